@@ -1,0 +1,233 @@
+"""The disk pendulum's model: messages, nodes and parameters. th = 0 is upright, th = pi hangs down."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.worlds.ode import OdeWorld
+
+GRAVITY = 9.81  # [m/s^2]
+HISTORY = 4
+"""Past observations and actions that the policy sees."""
+
+
+@struct.dataclass
+class Command(Base):
+    """What the motor is told; ``action`` has shape ``(1,)`` [V]."""
+
+    action: Any
+
+
+@struct.dataclass
+class Measurement(Base):
+    """Angle ``th`` [rad] and angular velocity ``thdot`` [rad/s]."""
+
+    th: Any
+    thdot: Any
+
+
+@struct.dataclass
+class PendulumParams(Base):
+    """A DC motor that turns an eccentric mass.
+
+    Attributes:
+        J: Moment of inertia about the axis [kg m^2].
+        mass: Eccentric mass [kg].
+        length: Distance of the mass from the axis [m].
+        b: Viscous friction [N m s/rad].
+        K: Torque constant, and of the back-EMF [N m/A].
+        R: Winding resistance [ohm].
+        c: Coulomb friction [N m].
+        max_speed: Speed limit of the model [rad/s].
+        start: Initial angle and velocity, shape ``(2,)`` [rad, rad/s].
+        smooth_rad_s: Speed over which Coulomb friction changes sign: ``tanh(thdot / smooth_rad_s)``. With 0 it is
+            ``sign(thdot)``, which chatters around standstill by c/J times the substep.
+    """
+
+    J: Any
+    mass: Any
+    length: Any
+    b: Any
+    K: Any
+    R: Any
+    c: Any
+    max_speed: Any
+    start: Any
+    smooth_rad_s: float = struct.field(pytree_node=False, default=0.05)
+
+
+def nominal_params() -> PendulumParams:
+    """Return the data-sheet values: those of the seed's tutorial."""
+    return PendulumParams(
+        J=0.000159931461600856,
+        mass=0.0508581731919534,
+        length=0.0415233722862552,
+        b=1.43298488358436e-05,
+        K=0.0333391179016334,
+        R=7.73125142447252,
+        c=0.000975041213361349,
+        max_speed=60.0,
+        start=jnp.array([jnp.pi, 0.0]),
+    )
+
+
+class PendulumWorld(OdeWorld):
+    """The pendulum as an ordinary differential equation, driven by the ``actuator`` input."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> PendulumParams:
+        """Return the nominal parameters."""
+        del rng, graph_state
+        return nominal_params()
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+        """Return the initial angle and velocity that the parameters name."""
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        return Measurement(th=params.start[0], thdot=params.start[1])
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+        """Return the initial state: what a sensor sees before the first tick has ended."""
+        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
+
+    def command(self, step_state: StepState) -> Any:
+        """Return the voltage during this tick [V]."""
+        return step_state.inputs["actuator"][-1].data.action[0]
+
+    def derivative(self, params: PendulumParams, state: Measurement, command: Any) -> Measurement:
+        """Return velocity [rad/s] and acceleration [rad/s^2]."""
+        p, th, thdot = params, state.th, state.thdot
+        turn = jnp.tanh(thdot / p.smooth_rad_s) if p.smooth_rad_s > 0 else jnp.sign(thdot)
+        motor = p.K / p.R * (command - p.K * thdot)
+        gravity = p.mass * GRAVITY * p.length * jnp.sin(th)
+        return Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * turn) / p.J)
+
+    def limit(self, params: PendulumParams, state: Measurement) -> Measurement:
+        """Clip the speed."""
+        return Measurement(th=state.th, thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
+
+
+@struct.dataclass
+class DelayParams(Base):
+    """The delay of a node's connection with the world [s]; None leaves the connection's own."""
+
+    delay: Any = None
+
+
+class SimSensor(BaseNode):
+    """The servo's encoder in simulation: passes the world's state on, as late as ``DelayParams`` says."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
+        """Return no delay of its own."""
+        del rng, graph_state
+        return DelayParams()
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+        """Return the world's initial state, hanging at rest without one."""
+        del rng
+        state = (graph_state or GraphState()).state.get("world")
+        return state if state is not None else Measurement(th=jnp.float32(jnp.pi), thdot=jnp.float32(0.0))
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the sensing delay, where the parameters set one."""
+        return _delay(self.name, "world", graph_state)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
+        """Measure."""
+        return step_state, step_state.inputs["world"][-1].data
+
+
+class SimActuator(BaseNode):
+    """The motor driver in simulation: passes the command on."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
+        """Return no delay of its own."""
+        del rng, graph_state
+        return DelayParams()
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
+        """Return zero voltage."""
+        del rng, graph_state
+        return Command(action=jnp.zeros(1))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Command]:
+        """Apply the command."""
+        return step_state, step_state.inputs["agent"][-1].data
+
+
+class DelayedWorld(PendulumWorld):
+    """The world whose actuation delay is set by the actuator's ``DelayParams``."""
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the actuation delay, where the actuator's parameters set one."""
+        delays = _delay("actuator", "actuator", graph_state)
+        return delays
+
+
+def _delay(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:
+    params = (graph_state or GraphState()).params.get(node)
+    delay = getattr(params, "delay", None)
+    return {} if delay is None else {input_name: delay}
+
+
+@struct.dataclass
+class AgentParams(Base):
+    """The policy, a pytree with ``get_action(obs, rng)``; None commands zero."""
+
+    policy: Any = None
+
+
+@struct.dataclass
+class AgentState(Base):
+    """The last observations ``(HISTORY, 3)`` and actions ``(HISTORY, 1)``, newest first."""
+
+    observations: Any
+    actions: Any
+
+
+class Agent(BaseNode):
+    """The policy's node: the newest measurement and a short history in, a voltage out."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
+        """Return no policy."""
+        del rng, graph_state
+        return AgentParams()
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentState:
+        """Return an empty history."""
+        del rng, graph_state
+        return AgentState(observations=jnp.zeros((HISTORY, 3)), actions=jnp.zeros((HISTORY, 1)))
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
+        """Return zero voltage."""
+        del rng, graph_state
+        return Command(action=jnp.zeros(1))
+
+    def observe(self, step_state: StepState) -> jax.Array:
+        """Return what the policy sees, shape ``(19,)``: cos, sin, thdot / 10, then the history."""
+        state = step_state.state
+        return jnp.concatenate([_features(step_state), state.observations.ravel(), state.actions.ravel()])
+
+    def act(self, step_state: StepState, action: Any) -> tuple[StepState, Command]:
+        """Return the step's results for an action, shape ``(1,)`` [V]."""
+        state = step_state.state
+        state = AgentState(
+            observations=jnp.concatenate([_features(step_state)[None], state.observations[:-1]]),
+            actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], state.actions[:-1]]),
+        )
+        return step_state.replace(state=state), Command(action=action)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def step(self, step_state: StepState) -> tuple[StepState, Command]:
+        """Ask the policy."""
+        policy = step_state.params.policy
+        action = jnp.zeros(1) if policy is None else policy.get_action(self.observe(step_state))
+        return self.act(step_state, action)
+
+
+def _features(step_state: StepState) -> jax.Array:
+    m = step_state.inputs["sensor"][-1].data
+    return jnp.stack([jnp.cos(m.th), jnp.sin(m.th), m.thdot / 10.0]).astype(jnp.float32)

@@ -1,0 +1,54 @@
+"""What can go wrong, and the exit code that each kind ends a command with."""
+
+from __future__ import annotations
+
+OK = 0
+ERROR = 1
+USAGE = 2
+SAFETY_STOP = 3
+HARDWARE_LOST = 4
+DEADLINE = 5
+
+
+class Sim2RealError(ValueError):
+    """A failure with a message for the user: what happened, which name, what was available.
+
+    Args:
+        message: What happened.
+        hint: What to do next; printed on a line of its own.
+    """
+
+    exit_code: int = ERROR
+
+    def __init__(self, message: str, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """Return the message, followed by the hint on a paragraph of its own."""
+        message = super().__str__()
+        return f"{message}\n\nhint: {self.hint}" if self.hint else message
+
+
+class UsageError(Sim2RealError):
+    """The command or its configuration makes no sense (exit code 2)."""
+
+    exit_code = USAGE
+
+
+class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the program
+    """A limit, a watchdog or a value that is no number stopped the robot (exit code 3)."""
+
+    exit_code = SAFETY_STOP
+
+
+class HardwareLost(Sim2RealError):  # noqa: N818
+    """A port or a device does not answer (exit code 4)."""
+
+    exit_code = HARDWARE_LOST
+
+
+class DeadlineExceeded(Sim2RealError):  # noqa: N818
+    """A node missed more deadlines than --strict-timing allows (exit code 5)."""
+
+    exit_code = DEADLINE

@@ -1,0 +1,239 @@
+"""How long a computation or a transfer takes: fixed, random, recorded or to be identified.
+
+Timelines are drawn in numpy, all episodes at once; distrax distributions are accepted at the API.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, InputState
+
+
+class DelayDistribution(ABC):
+    """A distribution over non-negative delays [s]."""
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        """Draw delays [s] of the given shape; the last axis runs along successive messages."""
+
+    @abstractmethod
+    def quantile(self, q: float) -> float:
+        """Return the delay [s] that a share ``q`` of the samples does not exceed."""
+
+    def window(self, rate_out: float) -> int:
+        """Return how many messages the reader's window grows by, for a sender at ``rate_out`` Hz."""
+        del rate_out
+        return 0
+
+
+class StaticDist(DelayDistribution):
+    """A distrax distribution, clipped at 0, or a constant.
+
+    Args:
+        dist: A ``distrax.Distribution`` over seconds, or a number of seconds.
+    """
+
+    def __init__(self, dist: Any) -> None:
+        self.dist = dist
+        self._constant: float | None = None
+        if isinstance(dist, int | float):
+            self._constant = float(dist)
+        elif type(dist).__name__ == "Deterministic" or (type(dist).__name__ == "Normal" and float(dist.scale) == 0.0):
+            self._constant = float(dist.loc)
+        elif not callable(getattr(dist, "sample", None)):
+            raise UsageError(
+                f"a delay distribution was expected, got {dist!r}",
+                hint="pass seconds, a distrax distribution or a DelayDistribution",
+            )
+        if self._constant is not None and (not math.isfinite(self._constant) or self._constant < 0):
+            raise UsageError(f"a delay must be finite and at least 0 s, got {self._constant}")
+
+    def __repr__(self) -> str:
+        return f"StaticDist({self.dist!r})"
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        """Draw delays [s]; samples below 0 become 0."""
+        if self._constant is not None:
+            return np.full(shape, self._constant)
+        if type(self.dist).__name__ == "Normal":  # numpy draws 1e6 of these in 10 ms, distrax compiles for 300 ms first
+            raw = rng.normal(float(self.dist.loc), float(self.dist.scale), shape)
+        else:
+            key = jax.random.key(int(rng.integers(2**31)))
+            raw = np.asarray(self.dist.sample(seed=key, sample_shape=shape), np.float64)
+        return np.maximum(raw, 0.0)
+
+    def quantile(self, q: float) -> float:
+        """Return a quantile of the clipped distribution [s]: exact for constants and Normal, else from 1e5 samples."""
+        if self._constant is not None:
+            return self._constant
+        if type(self.dist).__name__ == "Normal":
+            from statistics import NormalDist
+
+            return max(0.0, NormalDist(float(self.dist.loc), float(self.dist.scale)).inv_cdf(q))
+        samples = self.sample(np.random.default_rng(0), (100_000,))
+        return float(np.quantile(samples, q))
+
+
+class EmpiricalDist(DelayDistribution):
+    """Delays resampled from a record in blocks, so that runs of slow steps stay runs.
+
+    Args:
+        samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
+        block: Successive samples that are drawn together; 1 resamples independently.
+    """
+
+    def __init__(self, samples: np.ndarray, block: int = 10) -> None:
+        samples = np.asarray(samples, np.float64)
+        if samples.ndim != 1 or samples.size == 0 or not np.isfinite(samples).all() or (samples < 0).any():
+            raise UsageError("recorded delays must be a non-empty list of finite times of at least 0 s")
+        self.samples = samples
+        self.block = max(1, min(block, samples.size))
+
+    def __repr__(self) -> str:
+        return f"EmpiricalDist({self.samples.size} samples, block={self.block})"
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        """Draw blocks of recorded delays along the last axis [s]."""
+        length = shape[-1]
+        blocks = -(-length // self.block)
+        starts = rng.integers(0, self.samples.size - self.block + 1, (*shape[:-1], blocks))
+        index = starts[..., None] + np.arange(self.block)
+        return self.samples[index].reshape(*shape[:-1], -1)[..., :length]
+
+    def quantile(self, q: float) -> float:
+        """Return a quantile of the record [s]."""
+        return float(np.quantile(self.samples, q))
+
+
+_INTERPOLATIONS = ("zoh", "linear", "linear_real_only", "zoh_mean")
+
+
+@struct.dataclass
+class TrainableDist(Base, DelayDistribution):
+    """A delay that is chosen when the graph runs, between two bounds: ``min + alpha * (max - min)``.
+
+    Timelines are built with the least delay and the reader's window is widened, so that every message that any delay
+    within the bounds could deliver is there.
+
+    Attributes:
+        alpha: Traced, in [0, 1].
+        min: Least delay [s].
+        max: Largest delay [s].
+        interp: ``zoh``, ``linear``, ``linear_real_only`` (real messages only), or ``zoh_mean`` (inputs of a world).
+    """
+
+    alpha: Any
+    min: float = struct.field(pytree_node=False)
+    max: float = struct.field(pytree_node=False)
+    interp: str = struct.field(pytree_node=False, default="zoh")
+
+    @classmethod
+    def create(cls, delay: float, min: float, max: float, interp: str = "zoh") -> TrainableDist:
+        """Return the distribution with ``delay`` [s] between ``min`` and ``max`` [s].
+
+        Raises:
+            UsageError: Unless ``0 <= min < max``, ``min <= delay <= max`` and ``interp`` is known.
+        """
+        if interp not in _INTERPOLATIONS:
+            raise UsageError(f"unknown interpolation {interp!r}. Available: {', '.join(_INTERPOLATIONS)}")
+        if not 0.0 <= min < max:
+            raise UsageError(f"a trainable delay needs 0 <= min < max, got min={min} s and max={max} s")
+        if not min <= delay <= max:
+            raise UsageError(f"the delay {delay} s lies outside its bounds [{min}, {max}] s")
+        return cls(alpha=jnp.float32((delay - min) / (max - min)), min=min, max=max, interp=interp)
+
+    @property
+    def delay(self) -> Any:
+        """The delay [s], traced."""
+        return self.min + self.alpha * (self.max - self.min)
+
+    def with_delay(self, delay: Any) -> TrainableDist:
+        """Return the distribution at another delay [s], clipped to its bounds."""
+        alpha = jnp.clip((jnp.asarray(delay, jnp.float32) - self.min) / (self.max - self.min), 0.0, 1.0)
+        return self.replace(alpha=alpha)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the least delay: what timelines are built with [s]."""
+        del rng
+        return np.full(shape, self.min)
+
+    def quantile(self, q: float) -> float:
+        """Return the delay at construction: what phases are built with [s]."""
+        del q
+        return float(self.delay)
+
+    def window(self, rate_out: float) -> int:
+        """Return ``ceil(rate_out * (max - min))``, what the reader's window grows by."""
+        return math.ceil(round(rate_out * (self.max - self.min), 9))
+
+    def apply(self, inputs: InputState, age_s: Any, window: int, period_s: float) -> InputState:
+        """Pick or interpolate the messages that a step reads at this delay.
+
+        Args:
+            inputs: The widened window, leaves ``(W, ...)``.
+            age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
+            window: The window that the user asked for.
+            period_s: The reader's period [s]; used by ``zoh_mean`` alone.
+
+        Returns:
+            The window of ``window`` messages.
+        """
+        late = age_s - self.delay  # time since arrival at this delay; negative: not there yet
+        if self.interp == "zoh_mean":
+            return _mean_over_period(inputs, late, window, period_s)
+        width = inputs.seq.shape[0]
+        last = jnp.maximum(jnp.sum(late >= 0) - 1, window - 1)
+        if self.interp == "zoh":
+            start = last - window + 1
+            return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, window), inputs)
+        if self.interp == "linear_real_only":
+            # An empty slot is as old as can be: between it and the first message the first message's value holds.
+            late = jnp.where(inputs.seq < 0, 1e9, late)
+        steps = jnp.arange(window - 1, -1, -1)
+        newest = jnp.take(late, last)
+        query = -(jnp.take(late, jnp.clip(last - steps, 0, width - 1)) - newest)
+        return _interpolate(inputs, -late, query)
+
+
+def _interpolate(inputs: InputState, knots: Any, query: Any) -> InputState:
+    """Interpolate every leaf linearly at ``query``, in time relative to the reader; clamped at the ends."""
+    above = jnp.clip(jnp.sum(knots[None] <= query[:, None], axis=1), 1, knots.shape[0] - 1)
+    low, high = jnp.take(knots, above - 1), jnp.take(knots, above)
+    span = jnp.where(high > low, high - low, 1.0)
+    weight = jnp.clip((query - low) / span, 0.0, 1.0)
+
+    def one(leaf: Any) -> Any:
+        a, b = jnp.take(leaf, above - 1, axis=0), jnp.take(leaf, above, axis=0)
+        w = weight.reshape(-1, *[1] * (leaf.ndim - 1))
+        return (a + (b - a) * w).astype(leaf.dtype)
+
+    picked = jax.tree_util.tree_map(one, (inputs.seq, inputs.ts_sent, inputs.ts_recv, inputs.data))
+    return InputState(*picked, delay_dist=inputs.delay_dist)
+
+
+def _mean_over_period(inputs: InputState, late: Any, window: int, period_s: float) -> InputState:
+    """Average the held message over the reader's period: exact to first order, differentiable in the delay."""
+    arrival = jnp.clip(-late, 0.0, period_s)  # of each message, within the tick; FIFO, so non-decreasing
+    until = jnp.concatenate([arrival[1:], jnp.full(1, period_s, arrival.dtype)])
+    weight = (until - arrival) / period_s
+    # What held before the oldest message in the window is not known: the oldest stands for it.
+    weight = weight.at[0].add(arrival[0] / period_s)
+
+    def one(leaf: Any) -> Any:
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            return leaf[-window:]
+        mean = jnp.tensordot(weight.astype(leaf.dtype), leaf, axes=1)
+        return leaf[-window:].at[-1].set(mean)
+
+    data = jax.tree_util.tree_map(one, inputs.data)
+    tail = inputs[-window:]
+    return tail.replace(data=data)  # pyright: ignore[reportAttributeAccessIssue]

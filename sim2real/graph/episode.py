@@ -1,0 +1,165 @@
+"""What a graph did: which steps ran when, on which messages, with which outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+
+class StepRecord(NamedTuple):
+    """One finished step of a node; times in ticks [us] from the episode's start.
+
+    ``woken`` is when the thread really ran, ``ts_overwrite`` the start that the step set itself (-1: it did not).
+    ``drift`` is how far overruns have moved the node's schedule.
+    """
+
+    node: str
+    seq: int
+    scheduled: int
+    start: int
+    woken: int
+    ts_overwrite: int
+    end: int
+    drift: int
+
+
+class MessageRecord(NamedTuple):
+    """One message of a connection; times in ticks [us]. ``seq_in`` is -1 if no step consumed it."""
+
+    node: str
+    input: str
+    seq_out: int
+    seq_in: int
+    sent: int
+    received: int
+
+
+class Recorder(Protocol):
+    """Takes what a running graph reports. Every call returns at once: nothing here may block a control loop."""
+
+    def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """The episode starts: time 0 is ``monotonic_ns`` on the monotonic clock, ``epoch_ns`` on the wall clock."""
+
+    def step(self, record: StepRecord, output: Any) -> None:
+        """A step has ended with this output: a pytree of numpy arrays or numbers."""
+
+    def message(self, record: MessageRecord) -> None:
+        """The fate of a message is known."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """All steps of one node, by seq; every array has shape ``(N,)``, int64 ticks [us]."""
+
+    scheduled: np.ndarray
+    start: np.ndarray
+    woken: np.ndarray
+    ts_overwrite: np.ndarray
+    end: np.ndarray
+    drift: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+@dataclass(frozen=True)
+class Messages:
+    """All messages of one connection, by seq_out; every array has shape ``(M,)``, int64 (times in ticks [us])."""
+
+    seq_out: np.ndarray
+    seq_in: np.ndarray
+    sent: np.ndarray
+    received: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.seq_out)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A recorded run of a graph.
+
+    Attributes:
+        steps: Node -> its steps.
+        messages: (node, input name) -> the messages on that connection.
+        outputs: Node -> field name -> array with one row a step, shape ``(N, ...)``.
+        metadata: What the session's log says about itself (pipeline, configuration, versions, ...).
+        complete: Whether the session ended in order; False after a crash.
+    """
+
+    steps: Mapping[str, Steps]
+    messages: Mapping[tuple[str, str], Messages]
+    outputs: Mapping[str, Mapping[str, np.ndarray]]
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    complete: bool = True
+
+    @property
+    def duration_s(self) -> float:
+        """When the last step ended [s]."""
+        ends = [int(s.end[-1]) for s in self.steps.values() if len(s)]
+        return max(ends, default=0) / 1e6
+
+
+class MemoryRecorder:
+    """A recorder that keeps everything in memory and hands it over as an ``Episode``."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, list[StepRecord]] = {}
+        self._outputs: dict[str, list[Any]] = {}
+        self._messages: dict[tuple[str, str], list[MessageRecord]] = {}
+
+    def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """Forget what was recorded before."""
+        del epoch_ns, monotonic_ns
+        self._steps, self._outputs, self._messages = {}, {}, {}
+
+    def step(self, record: StepRecord, output: Any) -> None:
+        """Keep a step and its output."""
+        self._steps.setdefault(record.node, []).append(record)
+        self._outputs.setdefault(record.node, []).append(output)
+
+    def message(self, record: MessageRecord) -> None:
+        """Keep a message."""
+        self._messages.setdefault((record.node, record.input), []).append(record)
+
+    def episode(self) -> Episode:
+        """Return what was recorded so far."""
+        return Episode(
+            steps={n: steps_from_records(r) for n, r in self._steps.items()},
+            messages={k: messages_from_records(r) for k, r in self._messages.items()},
+            outputs={n: _stack(o) for n, o in self._outputs.items()},
+        )
+
+
+def steps_from_records(records: list[StepRecord]) -> Steps:
+    """Turn step records, in any order, into columns by seq."""
+    records = sorted(records, key=lambda r: r.seq)
+    return Steps(*(np.array([getattr(r, f) for r in records], np.int64) for f in Steps.__dataclass_fields__))
+
+
+def messages_from_records(records: list[MessageRecord]) -> Messages:
+    """Turn message records, in any order, into columns by seq_out."""
+    records = sorted(records, key=lambda r: r.seq_out)
+    return Messages(*(np.array([getattr(r, f) for r in records], np.int64) for f in Messages.__dataclass_fields__))
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Return the leaves of a message by dotted name (``th``, ``pose.x``), in a fixed order."""
+    import jax  # a log is written without JAX when messages are plain dictionaries
+
+    if isinstance(tree, Mapping) and all(not isinstance(v, Mapping) for v in tree.values()):
+        return dict(tree)
+    flat, _ = jax.tree_util.tree_flatten_with_path(tree)
+
+    def label(path: Any) -> str:
+        return ".".join(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path) or "value"
+
+    return {label(path): leaf for path, leaf in flat}
+
+
+def _stack(outputs: list[Any]) -> dict[str, np.ndarray]:
+    rows = [named_leaves(o) for o in outputs]
+    return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in (rows[0] if rows else {})}

@@ -1,0 +1,309 @@
+"""Nodes and the connections between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import Enum
+from typing import Any
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Empty, GraphState, StepState
+from sim2real.graph.delays import DelayDistribution, StaticDist, TrainableDist
+
+TICKS_PER_S = 1_000_000
+"""Schedules are computed on integers: one tick is a microsecond."""
+
+
+class Scheduling(Enum):
+    """What an overrun does to the steps after it."""
+
+    FREQUENCY = "frequency"
+    """The whole later schedule moves: the node keeps its frequency."""
+    PHASE = "phase"
+    """The node returns to its grid."""
+
+
+class Jitter(Enum):
+    """Which of the messages that have arrived a non-blocking input hands over."""
+
+    LATEST = "latest"
+    """All of them."""
+    BUFFER = "buffer"
+    """Those whose nominal arrival has passed as well."""
+
+
+class Connection:
+    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``."""
+
+    def __init__(
+        self,
+        input_node: BaseNode,
+        output_node: BaseNode,
+        blocking: bool,
+        delay: float | None,
+        delay_dist: Any,
+        window: int,
+        skip: bool,
+        jitter: Jitter,
+        name: str,
+    ) -> None:
+        self.input_node = input_node
+        self.output_node = output_node
+        self.blocking = bool(blocking)
+        self.window = window
+        self.skip = bool(skip)
+        self.jitter = Jitter(jitter)
+        self.name = name
+        where = f"connection {output_node.name!r} -> {input_node.name!r} (input {name!r})"
+        self.delay_dist = _as_distribution(delay_dist, where)
+        self.delay = _expected_delay(delay, self.delay_dist, where)
+        if window < 1:
+            raise UsageError(f"{where}: window must be at least 1, got {window}")
+        if self.trainable and (self.blocking or self.jitter is Jitter.BUFFER):
+            raise UsageError(
+                f"{where}: a trainable delay cannot move when a blocking or buffered message is used, as the step "
+                "waits for it or for its nominal arrival",
+                hint="make the connection non-blocking with Jitter.LATEST, or give it a fixed delay",
+            )
+        if self.averaged and not isinstance(input_node, BaseWorld):
+            raise UsageError(f"{where}: interp='zoh_mean' is for inputs of a world", hint="use 'zoh' or 'linear'")
+
+    @property
+    def trainable(self) -> bool:
+        """Whether the delay is chosen when the graph runs."""
+        return isinstance(self.delay_dist, TrainableDist)
+
+    @property
+    def averaged(self) -> bool:
+        """Whether a tick reads the mean of the command over the tick (``zoh_mean``)."""
+        return isinstance(self.delay_dist, TrainableDist) and self.delay_dist.interp == "zoh_mean"
+
+    @property
+    def total_window(self) -> int:
+        """Messages that a reader must see so that any trainable delay within its bounds can be served."""
+        extra = self.delay_dist.window(self.output_node.rate)
+        if self.averaged:  # and those that arrive while the tick lasts
+            extra += math.ceil(self.output_node.rate / self.input_node.rate)
+        return self.window + extra
+
+    @property
+    def phase(self) -> float:
+        """Nominal arrival of the sender's first message [s]."""
+        return self.phase_ticks / TICKS_PER_S
+
+    @property
+    def phase_ticks(self) -> int:
+        """Nominal arrival of the sender's first message [ticks]."""
+        return phase_ticks(self.output_node) + to_ticks(self.output_node.delay) + to_ticks(self.delay)
+
+    def __repr__(self) -> str:
+        return f"Connection({self.output_node.name!r} -> {self.input_node.name!r}, name={self.name!r})"
+
+
+class BaseNode:
+    """One computation that runs at a rate: override ``step`` and the ``init_*`` methods that it needs.
+
+    Args:
+        name: Unique in the graph.
+        rate: Nominal frequency [Hz].
+        delay: Expected computation delay [s], which shifts the phases of readers; default: the 0.99 quantile of
+            ``delay_dist``.
+        delay_dist: Computation delay in simulation: a distrax distribution over seconds, a ``DelayDistribution`` or a
+            number of seconds; default 0.
+        advance: With only blocking inputs, start as soon as they are there, before the scheduled time too.
+        scheduling: What an overrun does to later steps.
+        color: Colour in drawings.
+        order: Place in drawings.
+
+    Raises:
+        UsageError: When a rate or a delay makes no sense.
+    """
+
+    jittable: bool = True
+    """Whether ``step`` may be traced by JAX; a node that talks to hardware in plain Python says False."""
+    _clock: Callable[[], float] | None = None
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        delay: float | None = None,
+        delay_dist: Any = None,
+        advance: bool = False,
+        scheduling: Scheduling = Scheduling.FREQUENCY,
+        color: str | None = None,
+        order: int | None = None,
+    ) -> None:
+        where = f"node {name!r}"
+        if not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+            raise UsageError(f"{where}: rate must be a positive number of hertz, got {rate!r}")
+        self.name = name
+        self.rate = float(rate)
+        self.delay_dist = _as_distribution(delay_dist, where)
+        if isinstance(self.delay_dist, TrainableDist):
+            raise UsageError(
+                f"{where}: a computation delay cannot be trainable",
+                hint="put the TrainableDist on the connection that leaves the node",
+            )
+        self.delay = _expected_delay(delay, self.delay_dist, where)
+        self.advance = bool(advance)
+        self.scheduling = Scheduling(scheduling)
+        self.color = color
+        self.order = order
+        self.inputs: dict[str, Connection] = {}
+        self.outputs: list[Connection] = []
+
+    def connect(
+        self,
+        output_node: BaseNode,
+        blocking: bool = False,
+        delay: float | None = None,
+        delay_dist: Any = None,
+        window: int = 1,
+        skip: bool = False,
+        jitter: Jitter = Jitter.LATEST,
+        name: str | None = None,
+    ) -> Connection:
+        """Feed an input of this node with the outputs of another.
+
+        Args:
+            output_node: The sender.
+            blocking: Wait for the messages that are due by the nominal schedule.
+            delay: Expected communication delay [s], for phases; default: the 0.99 quantile of ``delay_dist``.
+            delay_dist: Communication delay in simulation; may be a ``TrainableDist``; default 0.
+            window: How many of the last messages the step sees.
+            skip: Leave this input out of the phase, and messages that arrive exactly at the start to the next step.
+            jitter: What a non-blocking input does with messages that arrive early.
+            name: Key in ``step_state.inputs``; default: the sender's name.
+
+        Raises:
+            UsageError: When the input's name is taken or an option makes no sense.
+        """
+        name = name or output_node.name
+        if name in self.inputs:
+            raise UsageError(
+                f"node {self.name!r} has an input {name!r} already. Inputs: {', '.join(self.inputs)}",
+                hint="give the second connection a name of its own: connect(..., name='other')",
+            )
+        connection = Connection(self, output_node, blocking, delay, delay_dist, window, skip, jitter, name)
+        self.inputs[name] = connection
+        output_node.outputs.append(connection)
+        return connection
+
+    @property
+    def phase(self) -> float:
+        """Nominal start of the first step [s]."""
+        return phase_ticks(self) / TICKS_PER_S
+
+    @property
+    def phase_output(self) -> float:
+        """Nominal time of the first output [s]."""
+        return self.phase + self.delay
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the node's parameters."""
+        del rng, graph_state
+        return Empty()
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the node's state at the start of an episode."""
+        del rng, graph_state
+        return Empty()
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the message that stands in a reader's window before the first one has arrived."""
+        del rng, graph_state
+        return Empty()
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the delay [s] of trainable inputs, by input name; others are ignored."""
+        del rng, graph_state
+        return {}
+
+    def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
+        """Get ready for an episode on the wall clock: open a port, move to a start. Return whether that worked."""
+        del graph_state, timeout
+        return True
+
+    def stop(self, timeout: float | None = None) -> bool:
+        """Make safe after an episode on the wall clock; called on every way out. Return whether that worked."""
+        del timeout
+        return True
+
+    def now(self) -> float:
+        """Return the time since the episode's start [s], on the clock that stamps messages; 0 outside of an episode."""
+        return 0.0 if self._clock is None else self._clock()
+
+    def set_clock(self, clock: Callable[[], float] | None) -> None:
+        """Set what ``now`` reads; called by a running graph."""
+        self._clock = clock
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Return the new step state and the output message."""
+        raise NotImplementedError(f"node {self.name!r} ({type(self).__name__}) has no step method")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, rate={self.rate:g})"
+
+
+class BaseWorld(BaseNode):
+    """A simulated world: its steps lie on a fixed grid and each output leaves at the end of its tick.
+
+    Args:
+        name: Unique in the graph.
+        rate: Ticks per second [Hz].
+        color: Colour in drawings.
+        order: Place in drawings.
+    """
+
+    def __init__(self, name: str, rate: float, color: str | None = None, order: int | None = None) -> None:
+        if not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+            raise UsageError(f"node {name!r}: rate must be a positive number of hertz, got {rate!r}")
+        # A hair less than the period: the end of a tick is never taken for the start of the next but one.
+        busy = 0.999 / rate
+        super().__init__(name, rate, delay=busy, delay_dist=StaticDist(busy), color=color, order=order)
+
+
+def to_ticks(seconds: float) -> int:
+    """Round a time [s] to ticks [us]."""
+    return math.floor(seconds * TICKS_PER_S + 0.5)
+
+
+def phase_ticks(node: BaseNode, _path: tuple[str, ...] = ()) -> int:
+    """Return the nominal start of a node's first step [ticks] (timing rule 1).
+
+    Raises:
+        UsageError: When connections that are not skipped form a loop; the message names it.
+    """
+    if node.name in _path:
+        loop = " -> ".join([*reversed(_path[_path.index(node.name) :]), _path[-1]])
+        raise UsageError(
+            f"algebraic loop: {loop}: every node in it waits for another",
+            hint="connect one of them with skip=True: it then reads the message of the step before",
+        )
+    path = (*_path, node.name)
+    arrivals = [
+        phase_ticks(c.output_node, path) + to_ticks(c.output_node.delay) + to_ticks(c.delay)
+        for c in node.inputs.values()
+        if not c.skip
+    ]
+    return max([0, *arrivals])
+
+
+def _as_distribution(dist: Any, where: str) -> DelayDistribution:
+    if dist is None:
+        return StaticDist(0.0)
+    if isinstance(dist, DelayDistribution):
+        return dist
+    try:
+        return StaticDist(dist)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error.args[0]}", hint=error.hint) from None
+
+
+def _expected_delay(delay: float | None, dist: DelayDistribution, where: str) -> float:
+    value = dist.quantile(0.99) if delay is None else float(delay)
+    if not (math.isfinite(value) and value >= 0):
+        raise UsageError(f"{where}: the expected delay must be finite and at least 0 s, got {value}")
+    return value

@@ -1,0 +1,238 @@
+"""Timelines: which step ran when, and which message went into which step, for E episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import BaseNode
+
+_FORMAT = 1
+_NEVER = np.int64(2**60)
+
+
+@dataclass(frozen=True)
+class Vertex:
+    """The steps of one node; times in ticks [us] from the episode's start.
+
+    Attributes:
+        start: Shape ``(E, N)``, int64.
+        end: Shape ``(E, N)``, int64.
+        count: Shape ``(E,)``: how many steps each episode has; what stands behind them in ``start`` only increases.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    count: np.ndarray
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The messages of one connection.
+
+    Attributes:
+        received: Shape ``(E, M)``, int64 [ticks]; message m is the sender's step m, sent at its end.
+        seq_in: Shape ``(E, M)``, int64: the reader's step that consumed it; -1 if none did.
+        sender: The node whose messages these are.
+    """
+
+    received: np.ndarray
+    seq_in: np.ndarray
+    sender: str
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """E episodes of a graph: vertices by node, edges by (node, input name)."""
+
+    vertices: Mapping[str, Vertex]
+    edges: Mapping[tuple[str, str], Edge]
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes there are."""
+        return next((len(v.count) for v in self.vertices.values()), 0)
+
+    def __getitem__(self, index: slice | np.ndarray | Sequence[int]) -> Timeline:
+        """Select episodes."""
+        return Timeline(
+            {n: Vertex(v.start[index], v.end[index], v.count[index]) for n, v in self.vertices.items()},
+            {k: Edge(e.received[index], e.seq_in[index], e.sender) for k, e in self.edges.items()},
+        )
+
+    def filter(self, names: Iterable[str]) -> Timeline:
+        """Keep some nodes, and the edges between them."""
+        names = set(names)
+        missing = names - set(self.vertices)
+        if missing:
+            raise UsageError(
+                f"no node {', '.join(sorted(missing))} in the timeline. Available: {', '.join(self.vertices)}"
+            )
+        return Timeline(
+            {n: v for n, v in self.vertices.items() if n in names},
+            {k: e for k, e in self.edges.items() if k[0] in names and e.sender in names},
+        )
+
+    @staticmethod
+    def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
+        """Return the timeline of one recorded episode (E = 1): of those ``nodes`` that the record holds.
+
+        Raises:
+            UsageError: When it holds none of them, or messages of a connection that the nodes do not have.
+        """
+        vertices, edges = {}, {}
+        present = [n for n in nodes if n in episode.steps]
+        if not present:
+            raise UsageError(f"the record has none of {', '.join(nodes)}. Available: {', '.join(episode.steps)}")
+        for name in present:
+            steps = episode.steps[name]
+            begin = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start)
+            vertices[name] = Vertex(begin[None], steps.end[None], np.array([len(steps)]))
+        for (name, input_name), m in episode.messages.items():
+            if name not in vertices or input_name not in nodes[name].inputs:
+                continue
+            sender = nodes[name].inputs[input_name].output_node.name
+            if sender in vertices:
+                edges[name, input_name] = Edge(m.received[None], m.seq_in[None], sender)
+        return Timeline(vertices, edges)
+
+    @staticmethod
+    def stack(timelines: Sequence[Timeline]) -> Timeline:
+        """Join timelines of the same graph along the episodes; shorter ones are padded."""
+        if not timelines:
+            raise UsageError("no timelines to stack")
+        first = timelines[0]
+        for t in timelines[1:]:
+            if set(t.vertices) != set(first.vertices) or set(t.edges) != set(first.edges):
+                raise UsageError("only timelines of the same nodes and connections can be stacked")
+        vertices = {
+            n: Vertex(
+                _pad([t.vertices[n].start for t in timelines], _NEVER),
+                _pad([t.vertices[n].end for t in timelines], _NEVER),
+                np.concatenate([t.vertices[n].count for t in timelines]),
+            )
+            for n in first.vertices
+        }
+        edges = {
+            k: Edge(
+                _pad([t.edges[k].received for t in timelines], _NEVER),
+                _pad([t.edges[k].seq_in for t in timelines], np.int64(-1)),
+                first.edges[k].sender,
+            )
+            for k in first.edges
+        }
+        return Timeline(vertices, edges)
+
+    def save(self, path: Path) -> None:
+        """Write the timeline to an ``.npz`` file."""
+        arrays: dict[str, np.ndarray] = {"format": np.array(_FORMAT)}
+        for n, v in self.vertices.items():
+            arrays |= {f"vertex|{n}|start": v.start, f"vertex|{n}|end": v.end, f"vertex|{n}|count": v.count}
+        for (n, i), e in self.edges.items():
+            arrays |= {f"edge|{n}|{i}|received": e.received, f"edge|{n}|{i}|seq_in": e.seq_in}
+            arrays[f"edge|{n}|{i}|sender"] = np.array(e.sender)
+        np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def load(path: Path) -> Timeline:
+        """Read a timeline from an ``.npz`` file.
+
+        Raises:
+            Sim2RealError: When the file is missing or holds no timeline of this format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = dict(data)
+        except (OSError, ValueError) as error:
+            raise Sim2RealError(f"{path} is no timeline: {error}", hint="pass a file made by Timeline.save") from None
+        if int(arrays.pop("format", np.array(-1))) != _FORMAT:
+            raise Sim2RealError(f"{path} is no timeline of format {_FORMAT}", hint="pass a file made by Timeline.save")
+        vertices: dict[str, dict[str, np.ndarray]] = {}
+        edges: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+        for key, array in arrays.items():
+            kind, name, *rest = key.split("|")
+            if kind == "vertex":
+                vertices.setdefault(name, {})[rest[0]] = array
+            else:
+                edges.setdefault((name, rest[0]), {})[rest[1]] = array
+        return Timeline(
+            {n: Vertex(**v) for n, v in vertices.items()},
+            {k: Edge(e["received"], e["seq_in"], str(e["sender"])) for k, e in edges.items()},
+        )
+
+    def cut(
+        self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None
+    ) -> tuple[Timeline, dict[str, np.ndarray]]:
+        """Cut one episode into segments whose time starts at 0 each.
+
+        Args:
+            begins: Where the segments start [ticks].
+            length: Their length [ticks].
+            lead: Node -> how long before the start its steps are kept as well, at negative times [ticks].
+
+        Returns:
+            The segments as episodes, and for each node the sequence number that its step 0 had, shape ``(E,)``.
+
+        Raises:
+            UsageError: When the timeline has more than one episode.
+        """
+        if self.episodes != 1:
+            raise UsageError(f"only a timeline of one episode can be cut, this one has {self.episodes}")
+        ahead = lead or {}
+        firsts = {
+            n: np.searchsorted(v.start[0, : v.count[0]], np.asarray(begins) - ahead.get(n, 0))
+            for n, v in self.vertices.items()
+        }
+        parts = [self._part({n: int(f[i]) for n, f in firsts.items()}, b, length) for i, b in enumerate(begins)]
+        return Timeline.stack(parts), firsts
+
+    def _part(self, firsts: Mapping[str, int], begin: int, length: int) -> Timeline:
+        vertices, edges = {}, {}
+        last: dict[str, int] = {}
+        for n, v in self.vertices.items():
+            stop = int(np.searchsorted(v.start[0, : v.count[0]], begin + length))
+            last[n] = stop
+            take = slice(firsts[n], stop)
+            count = np.array([stop - firsts[n]])
+            vertices[n] = Vertex(v.start[:, take] - begin, v.end[:, take] - begin, count)
+        for (n, i), e in self.edges.items():
+            take = slice(firsts[e.sender], last[e.sender])
+            seq_in = e.seq_in[:, take]
+            inside = (seq_in >= firsts[n]) & (seq_in < last[n])
+            edges[n, i] = Edge(e.received[:, take] - begin, np.where(inside, seq_in - firsts[n], -1), e.sender)
+        return Timeline(vertices, edges)
+
+
+def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "right"] = "left") -> np.ndarray:
+    """Do ``np.searchsorted`` in each row at once.
+
+    Args:
+        rows: Shape ``(E, N)``, int64, not decreasing along the last axis.
+        values: Shape ``(E, M)``, int64.
+        side: As in ``np.searchsorted``.
+
+    Returns:
+        Shape ``(E, M)``: where each value belongs in its row.
+    """
+    low = min(int(rows.min(initial=0)), int(values.min(initial=0)))
+    # What is never reached stands at 2**60: cut down to just above everything that is, so that the sum fits 64 bits.
+    real = [a[a < _NEVER // 2] for a in (rows, values)]
+    high = max(int(a.max(initial=0)) for a in real) + 2
+    lift = (np.arange(len(rows), dtype=np.int64) * (high - low + 1))[:, None]
+    flat = np.searchsorted(
+        (np.minimum(rows, high) + lift).ravel(),
+        (np.minimum(values, high - (side == "right")) + lift).ravel(),
+        side=side,
+    )
+    return flat.reshape(values.shape) - np.arange(len(rows))[:, None] * rows.shape[1]
+
+
+def _pad(arrays: Sequence[np.ndarray], value: np.int64) -> np.ndarray:
+    width = max(a.shape[1] for a in arrays)
+    return np.concatenate([np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=value) for a in arrays])

@@ -1,0 +1,138 @@
+"""What each stage can be told; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sim2real.errors import UsageError
+
+
+@dataclass(frozen=True)
+class GateLimits:
+    """The safety gate: what no command gets past."""
+
+    limit: float = 2.0
+    """Largest command in either direction [the actuator's unit; V for the pendulum]."""
+    slew_per_s: float = 400.0
+    """Fastest change of the command [unit/s]."""
+    command_timeout_s: float = 0.1
+    """A command older than this becomes zero [s]."""
+    max_speed_rad_s: float = 60.0
+    """Joint speed above which the robot is stopped [rad/s]."""
+    servo_watchdog_s: float = 0.1
+    """The servo stops by itself when it has heard nothing for this long [s]; steps of 20 ms."""
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Record the robot under an excitation."""
+
+    port: str = "embedded"
+    """Serial port of the servo bus, or 'embedded' for the emulated robot."""
+    duration_s: float = 40.0
+    """Length of the recording [s]."""
+    excitation: Literal["multisine", "chirp", "steps"] = "multisine"
+    """Command signal."""
+    amplitude: float = 1.8
+    """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
+    low_hz: float = 0.2
+    """Lowest frequency of the excitation [Hz]."""
+    high_hz: float = 3.0
+    """Highest frequency of the excitation [Hz]."""
+    seed: int = 0
+    """Seed of the excitation, and of the embedded robot."""
+    strict_timing: bool = False
+    """End with code 5 when more than 1 % of the steps miss their deadline."""
+    gate: GateLimits = field(default_factory=GateLimits)
+    """Limits on every command."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
+        if not 0.0 < self.low_hz < self.high_hz:
+            raise UsageError(f"the excitation needs 0 < low_hz < high_hz, got {self.low_hz} and {self.high_hz} Hz")
+        if not 0.0 < self.amplitude <= self.gate.limit:
+            raise UsageError(
+                f"the amplitude must lie in (0, {self.gate.limit}], got {self.amplitude}",
+                hint="raise --gate.limit only if the robot bears it",
+            )
+
+
+@dataclass(frozen=True)
+class IdentifyConfig:
+    """Identify dynamics, delays and initial states from a log."""
+
+    log: str | None = None
+    """MCAP log to identify from; default: the newest finished recording of the pipeline."""
+    segment_s: float = 2.0
+    """Length of the segments that are simulated from an estimated state of their own [s]."""
+    held_out: float = 0.25
+    """Share of the log, at its end, that is only predicted."""
+    population: int = 32
+    """Candidates a generation of CMA-ES."""
+    generations: int = 80
+    """Generations of CMA-ES at most."""
+    max_delay_s: float = 0.06
+    """Upper bound of each identified delay [s]."""
+    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Bounds of single parameters instead of the pipeline's: --bounds NAME LOW HIGH."""
+    seed: int = 0
+    """Seed of the search."""
+    reveal: bool = True
+    """Show the embedded robot's true parameters beside the estimates; the search never sees them."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before the log is read."""
+        if not 0.05 <= self.held_out <= 0.8:
+            raise UsageError(f"held_out must lie in [0.05, 0.8], got {self.held_out}")
+        if not 0.5 <= self.segment_s <= 60.0:
+            raise UsageError(f"segment_s must lie in [0.5, 60] s, got {self.segment_s}")
+        if self.population < 4 or self.generations < 1:
+            raise UsageError(
+                f"the search needs a population of 4 and one generation at least, got {self.population} and "
+                f"{self.generations}"
+            )
+        if not 0.0 < self.max_delay_s <= 1.0:
+            raise UsageError(f"max_delay_s must lie in (0, 1] s, got {self.max_delay_s}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Train a policy on the identified model with the robot's timing."""
+
+    model: Literal["identified", "nominal"] = "identified"
+    """Parameters to train on: what identify found, or the nominal ones without any delay."""
+    parameters: str | None = None
+    """parameters.json to train on; default: the newest identification of the pipeline."""
+    timelines: int = 32
+    """Timelines drawn from the recorded timing."""
+    episode_s: float = 5.0
+    """Length of an episode [s]."""
+    randomise: float = 1.0
+    """Copies differ in their parameters by this many standard errors of the identification, and at least by 2 %."""
+    seed: int = 0
+    """Seed of training."""
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """Run the policy on the robot and compare with the simulation."""
+
+    port: str = "embedded"
+    """Serial port of the servo bus, or 'embedded' for the emulated robot."""
+    bundle: str | None = None
+    """Folder of the policy bundle; default: the newest training of the pipeline."""
+    episodes: int = 2
+    """How many times to deploy."""
+    duration_s: float = 10.0
+    """Length of a deployment [s]."""
+    settle_s: float = 20.0
+    """Longest wait for the robot to come to rest before a deployment [s]."""
+    seed: int = 0
+    """Seed of the embedded robot."""
+    strict_timing: bool = False
+    """End with code 5 when more than 1 % of the steps miss their deadline."""
+    gate: GateLimits = field(default_factory=GateLimits)
+    """Limits on every command."""

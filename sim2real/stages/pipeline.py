@@ -1,0 +1,107 @@
+"""What a robot's folder under ``pipelines/`` provides, and how it is found."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from sim2real.errors import UsageError
+from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
+
+ENTRY_POINT_GROUP = "sim2real.pipelines"
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """One robot, from its bus to its task.
+
+    ``pipelines/NAME/__init__.py`` defines ``PIPELINE``, an instance of this class, and imports neither JAX nor MuJoCo.
+    The heavy parts stand in modules beside it and are imported when a stage needs them.
+
+    Attributes:
+        name: The folder's name; what the command line calls it.
+        summary: One line for ``sim2real info``.
+        package: ``__name__`` of the pipeline's package.
+        robot: Module in the package with the robot's parts for the stages (see ``sim2real.stages.robot.Robot``).
+        record: Defaults of the stage; its fields become the flags.
+        identify: Defaults of the stage.
+        train: Defaults of the stage.
+        deploy: Defaults of the stage.
+    """
+
+    name: str
+    summary: str
+    package: str
+    robot: str = "robot"
+    record: RecordConfig = RecordConfig()
+    identify: IdentifyConfig = IdentifyConfig()
+    train: TrainConfig = TrainConfig()
+    deploy: DeployConfig = DeployConfig()
+
+    def load(self, module: str | None = None) -> ModuleType:
+        """Import a module of the pipeline's package; default: the robot's parts."""
+        return importlib.import_module(f"{self.package}.{module or self.robot}")
+
+
+def available() -> dict[str, Any]:
+    """Return the names of all pipelines and where each comes from: entry points, ./pipelines, those of the package."""
+    found: dict[str, Any] = {}
+    for folder in reversed(_folders()):
+        found.update({p.parent.name: p.parent for p in sorted(folder.glob("*/__init__.py"))})
+    found.update({entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)})
+    return found
+
+
+def load_pipeline(name: str) -> Pipeline:
+    """Return a pipeline by name.
+
+    Raises:
+        UsageError: When there is none of this name; the message lists those that there are.
+    """
+    found = available()
+    if name not in found:
+        raise UsageError(
+            f"unknown pipeline {name!r}. Available: {', '.join(sorted(found)) or 'none'}",
+            hint="run where ./pipelines/NAME/__init__.py exists, or install a package with the entry point "
+            f"group '{ENTRY_POINT_GROUP}'",
+        )
+    source = found[name]
+    if not isinstance(source, Path):
+        pipeline = source.load()
+    else:
+        pipeline = getattr(_import_folder(source), "PIPELINE", None)
+    if not isinstance(pipeline, Pipeline):
+        raise UsageError(f"pipeline {name!r} ({source}) defines no PIPELINE of type sim2real.stages.pipeline.Pipeline")
+    return pipeline
+
+
+def _folders() -> list[Path]:
+    package = Path(__file__).resolve().parent.parent
+    # The wheel carries the pipelines inside the package; a checkout has them beside it.
+    return [f for f in (Path.cwd() / "pipelines", package / "_pipelines", package.parent / "pipelines") if f.is_dir()]
+
+
+def _import_folder(folder: Path) -> ModuleType:
+    """Import a pipeline's package under a name of its own, so that no top-level ``pipelines`` is needed."""
+    parent = "sim2real_pipelines"
+    if parent not in sys.modules:
+        sys.modules[parent] = ModuleType(parent)
+        sys.modules[parent].__path__ = []
+    name = f"{parent}.{folder.name}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(
+        name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+    )
+    if spec is None or spec.loader is None:
+        raise UsageError(f"{folder} is no Python package")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,75 @@
+"""Worlds whose dynamics are an ordinary differential equation."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import StepState
+from sim2real.graph.node import BaseWorld
+
+
+class OdeWorld(BaseWorld):
+    """Integrates ``derivative`` over a tick with the classical Runge-Kutta method of order four.
+
+    Args:
+        name: Unique in the graph.
+        rate: Ticks per second [Hz].
+        substep_s: Largest step of the integrator [s]; a tick is split into equal parts no longer than this.
+        color: Colour in drawings.
+        order: Place in drawings.
+    """
+
+    def __init__(
+        self, name: str, rate: float, substep_s: float = 0.002, color: str | None = None, order: int | None = None
+    ) -> None:
+        super().__init__(name, rate, color=color, order=order)
+        if not substep_s > 0:
+            raise UsageError(f"world {name!r}: substep_s must be positive, got {substep_s} s")
+        self.substeps = math.ceil(round(1.0 / (self.rate * substep_s), 9))
+
+    @abstractmethod
+    def derivative(self, params: Any, state: Any, command: Any) -> Any:
+        """Return the time derivative of ``state``, a tree of the same structure [state's unit/s]."""
+
+    @abstractmethod
+    def command(self, step_state: StepState) -> Any:
+        """Return the command that is held during this tick."""
+
+    def limit(self, params: Any, state: Any) -> Any:
+        """Return the state inside its limits; called after every substep."""
+        del params
+        return state
+
+    def output(self, params: Any, state: Any) -> Any:
+        """Return the message that leaves at the end of the tick; default: the state."""
+        del params
+        return state
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Integrate over one tick."""
+        params, command = step_state.params, self.command(step_state)
+        h = 1.0 / (self.rate * self.substeps)
+
+        def substep(x: Any, _: None) -> tuple[Any, None]:
+            f = lambda y: self.derivative(params, y, command)  # noqa: E731
+            k1 = f(x)
+            k2 = f(_axpy(x, k1, h / 2))
+            k3 = f(_axpy(x, k2, h / 2))
+            k4 = f(_axpy(x, k3, h))
+            move = jax.tree_util.tree_map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+            return self.limit(params, _axpy(x, move, h)), None
+
+        start = jax.tree_util.tree_map(jnp.asarray, step_state.state)
+        state, _ = jax.lax.scan(substep, start, length=self.substeps, unroll=min(self.substeps, 4))
+        new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
+        return new, self.output(params, state)
+
+
+def _axpy(x: Any, direction: Any, factor: float) -> Any:
+    return jax.tree_util.tree_map(lambda a, b: a + factor * b, x, direction)
