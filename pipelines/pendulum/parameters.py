@@ -1,7 +1,7 @@
 """What can be told from a log of the pendulum, and how it maps onto the model's parameters.
 
 th'' = gain * V + gravity * sin(th) - damping * th' - friction * sign(th'). A log determines these four groups; J, K, R
-and the rest appear only in them, so the model keeps its nominal J, R and length and takes the groups through the others.
+and the rest appear only in them: the model keeps its nominal J, R and length and takes the groups through the others.
 """
 
 from __future__ import annotations
@@ -44,8 +44,13 @@ def from_groups(values: Mapping[str, Any], start: Any) -> PendulumParams:
     )
 
 
-def table(max_delay_s: float) -> ParameterTable:
-    """Return the parameters to identify: a factor of 4 either way of nominal, and delays up to ``max_delay_s`` [s]."""
+def table(max_delay_s: float, tick_s: float) -> ParameterTable:
+    """Return the parameters to identify: dynamics within a factor of 4 of nominal, and delays.
+
+    Args:
+        max_delay_s: Upper bound of each delay [s].
+        tick_s: The world's period [s].
+    """
     about = {
         "gain": ("rad/s^2/V", "acceleration per volt, K / (R J)"),
         "gravity": ("rad/s^2", "m g l / J"),
@@ -56,12 +61,15 @@ def table(max_delay_s: float) -> ParameterTable:
         Parameter(name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1])
         for name, value in groups(nominal_params()).items()
     ]
+    # The sensor interpolates between ticks of the world: at less than a tick it would have to see the future. As only
+    # the sum of both delays can be told from a log, nothing is lost.
     delays = [
-        Parameter(name, "s", 0.0, 0.0, max_delay_s, log=False, kind="delay", about=text)
-        for name, text in (
-            ("sensor_delay", "from the motion to the measurement's time stamp"),
-            ("actuator_delay", "from the command's departure to the motor"),
-        )
+        Parameter(
+            "sensor_delay", "s", 0.0, tick_s, max_delay_s, False, "delay", "from motion to measurement's time stamp"
+        ),
+        Parameter(
+            "actuator_delay", "s", 0.0, 0.0, max_delay_s, False, "delay", "from command's departure to the motor"
+        ),
     ]
     return ParameterTable([*dynamics, *delays])
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
+import mujoco  # pyright: ignore[reportAttributeAccessIssue]
 
 SUPPLY_V = 5.0
 """Voltage of the motor at full PWM [V]."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,11 +13,28 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Channel
 
-from . import parameters
-from .model import Agent, Command, DelayedWorld, SimActuator, SimSensor
+from sim2real.stages.config import GateLimits
+
+from . import hardware, parameters
+from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, SimActuator, SimSensor
+from .task import SwingUp, upright
 
 RATE_HZ = 50.0
+SUPERVISOR = "agent"
+COMMAND = ("actuator", "action")
+JOINTS = {
+    "sensor": {"hinge": {"position": "th", "velocity": "thdot"}},
+}
+_FEATURES = [("cos(th)", "1"), ("sin(th)", "1"), ("thdot / 10", "rad/s")]
+OBSERVATION = [
+    *_FEATURES,
+    *[(f"{name}[-{k + 1}]", unit) for k in range(HISTORY) for name, unit in _FEATURES],
+    *[(f"voltage[-{k + 1}]", "V") for k in range(HISTORY)],
+]
+ACTION = [("voltage", "V")]
 WORLD_HZ = 100.0
+DELAY_SPREAD_S = 0.002
+"""By how much delays vary between episodes of training, either way [s]."""
 EXPECTED_DELAY_S = {"sensor": 0.002, "agent": 0.002, "actuator": 0.002}
 """Computation delay that phases allow for: a bus transaction, and a policy with its thread's wake-up [s]."""
 
@@ -28,7 +46,7 @@ class IdentifiablePendulum:
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
 
     def __init__(self, max_delay_s: float = 0.06) -> None:
-        self.parameters: ParameterTable = parameters.table(max_delay_s)
+        self.parameters: ParameterTable = parameters.table(max_delay_s, 1 / WORLD_HZ)
         self.given: Mapping[str, Any] = {"actuator": Command(action="action")}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
@@ -77,6 +95,72 @@ def simulated_nodes(
     return {**nodes, "world": world}
 
 
-def hanging() -> np.ndarray:
-    """Return the state at rest: th = pi, thdot = 0."""
-    return np.array([np.pi, 0.0])
+def connect(port: str, limits: GateLimits, truth_path: Path, seed: int) -> hardware.Session:
+    """Open the robot on a port, or the embedded one, with torque off."""
+    return hardware.Session(port, limits, truth_path, seed)
+
+
+def recording_nodes(session: hardware.Session, signal: np.ndarray) -> dict[str, BaseNode]:
+    """Return the graph on hardware that plays a signal, one voltage a step ``(N,)`` [V]."""
+    agent = hardware.Excitation("agent", RATE_HZ, signal, delay=EXPECTED_DELAY_S["agent"])
+    return _on_hardware(session, agent)
+
+
+def deployment_nodes(session: hardware.Session, policy: Any) -> tuple[dict[str, BaseNode], dict[str, Any]]:
+    """Return the graph on hardware that runs a policy, and the agent's parameters."""
+    agent = Agent("agent", RATE_HZ, delay=EXPECTED_DELAY_S["agent"])
+    return _on_hardware(session, agent), {"agent": AgentParams(policy=policy)}
+
+
+def identifiable(max_delay_s: float) -> IdentifiablePendulum:
+    """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
+    return IdentifiablePendulum(max_delay_s)
+
+
+def training(
+    values: Mapping[str, float],
+    spread: Mapping[str, float],
+    computation: Mapping[str, DelayDistribution],
+    delays: bool,
+) -> tuple[dict[str, BaseNode], SwingUp]:
+    """Return the loop in simulation and the task.
+
+    Args:
+        values: Parameters by name.
+        spread: By how much the dynamics vary between episodes, as a share of each.
+        computation: Computation delays by node.
+        delays: Whether there are delays; without them every message arrives at once.
+    """
+    bounds = None
+    if delays:
+        # A tick less than the delay, for the sensor to interpolate; and room for the spread.
+        room = 1 / WORLD_HZ + DELAY_SPREAD_S
+        bounds = {
+            n: (values[n], max(0.0, values[n] - room), values[n] + DELAY_SPREAD_S)
+            for n in ("sensor_delay", "actuator_delay")
+        }
+    nodes = simulated_nodes(computation, bounds)
+    agent = cast(Agent, nodes["agent"])
+    return nodes, SwingUp(agent, values, spread, DELAY_SPREAD_S if delays else 0.0)
+
+
+def nominal() -> dict[str, float]:
+    """Return the data sheet's values, without delays."""
+    return {p.name: p.nominal for p in parameters.table(0.06, 1 / WORLD_HZ) if p.kind == "dynamics"}
+
+
+def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the share of the last half in which the pendulum was upright, and when it first was [s]."""
+    good = np.asarray(upright(states["th"], states["thdot"]))
+    last = t_s >= t_s[-1] - (t_s[-1] - t_s[0]) / 2
+    up = np.flatnonzero(np.cos(states["th"]) > 0.95)
+    return {
+        "success": float(good[last].mean()),
+        "first_upright_s": float(t_s[up[0]] - t_s[0]) if up.size else float("nan"),
+    }
+
+
+def _on_hardware(session: hardware.Session, agent: BaseNode) -> dict[str, BaseNode]:
+    sensor = hardware.ServoSensor("sensor", RATE_HZ, session.rig, delay=EXPECTED_DELAY_S["sensor"])
+    actuator = hardware.ServoActuator("actuator", RATE_HZ, session.rig, delay=EXPECTED_DELAY_S["actuator"])
+    return control_nodes(sensor, agent, actuator)

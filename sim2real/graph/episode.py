@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -150,7 +150,7 @@ def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves of a message by dotted name (``th``, ``pose.x``), in a fixed order."""
     import jax  # a log is written without JAX when messages are plain dictionaries
 
-    if isinstance(tree, Mapping) and all(not isinstance(v, Mapping) for v in tree.values()):
+    if isinstance(tree, Mapping) and not any(isinstance(v, Mapping) or is_dataclass(v) for v in tree.values()):
         return dict(tree)
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
 

@@ -122,7 +122,6 @@ class BaseNode:
 
     jittable: bool = True
     """Whether ``step`` may be traced by JAX; a node that talks to hardware in plain Python says False."""
-    _clock: Callable[[], float] | None = None
 
     def __init__(
         self,
@@ -153,6 +152,8 @@ class BaseNode:
         self.order = order
         self.inputs: dict[str, Connection] = {}
         self.outputs: list[Connection] = []
+        self._clock: Callable[[], float] | None = None
+        self._origin_ns = 0
 
     def connect(
         self,
@@ -201,6 +202,23 @@ class BaseNode:
         """Nominal time of the first output [s]."""
         return self.phase + self.delay
 
+    def now(self) -> float:
+        """Return the time since the episode's start [s], of the clock that the node runs on; 0 when it runs on none."""
+        return self._clock() if self._clock else 0.0
+
+    def at(self, monotonic_ns: int) -> float:
+        """Return a time of the machine's monotonic clock as time since the episode's start [s]."""
+        return (monotonic_ns - self._origin_ns) / 1e9
+
+    def set_clock(self, clock: Callable[[], float] | None, origin_ns: int = 0) -> None:
+        """Set what ``now`` and ``at`` go by; called by the runtime.
+
+        Args:
+            clock: Returns the time since the episode's start [s]; None when the node does not run.
+            origin_ns: The episode's start on the machine's monotonic clock.
+        """
+        self._clock, self._origin_ns = clock, origin_ns
+
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return the node's parameters."""
         del rng, graph_state
@@ -230,14 +248,6 @@ class BaseNode:
         """Make safe after an episode on the wall clock; called on every way out. Return whether that worked."""
         del timeout
         return True
-
-    def now(self) -> float:
-        """Return the time since the episode's start [s], on the clock that stamps messages; 0 outside of an episode."""
-        return 0.0 if self._clock is None else self._clock()
-
-    def set_clock(self, clock: Callable[[], float] | None) -> None:
-        """Set what ``now`` reads; called by a running graph."""
-        self._clock = clock
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Return the new step state and the output message."""

@@ -149,10 +149,9 @@ def derive(
     edges = dict(kept.edges)
     for key in transfers:
         connection = nodes[key[0]].inputs[key[1]]
-        arrivals = received.get(key)
-        if arrivals is None:
-            arrivals = np.maximum.accumulate(vertices[connection.output_node.name].end + transfers[key], axis=1)
         sender = connection.output_node.name
+        # Of a blocking input, `received` holds what steps waited for; messages after the last step have arrived too.
+        arrivals = np.maximum.accumulate(vertices[sender].end + transfers[key], axis=1)
         seq_in = consumer(connection, arrivals, vertices[key[0]], vertices[sender])
         edges[key] = Edge(arrivals, seq_in, sender)
     return Timeline(vertices, edges)

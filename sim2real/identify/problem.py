@@ -40,6 +40,11 @@ class Channel:
     position_sigma: float
     velocity_sigma: float
 
+    @property
+    def fields(self) -> tuple[tuple[str, float], tuple[str, float]]:
+        """Field and deviation of position and of velocity, in the order of residuals."""
+        return (self.position, self.position_sigma), (self.velocity, self.velocity_sigma)
+
 
 class IdentifiableModel(Protocol):
     """What a pipeline provides for identification."""
@@ -64,10 +69,10 @@ class Problem:
     Args:
         model: The pipeline's model.
         episode: The log.
-        begins_s: Where the segments start [s].
+        begins_s: Shape ``(E,)``: where the segments start [s].
         segment_s: Their length [s].
         max_delay_s: Upper bound of each delay [s].
-        fit_s: The initial state is fitted to this first part of a segment [s]; default: to all of it.
+        train: Shape ``(E,)``, bool: the segments that the loss is made of; default: all.
 
     Raises:
         UsageError: When the log lacks a node or a field, or a segment holds no measurement.
@@ -80,7 +85,7 @@ class Problem:
         begins_s: np.ndarray,
         segment_s: float,
         max_delay_s: float,
-        fit_s: float | None = None,
+        train: np.ndarray | None = None,
     ) -> None:
         self.model = model
         self.table = model.parameters
@@ -107,12 +112,15 @@ class Problem:
         self.ts = jnp.asarray(np.where(start < segment_s, start, 0.0), jnp.float32)
         # Before this a measurement shows the world from before the segment's start.
         self._from_s = max_delay_s + 1.0 / min(n.rate for n in nodes.values())
-        self._fit_s = segment_s if fit_s is None else fit_s
+        self.segment_s = segment_s
+        self.begins_s = np.asarray(begins_s)
+        self.train = np.flatnonzero(np.ones(len(begins_s), bool) if train is None else train)
         self._starts = jnp.asarray(_local_fits(episode, model, begins_s), jnp.float32)
         self.segments = self.graph.episodes
-        # How far an initial state may be from its estimate: four deviations of a measurement.
+        # How far an initial state may be from its estimate. Wide: a narrow one would tell the delays apart by the
+        # estimate's own bias, though shifting time between them changes nothing else.
         sigmas = [c.position_sigma for c in self.channels] + [c.velocity_sigma for c in self.channels]
-        self.prior = 4.0 * jnp.array(sigmas)
+        self.prior = 30.0 * jnp.array(sigmas)
 
     def _start(self, eps: Any, delay_s: Any) -> Any:
         """Return the initial state ``(2 * channels,)``: what was measured around the start, read ``delay_s`` later."""
@@ -121,6 +129,11 @@ class Problem:
         position = c[:, 0] + t * (c[:, 1] + t * (c[:, 2] + t * c[:, 3]))
         velocity = c[:, 1] + t * (2 * c[:, 2] + t * 3 * c[:, 3])
         return jnp.concatenate([position, velocity])
+
+    def measured(self, field: str) -> np.ndarray:
+        """Return a field's measurements in the places of the residuals, ``(E, C)``."""
+        table = self.graph.wiring.tables[-1].seq
+        return np.take_along_axis(np.asarray(self._measured[field]), np.maximum(table, 0), axis=1)
 
     def simulate(self, values: Mapping[str, Any], eps: Any, shift: Any) -> tuple[Any, Any]:
         """Simulate a segment from its estimated initial state plus ``shift``.
@@ -143,21 +156,20 @@ class Problem:
         counts = (seq >= 0) & (ts >= self._from_s)
         columns = []
         for c in self.channels:
-            for field, sigma in ((c.position, c.position_sigma), (c.velocity, c.velocity_sigma)):
+            for field, sigma in c.fields:
                 error = getattr(predicted, field) - self._measured[field][eps, at]
                 columns.append(jnp.where(counts, error / sigma, 0.0))
         return jnp.stack(columns, axis=1), jnp.where(counts, ts, -1.0)
 
-    def sensitivity(self, values: Mapping[str, Any], eps: Any) -> Any:
+    def sensitivity(self, values: Mapping[str, Any], eps: Any, shift: Any) -> Any:
         """Return how a segment's residuals move with its initial state, ``(2 * channels, C, 2 * channels)``.
 
         Each row is for a shift of one component by its prior deviation.
         """
-        n = 2 * len(self.channels)
-        push = jax.linearize(lambda s: self.residuals(values, eps, s)[0], jnp.zeros(n))[1]
+        push = jax.linearize(lambda s: self.residuals(values, eps, s)[0], shift)[1]
         return jax.vmap(push)(jnp.diag(self.prior))
 
-    def projected(self, values: Mapping[str, Any], eps: Any, sensitivity: Any) -> tuple[Any, Any, Any]:
+    def projected(self, values: Mapping[str, Any], eps: Any, sensitivity: Any) -> tuple[Any, Any]:
         """Return a segment's residuals at the best initial state near its estimate.
 
         Args:
@@ -166,15 +178,28 @@ class Problem:
             sensitivity: What ``sensitivity`` returned at these parameters, or at some close by.
 
         Returns:
-            Residuals ``(C, 2 * channels)``, their times ``(C,)`` [s] and the shift of the initial state.
+            Residuals ``(C, 2 * channels)`` and their times ``(C,)`` [s].
         """
         n = 2 * len(self.channels)
         error, ts = self.residuals(values, eps, jnp.zeros(n))
-        fitted = (ts >= 0) & (ts <= self._fit_s)
-        J = jnp.where(fitted[None, :, None], sensitivity, 0.0).reshape(n, -1)
-        r = jnp.where(fitted[:, None], error, 0.0).reshape(-1)
-        shift = jnp.linalg.solve(J @ J.T + jnp.eye(n), -J @ r)
-        return error + jnp.tensordot(shift, sensitivity, axes=1), ts, shift * self.prior
+        shift = self._solve(error, ts, sensitivity, jnp.zeros(n), self.segment_s)
+        return error + jnp.tensordot(shift, sensitivity, axes=1), ts
+
+    def predict(self, values: Mapping[str, Any], eps: Any, fit_s: Any) -> tuple[Any, Any]:
+        """Simulate a segment after fitting its initial state to the measurements of its first ``fit_s`` [s].
+
+        Returns:
+            Residuals ``(C, 2 * channels)``, scaled, and their times ``(C,)`` [s]; -1 where there is no measurement.
+        """
+        n = 2 * len(self.channels)
+
+        def improve(shift: Any, _: None) -> tuple[Any, None]:
+            error, ts = self.residuals(values, eps, shift)
+            step = self._solve(error, ts, self.sensitivity(values, eps, shift), shift / self.prior, fit_s)
+            return shift + step * self.prior, None
+
+        shift, _ = jax.lax.scan(improve, jnp.zeros(n), length=3)
+        return self.residuals(values, eps, shift)
 
     def losses(self, candidates: Any, around: Any) -> Any:
         """Return the mean robust loss of each candidate, ``(N,)``; about 0.5 per unit of squared scaled residual.
@@ -186,29 +211,38 @@ class Problem:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``.
         """
-        segments = jnp.arange(self.segments)
-        middle = self.table.decode(around)
-        columns = jax.vmap(lambda e: self.sensitivity(middle, e))(segments)
+        columns = self.sensitivities(around)
 
         def candidate(z: Any) -> Any:
             values = self.table.decode(z)
 
             def segment(eps: Any, sensitivity: Any) -> Any:
-                r, ts, _ = self.projected(values, eps, sensitivity)
+                r, ts = self.projected(values, eps, sensitivity)
                 # Pseudo-Huber at 5 sigma: a swing that falls to the other side must not decide the fit.
                 robust = 25.0 * (jnp.sqrt(1.0 + (r / 5.0) ** 2) - 1.0)
                 return jnp.sum(robust) / jnp.maximum(jnp.sum(ts >= 0) * r.shape[1], 1)
 
-            return jnp.mean(jax.vmap(segment)(segments, columns))
+            return jnp.mean(jax.vmap(segment)(jnp.asarray(self.train), columns))
 
         return jax.vmap(candidate)(candidates)
 
-    def stacked(self, z: Any, around: Any) -> Any:
-        """Return all projected residuals at ``z`` as one vector, with sensitivities at ``around``, for a Jacobian."""
-        segments = jnp.arange(self.segments)
-        values, middle = self.table.decode(z), self.table.decode(around)
-        columns = jax.vmap(lambda e: self.sensitivity(middle, e))(segments)
-        return jax.vmap(lambda e, c: self.projected(values, e, c)[0])(segments, columns).reshape(-1)
+    def sensitivities(self, z: Any) -> Any:
+        """Return the sensitivity of every segment of the loss at ``z``."""
+        values, zero = self.table.decode(z), jnp.zeros(2 * len(self.channels))
+        return jax.vmap(lambda e: self.sensitivity(values, e, zero))(jnp.asarray(self.train))
+
+    def stacked(self, z: Any, columns: Any) -> Any:
+        """Return all projected residuals at ``z``, ``(segments, C, 2 * channels)``, for given sensitivities."""
+        values = self.table.decode(z)
+        return jax.vmap(lambda e, c: self.projected(values, e, c)[0])(jnp.asarray(self.train), columns)
+
+    def _solve(self, error: Any, ts: Any, sensitivity: Any, shift: Any, fit_s: Any) -> Any:
+        """Return the Gauss-Newton step of the initial state, in units of the prior deviation."""
+        n = 2 * len(self.channels)
+        fitted = (ts >= 0) & (ts <= fit_s)
+        J = jnp.where(fitted[None, :, None], sensitivity, 0.0).reshape(n, -1)
+        r = jnp.where(fitted[:, None], error, 0.0).reshape(-1)
+        return jnp.linalg.solve(J @ J.T + jnp.eye(n), -J @ r - shift)
 
 
 def _check_log(episode: Episode, nodes: Mapping[str, BaseNode], model: IdentifiableModel) -> None:

@@ -66,8 +66,10 @@ class IdentifyConfig:
 
     log: str | None = None
     """MCAP log to identify from; default: the newest finished recording of the pipeline."""
-    segment_s: float = 2.0
-    """Length of the segments that are simulated from an estimated state of their own [s]."""
+    settle_s: float = 0.3
+    """First part of a segment, to which the initial state is fitted where the rest is predicted [s]."""
+    horizon_s: float = 1.0
+    """Rest of a segment: how far ahead predictions are compared with the log [s]."""
     held_out: float = 0.25
     """Share of the log, at its end, that is only predicted."""
     population: int = 32
@@ -87,8 +89,10 @@ class IdentifyConfig:
         """Check what can be checked before the log is read."""
         if not 0.05 <= self.held_out <= 0.8:
             raise UsageError(f"held_out must lie in [0.05, 0.8], got {self.held_out}")
-        if not 0.5 <= self.segment_s <= 60.0:
-            raise UsageError(f"segment_s must lie in [0.5, 60] s, got {self.segment_s}")
+        if not (0.1 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 60.0):
+            raise UsageError(
+                f"settle_s must lie in [0.1, 10] s and horizon_s in [0.2, 60] s, got {self.settle_s} and {self.horizon_s}"
+            )
         if self.population < 4 or self.generations < 1:
             raise UsageError(
                 f"the search needs a population of 4 and one generation at least, got {self.population} and "

@@ -66,7 +66,7 @@ class OdeWorld(BaseWorld):
             return self.limit(params, _axpy(x, move, h)), None
 
         start = jax.tree_util.tree_map(jnp.asarray, step_state.state)
-        state, _ = jax.lax.scan(substep, start, length=self.substeps, unroll=min(self.substeps, 4))
+        state, _ = jax.lax.scan(substep, start, length=self.substeps)
         new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
         return new, self.output(params, state)
 

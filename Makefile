@@ -1,0 +1,54 @@
+# Every target does its own set-up: .venv in this folder, from uv.lock. Only Python 3.11+ and pip are needed.
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+DOCS_READY := .venv/.ready-docs
+SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
+
+.PHONY: demo test bench docs format
+
+demo: $(READY)
+	$(BIN)/sim2real demo
+
+test: $(READY)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/python -m pytest
+
+bench: $(READY)
+	for bench in graph identify compose train log async; do $(BIN)/python scripts/bench.py $$bench || exit 1; done
+
+docs: $(DOCS_READY)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html docs docs/_build/html
+	@echo "wrote docs/_build/html/index.html"
+
+format: $(READY)
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+# uv and pip stay in .venv beside what uv.lock lists: hence --inexact.
+# Where packages come from a mirror that only pip is configured for, pip installs the same versions by their hashes.
+$(READY): pyproject.toml uv.lock | $(BIN)/uv
+	@echo "setting up .venv from uv.lock" >&2
+	@$(SYNC) --all-extras || { \
+	  echo "uv cannot reach the package index: installing the locked versions with pip" >&2; \
+	  $(BIN)/uv export --frozen --offline --quiet --all-extras --no-dev --no-emit-project -o .venv/requirements.txt && \
+	  $(BIN)/python -m pip install --quiet --no-deps -r .venv/requirements.txt && \
+	  $(BIN)/python -m pip install --quiet --no-deps --editable .; }
+	@touch $@
+
+$(DOCS_READY): $(READY)
+	@$(SYNC) --all-extras --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser
+	@touch $@
+
+$(BIN)/uv: | $(BIN)/pip
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+
+# Some distributions split ensurepip off: then the pip of $(PYTHON) installs one into the environment.
+$(BIN)/pip:
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else \
+	  f"error: sim2real needs Python 3.11 or newer, $(PYTHON) is {v}\n\nhint: make PYTHON=python3.11")'
+	@$(PYTHON) -m venv .venv || { $(PYTHON) -m venv --clear --without-pip .venv && \
+	  $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }

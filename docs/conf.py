@@ -1,0 +1,37 @@
+"""Sphinx configuration; `make docs` builds with it."""
+
+from importlib import metadata
+
+project = "sim2real"
+author = "The sim2real authors"
+copyright = author
+release = metadata.version("sim2real")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"sim2real {release}"
+
+myst_heading_anchors = 3
+
+# A name is documented once, in the module that defines it: hence no __all__, which repeats what is re-exported.
+apidoc_modules = [
+    {
+        "path": "../sim2real",
+        "destination": "reference/api",
+        "exclude_patterns": ["../sim2real/_pipelines"],
+        "separate_modules": True,
+        "module_first": True,
+        "automodule_options": {"members", "show-inheritance", "ignore-module-all"},
+    }
+]
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_class_signature = "mixed"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+# "Attributes:" of a dataclass become a list in its description instead of entries that repeat its fields.
+napoleon_use_ivar = True
+# Rooms may use the same class name; a reference by the bare name then has several targets.
+suppress_warnings = ["ref.python"]

@@ -1,0 +1,111 @@
+"""From a robot's log to a policy that works on that robot.
+
+The public names are imported when they are first used: ``import sim2real`` itself loads neither JAX nor MuJoCo.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim2real.errors import DeadlineExceeded as DeadlineExceeded
+    from sim2real.errors import HardwareLost as HardwareLost
+    from sim2real.errors import SafetyStop as SafetyStop
+    from sim2real.errors import Sim2RealError as Sim2RealError
+    from sim2real.errors import UsageError as UsageError
+    from sim2real.graph import Base as Base
+    from sim2real.graph import BaseNode as BaseNode
+    from sim2real.graph import BaseWorld as BaseWorld
+    from sim2real.graph import Connection as Connection
+    from sim2real.graph import EmpiricalDist as EmpiricalDist
+    from sim2real.graph import Empty as Empty
+    from sim2real.graph import Episode as Episode
+    from sim2real.graph import GraphState as GraphState
+    from sim2real.graph import InputState as InputState
+    from sim2real.graph import Jitter as Jitter
+    from sim2real.graph import Recorder as Recorder
+    from sim2real.graph import Scheduling as Scheduling
+    from sim2real.graph import StaticDist as StaticDist
+    from sim2real.graph import StepState as StepState
+    from sim2real.graph import Timeline as Timeline
+    from sim2real.graph import TrainableDist as TrainableDist
+    from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
+    from sim2real.runtime.compiled import CompiledGraph as CompiledGraph
+    from sim2real.stages.pipeline import Pipeline as Pipeline
+    from sim2real.train.networks import Policy as Policy
+
+    __version__: str
+
+__all__ = [
+    "AsyncGraph",
+    "Base",
+    "BaseNode",
+    "BaseWorld",
+    "CompiledGraph",
+    "Connection",
+    "DeadlineExceeded",
+    "EmpiricalDist",
+    "Empty",
+    "Episode",
+    "GraphState",
+    "HardwareLost",
+    "InputState",
+    "Jitter",
+    "Pipeline",
+    "Policy",
+    "Recorder",
+    "SafetyStop",
+    "Scheduling",
+    "Sim2RealError",
+    "StaticDist",
+    "StepState",
+    "Timeline",
+    "TrainableDist",
+    "UsageError",
+]
+
+_HOMES = {
+    "sim2real.errors": ("DeadlineExceeded", "HardwareLost", "SafetyStop", "Sim2RealError", "UsageError"),
+    "sim2real.graph": (
+        "Base",
+        "BaseNode",
+        "BaseWorld",
+        "Connection",
+        "EmpiricalDist",
+        "Empty",
+        "Episode",
+        "GraphState",
+        "InputState",
+        "Jitter",
+        "Recorder",
+        "Scheduling",
+        "StaticDist",
+        "StepState",
+        "Timeline",
+        "TrainableDist",
+    ),
+    "sim2real.runtime.asynchronous": ("AsyncGraph",),
+    "sim2real.runtime.compiled": ("CompiledGraph",),
+    "sim2real.stages.pipeline": ("Pipeline",),
+    "sim2real.train.networks": ("Policy",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its module on first use."""
+    if name == "__version__":
+        from importlib import metadata
+
+        value: Any = metadata.version("sim2real")
+    elif name in _HOME_OF:
+        value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    else:
+        raise AttributeError(f"module 'sim2real' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__, "__version__"])

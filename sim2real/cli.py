@@ -1,0 +1,335 @@
+"""The command line: arguments in, a stage called, an exit code out."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+
+if TYPE_CHECKING:
+    from sim2real.stages.pipeline import Pipeline
+    from sim2real.stages.runs import StageFolder
+
+DEMO_PIPELINE = "pendulum"
+DEBUG = "SIM2REAL_DEBUG"
+
+EXIT_CODES = """\
+exit codes
+  0  finished                    4  hardware lost: a port or a device does not answer
+  1  error                       5  deadlines missed (with --strict-timing)
+  2  wrong command or flag       130, 143  ended by Ctrl-C, by SIGTERM; the robot is switched off first
+  3  safety stop"""
+
+HELP = f"""\
+From a robot's log to a policy that works on that robot
+
+usage: sim2real COMMAND [PIPELINE] [FLAGS]
+
+  record    record the robot under an excitation
+  identify  identify dynamics, delays and initial states from the log
+  train     train a policy on the identified model with the robot's timing
+  deploy    run the policy on the robot and compare with the simulation
+  run       all four, one after the other; --resume RUN goes on where it ended
+  demo      run on the embedded {DEMO_PIPELINE}, with its defaults
+  view      open a run in the Rerun viewer, or save it as a recording
+  report    write a run's report as one HTML page
+  info      about the installation, a pipeline, a log or a run
+
+examples
+  sim2real demo --seed 1
+  sim2real record {DEMO_PIPELINE} --duration-s 20 --gate.limit 1.5
+  sim2real train {DEMO_PIPELINE} --help
+  sim2real run {DEMO_PIPELINE} --train.episode-s 4
+  sim2real report {DEMO_PIPELINE}
+  sim2real info runs/{DEMO_PIPELINE}/TIME/record/session.mcap
+
+Results go to stdout, progress and errors to stderr. Every stage writes into runs/PIPELINE/TIME/STAGE.
+SIM2REAL_DEBUG=1 shows the traceback of an error.
+
+{EXIT_CODES}"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code.
+
+    Args:
+        argv: Arguments without the program's name; None takes the process's own.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    with _signals_as_exceptions():
+        try:
+            _dispatch(arguments)
+            sys.stdout.flush()
+        except Sim2RealError as error:
+            if os.environ.get(DEBUG):
+                traceback.print_exc()
+            print("\n".join([f"error: {error}", *getattr(error, "__notes__", [])]), file=sys.stderr)
+            return error.exit_code
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return 128 + signal.SIGINT
+        except SystemExit as end:
+            return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
+        except Exception as error:
+            if os.environ.get(DEBUG):
+                traceback.print_exc()
+            reason = " ".join(str(error).split()) or "no message"
+            print(f"error: {type(error).__name__}: {reason} (traceback in {_save_traceback()})", file=sys.stderr)
+            return ERROR
+    return OK
+
+
+def _dispatch(arguments: list[str]) -> None:
+    """Find the command and call it."""
+    command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    if command in ("-h", "--help", "help"):
+        print(HELP)
+    elif command in ("-V", "--version"):
+        import sim2real
+
+        print(f"sim2real {sim2real.__version__}")
+    elif command in COMMANDS:
+        COMMANDS[command](command, rest)
+    else:
+        kind = "flag" if command.startswith("-") else "command"
+        available = ", ".join([*COMMANDS, "--help", "--version"] if kind == "flag" else COMMANDS)
+        raise UsageError(f"unknown {kind} {command!r}. Available: {available}", hint="see `sim2real --help`")
+
+
+def _stage(stage: str, arguments: list[str]) -> None:
+    """``sim2real STAGE PIPELINE [flags]``."""
+    from sim2real.stages import flags, runs
+
+    pipeline, rest = _pipeline_first(stage, arguments)
+    config = getattr(pipeline, stage)
+    parsed = flags.parse(
+        flags.StageFlags(config),
+        rest,
+        prog=f"sim2real {stage} {pipeline.name}",
+        description=_summary(config),
+        epilog=_epilog(f"sim2real {stage} {pipeline.name} --runs /data/runs", f"sim2real report {pipeline.name}"),
+        kind=flags.StageFlags[type(config)],
+    )
+    run_dir = runs.find_run(parsed.runs, parsed.run, pipeline.name) if parsed.run else None
+    _call_stage(stage, pipeline, parsed.config, parsed.runs, run_dir)
+
+
+def _run(command: str, arguments: list[str]) -> None:
+    """``sim2real run PIPELINE [flags]``."""
+    from sim2real.stages import flags, runs
+
+    pipeline, rest = _pipeline_first(command, arguments)
+    default = flags.RunFlags(**{stage: getattr(pipeline, stage) for stage in runs.STAGES})
+    texts = {
+        "prog": f"sim2real run {pipeline.name}",
+        "description": "Record, identify, train and deploy, one after the other.",
+        "epilog": _epilog(
+            f"sim2real run {pipeline.name} --seed 3 --record.duration-s 20",
+            f"sim2real run {pipeline.name} --resume runs/{pipeline.name}/TIME",
+        ),
+    }
+    parsed = flags.parse(default, rest, **texts)
+    if parsed.seed is not None:
+        # The seed becomes the stages' default and the flags are read again: a stage's own seed flag wins.
+        parsed = flags.parse(_seeded(default, parsed.seed), rest, **texts)
+    _run_all(pipeline, parsed)
+
+
+def _demo(command: str, arguments: list[str]) -> None:
+    """``sim2real demo [flags]``."""
+    from sim2real.stages import flags, runs
+    from sim2real.stages.pipeline import load_pipeline
+
+    parsed = flags.parse(
+        flags.DemoFlags(),
+        arguments,
+        prog=f"sim2real {command}",
+        description=f"Record, identify, train and deploy the embedded {DEMO_PIPELINE}, with its defaults.",
+        epilog=_epilog("sim2real demo --seed 1", f"sim2real run {DEMO_PIPELINE} --help"),
+    )
+    pipeline = load_pipeline(DEMO_PIPELINE)
+    stages = {stage: getattr(pipeline, stage) for stage in runs.STAGES}
+    everything = flags.RunFlags(seed=parsed.seed, runs=parsed.runs, resume=parsed.resume, **stages)
+    _run_all(pipeline, everything if parsed.seed is None else _seeded(everything, parsed.seed))
+
+
+def _view(command: str, arguments: list[str]) -> None:
+    """``sim2real view RUN|PIPELINE [--save FILE.rrd]`` and ``sim2real report RUN|PIPELINE``."""
+    from sim2real.stages import console, flags, runs
+    from sim2real.stages.pipeline import available
+
+    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
+        names = ", ".join(sorted(available())) or "none"
+        raise UsageError(
+            f"{command} needs a run folder or a pipeline before its flags. Pipelines: {names}",
+            hint=f"see `sim2real {command} --help`",
+        )
+    target, rest = ("RUN|PIPELINE", arguments) if arguments[0].startswith("-") else (arguments[0], arguments[1:])
+    looks = {
+        "view": (flags.ViewFlags(), "Open a run in the Rerun viewer: a run folder, or a pipeline's newest run."),
+        "report": (
+            flags.TargetFlags(),
+            "Write a run's report as one HTML page: of a run folder, or a pipeline's newest.",
+        ),
+    }
+    default, description = looks[command]
+    epilog = _epilog(f"sim2real {command} {DEMO_PIPELINE}", f"sim2real {command} runs/{DEMO_PIPELINE}/TIME")
+    parsed = flags.parse(default, rest, f"sim2real {command} {target}", description, epilog)
+    run_dir = runs.find_run(parsed.runs, target)
+    if isinstance(parsed, flags.ViewFlags):
+        from sim2real.view.recording import view
+
+        view(run_dir, parsed.save)
+        if parsed.save is not None:
+            console.wrote(parsed.save)
+    else:
+        from sim2real.view.page import report
+
+        console.wrote(report(run_dir))
+
+
+def _info(command: str, arguments: list[str]) -> None:
+    """``sim2real info [PIPELINE|LOG|RUN]``."""
+    from sim2real.stages import flags, info, runs
+    from sim2real.stages.pipeline import available
+
+    named = bool(arguments) and not arguments[0].startswith("-")
+    target, rest = (arguments[0], arguments[1:]) if named else (None, arguments)
+    description = "About the installation; or about a pipeline, an MCAP log, a run folder."
+    epilog = _epilog("sim2real info", f"sim2real info {DEMO_PIPELINE}", f"sim2real info runs/{DEMO_PIPELINE}/TIME")
+    parsed = flags.parse(flags.TargetFlags(), rest, f"sim2real {command} [PIPELINE|LOG|RUN]", description, epilog)
+    if target is None:
+        print(info.installation())
+    elif Path(target).is_file():
+        print(info.log(Path(target)))
+    elif target in available():
+        print(info.pipeline(target, parsed.runs))
+    else:
+        print(info.run(runs.find_run(parsed.runs, target)))
+
+
+COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
+    "record": _stage,
+    "identify": _stage,
+    "train": _stage,
+    "deploy": _stage,
+    "run": _run,
+    "demo": _demo,
+    "view": _view,
+    "report": _view,
+    "info": _info,
+}
+
+
+def _run_all(pipeline: Pipeline, flags: Any) -> None:
+    """Run the four stages in one run folder; from the first one on that is not finished there."""
+    from sim2real.stages import console, runs
+
+    run_dir = runs.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
+    redo = run_dir is None
+    for number, stage in enumerate(runs.STAGES, 1):
+        done = None if redo or run_dir is None else runs.finished(run_dir, stage)
+        if done is not None:
+            console.note(f"{stage} ({number}/{len(runs.STAGES)}): finished before, skipped")
+            continue
+        redo = True  # what comes after a stage that ran again is out of date
+        console.note(f"{stage} ({number}/{len(runs.STAGES)})")
+        run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir).run_dir
+
+
+def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> StageFolder:
+    """Call a stage's entry point and print its summary and what it wrote."""
+    from sim2real.stages import console
+
+    done = importlib.import_module(f"sim2real.stages.{stage}").run(pipeline, config, root, run_dir)
+    if done.manifest["summary"]:
+        print(console.pairs(done.manifest["summary"]))
+    for path in [*done.outputs.values(), done.folder / "manifest.json"]:
+        console.wrote(path)
+    return done
+
+
+def _pipeline_first(command: str, arguments: list[str]) -> tuple[Pipeline, list[str]]:
+    """Take the pipeline off the arguments; without one, ``--help`` shows the demo's."""
+    from sim2real.stages.pipeline import available, load_pipeline
+
+    if arguments and arguments[0] in ("-h", "--help"):
+        return load_pipeline(DEMO_PIPELINE), ["--help"]
+    if not arguments or arguments[0].startswith("-"):
+        raise UsageError(
+            f"{command} needs a pipeline before its flags. Available: {', '.join(sorted(available())) or 'none'}",
+            hint=f"sim2real {command} PIPELINE [FLAGS]; see `sim2real {command} --help`",
+        )
+    return load_pipeline(arguments[0]), arguments[1:]
+
+
+def _seeded(flags: Any, seed: int) -> Any:
+    """Return the flags of a run with one seed in every stage."""
+    from sim2real.stages.runs import STAGES
+
+    return replace(flags, **{stage: replace(getattr(flags, stage), seed=seed) for stage in STAGES})
+
+
+def _summary(config: Any) -> str:
+    return (type(config).__doc__ or "").strip().splitlines()[0]
+
+
+def _epilog(*examples: str) -> str:
+    return "\n".join(["examples", *(f"  {example}" for example in examples), "", EXIT_CODES])
+
+
+def _save_traceback() -> str:
+    """Write the traceback of the exception at hand to a file and return its path."""
+    with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
+        file.write(traceback.format_exc())
+    return file.name
+
+
+@contextmanager
+def _signals_as_exceptions() -> Iterator[None]:
+    """Turn SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
+
+    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away.
+    """
+    raised = False
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        nonlocal raised
+        del frame
+        if raised:
+            os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
+            return
+        raised = True
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    # nohup and background jobs of a shell start with signals ignored; they stay ignored.
+    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

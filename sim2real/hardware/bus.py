@@ -1,0 +1,308 @@
+"""The servo bus: what a control loop does with DYNAMIXEL X servos, in SI units, and how it leaves them."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from dynamixel_sdk.group_sync_read import GroupSyncRead
+from dynamixel_sdk.group_sync_write import GroupSyncWrite
+
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.link import BusConfig, BusLink, Transaction, watchdog_message
+from sim2real.hardware.protocol import BROADCAST_ID, Instruction, build
+from sim2real.hardware.registers import OperatingMode, Register
+
+__all__ = ["BusConfig", "ServoBus", "StateReading", "Transaction"]
+
+_LOGGER = logging.getLogger(__name__)
+_STATE_ADDRESS: Final = reg.PRESENT_LOAD.address
+_STATE_BYTES: Final = reg.PRESENT_POSITION.end - _STATE_ADDRESS
+_STATE_DTYPE: Final = np.dtype([("load", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
+_SAFE_REPEATS: Final = 5
+_SAFE_PAUSE_S: Final = 0.002
+
+
+@dataclass(frozen=True)
+class StateReading:
+    """What the servos measured, in the order of the ids asked for.
+
+    Args:
+        position_rad: (n,) from each encoder's zero.
+        velocity_rad_s: (n,)
+        load: (n,) share of the largest load, in [-1, 1]; servos that report current instead: in units of 1000 counts.
+        transaction: When it was asked for, and what that took.
+    """
+
+    position_rad: np.ndarray
+    velocity_rad_s: np.ndarray
+    load: np.ndarray
+    transaction: Transaction
+
+
+class ServoBus:
+    """DYNAMIXEL X servos on one port. Every method may be called from any thread.
+
+    A missed answer is counted and asked for again; a bus that stays silent raises HardwareLost. Leaving the context,
+    `close`, or the end of the interpreter take the torque off. A signal does not unless its handler calls `make_safe`;
+    a killed host is what the servos' own watchdog is for.
+
+        with ServoBus(BusConfig("/dev/ttyUSB0")) as bus:
+            bus.handshake({1: None})
+            bus.setup(OperatingMode.PWM)
+            bus.torque(True)
+            bus.write_goal_pwm({1: 0.1})
+            print(bus.read_state().position_rad)
+
+    Args:
+        config: Port and limits.
+
+    Raises:
+        HardwareLost: The port cannot be opened.
+    """
+
+    def __init__(self, config: BusConfig) -> None:
+        self.config = config
+        self._link = BusLink(config)
+        self._ids: tuple[int, ...] = ()
+        self._readers: dict[tuple[int, ...], GroupSyncRead] = {}
+        self._torque_off_packet = b""
+        self._halted = False
+        atexit.register(self.close)
+
+    def __enter__(self) -> Self:
+        """Return the open bus."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The servos found by `handshake`."""
+        return self._ids
+
+    @property
+    def transactions(self) -> int:
+        """Instructions carried out so far."""
+        return self._link.transactions
+
+    @property
+    def lost_replies(self) -> int:
+        """Answers missed so far."""
+        return self._link.lost_replies
+
+    @property
+    def retries(self) -> int:
+        """Instructions sent again so far."""
+        return self._link.retries
+
+    def handshake(self, expected: Mapping[int, int | None]) -> dict[int, int]:
+        """Find the servos; from now on they are the ones whose torque `close` takes off.
+
+        Args:
+            expected: Model number by servo id; None accepts any model.
+
+        Returns:
+            The model number found, by id.
+
+        Raises:
+            HardwareLost: A servo does not answer, or is another model.
+        """
+        models = {servo_id: self._ping(servo_id) for servo_id in expected}
+        for servo_id, wanted in expected.items():
+            if wanted is not None and models[servo_id] != wanted:
+                names = [reg.MODEL_NAMES.get(model, "unknown") for model in (models[servo_id], wanted)]
+                raise HardwareLost(
+                    f"servo {servo_id} is model {models[servo_id]} ({names[0]}), expected {wanted} ({names[1]})"
+                )
+        self._ids = tuple(expected)
+        # Built now, so that make_safe has nothing to compute.
+        head = reg.TORQUE_ENABLE.address.to_bytes(2, "little") + reg.TORQUE_ENABLE.size.to_bytes(2, "little")
+        torque_off = b"".join(bytes((servo_id, 0)) for servo_id in self._ids)
+        self._torque_off_packet = build(BROADCAST_ID, Instruction.SYNC_WRITE, head + torque_off)
+        return models
+
+    def scan(self) -> dict[int, int]:
+        """Return the model number of every servo that answers a broadcast ping, by id; takes 0.8 s at 1 Mbaud."""
+        with self._link.hold():
+            found, _ = self._link.packets.broadcastPing(self._link.port)
+        return {servo_id: model for servo_id, (model, _) in sorted(found.items())}
+
+    def setup(self, mode: OperatingMode) -> None:
+        """Prepare the servos for a control loop, with torque off: operating mode, answers without delay.
+
+        EEPROM registers are only written where they differ, for they wear out.
+        """
+        for servo_id in self._ids:
+            self.write(servo_id, reg.TORQUE_ENABLE, 0)
+            self.write(servo_id, reg.BUS_WATCHDOG, 0)
+            self.write(servo_id, reg.STATUS_RETURN_LEVEL, 2)
+            for register, value in ((reg.RETURN_DELAY_TIME, 0), (reg.OPERATING_MODE, int(mode))):
+                if self.read(servo_id, register) != value:
+                    self.write(servo_id, register, value)
+
+    def torque(self, on: bool) -> None:
+        """Switch the torque of all servos; on: with goals at rest (no PWM, no speed, or the present position).
+
+        The bus watchdog is armed once torque is on, and disarmed, which also clears it, before that.
+
+        Raises:
+            SafetyStop: `make_safe` or `close` came before.
+        """
+        if on and self._halted:
+            raise SafetyStop("torque stays off: the bus has been made safe", hint="open the bus again")
+        for servo_id in self._ids:
+            if on:
+                self.write(servo_id, reg.BUS_WATCHDOG, 0)
+                self._rest_goal(servo_id)
+            self.write(servo_id, reg.TORQUE_ENABLE, int(on))
+            self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count if on else 0)
+
+    def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
+        """Read position, velocity and load of some servos (default: all) in one transaction."""
+        ids = self._ids if ids is None else tuple(ids)
+        if not ids:
+            raise UsageError("there are no servos to read", hint="call handshake first")
+        if len(ids) == 1:
+            data, transaction = self._link.read_bytes(ids[0], _STATE_ADDRESS, _STATE_BYTES, "read of the state")
+        else:
+            data, transaction = self._read_states(ids)
+        counts = np.frombuffer(data, _STATE_DTYPE)
+        return StateReading(
+            position_rad=counts["position"] * reg.RAD_PER_COUNT,
+            velocity_rad_s=counts["velocity"] * reg.RAD_S_PER_COUNT,
+            load=counts["load"] / reg.LOAD_FULL_SCALE,
+            transaction=transaction,
+        )
+
+    def write_goal_pwm(self, goals: Mapping[int, float]) -> Transaction:
+        """Command shares of the supply voltage, in [-1, 1], by servo id.
+
+        One servo confirms its goal; several get theirs in one instruction, at the same time and without an answer.
+
+        Raises:
+            SafetyStop: A goal is not finite or out of range, or the servo's watchdog has tripped.
+        """
+        return self._write_goals(reg.GOAL_PWM, goals, reg.pwm_from_fraction, 1.0)
+
+    def write_goal_velocity(self, goals: Mapping[int, float]) -> Transaction:
+        """Command speeds in rad/s, by servo id; otherwise as `write_goal_pwm`."""
+        return self._write_goals(
+            reg.GOAL_VELOCITY, goals, reg.count_from_rad_s, reg.rad_s_from_count(reg.GOAL_VELOCITY.maximum)
+        )
+
+    def write_goal_position(self, goals: Mapping[int, float]) -> Transaction:
+        """Command positions in rad from each encoder's zero, by servo id; otherwise as `write_goal_pwm`."""
+        return self._write_goals(
+            reg.GOAL_POSITION, goals, reg.count_from_rad, reg.rad_from_count(reg.GOAL_POSITION.maximum)
+        )
+
+    def read(self, servo_id: int, register: Register) -> int:
+        """Return a register's value in counts."""
+        return self._link.read(servo_id, register)
+
+    def write(self, servo_id: int, register: Register, value: int) -> Transaction:
+        """Write a value in counts to a register, and wait for the servo to confirm it."""
+        return self._link.write(servo_id, register, value)
+
+    def check(self) -> None:
+        """Raise SafetyStop if a servo's watchdog has tripped or it reports a hardware error; for a slow loop.
+
+        Goals written to several servos at once are not confirmed, so that nothing else would tell.
+        """
+        for servo_id in self._ids:
+            if self.read(servo_id, reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+                raise SafetyStop(*watchdog_message(servo_id))
+
+    def make_safe(self) -> None:
+        """Take the torque off without waiting for anything or anyone: for signal handlers and watchdog threads.
+
+        It takes no lock, for the code that it interrupts may hold it. The instruction may meet an answer on the wire
+        and be lost; therefore it is sent several times, over 8 ms. Torque cannot go on again afterwards.
+        """
+        self._halted = True
+        if not self._torque_off_packet or self._link.closed:
+            return
+        with suppress(OSError):
+            for repeat in range(_SAFE_REPEATS):
+                time.sleep(_SAFE_PAUSE_S if repeat else 0.0)
+                os.write(self._link.port.fd, self._torque_off_packet)
+
+    def close(self) -> None:
+        """Take the torque off, disarm the watchdogs, close the port. Never raises; closing twice is fine.
+
+        The watchdog of a servo that does not confirm stays armed: it is then what stops that servo.
+        """
+        if self._link.closed:
+            return
+        self._halted = True
+        for servo_id in self._ids:
+            if self._link.force(servo_id, reg.TORQUE_ENABLE, 0):
+                self._link.force(servo_id, reg.BUS_WATCHDOG, 0)
+            else:
+                _LOGGER.error("servo %d did not confirm that its torque is off", servo_id)
+        self._link.close()
+        atexit.unregister(self.close)
+
+    def _ping(self, servo_id: int) -> int:
+        """Return the model number of a servo that must be there."""
+        link = self._link
+        try:
+            return link.exchange(lambda: link.packets.ping(link.port, servo_id), f"ping of servo {servo_id}")[0]
+        except HardwareLost as error:
+            raise HardwareLost(
+                f"servo {servo_id} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
+                f"Available: {sorted(self.scan())}",
+                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms",
+            ) from error
+
+    def _rest_goal(self, servo_id: int) -> None:
+        mode = self.read(servo_id, reg.OPERATING_MODE)
+        if mode == OperatingMode.PWM:
+            self.write(servo_id, reg.GOAL_PWM, 0)
+        elif mode == OperatingMode.VELOCITY:
+            self.write(servo_id, reg.GOAL_VELOCITY, 0)
+        else:
+            self.write(servo_id, reg.GOAL_POSITION, self.read(servo_id, reg.PRESENT_POSITION))
+
+    def _write_goals(
+        self, register: Register, goals: Mapping[int, float], to_count: Callable[[float], int], limit: float
+    ) -> Transaction:
+        for servo_id, goal in goals.items():
+            if not math.isfinite(goal) or abs(goal) > limit:
+                raise SafetyStop(f"{register.name} of servo {servo_id}: {goal} is outside [-{limit:.6g}, {limit:.6g}]")
+        if len(goals) == 1:
+            ((servo_id, goal),) = goals.items()
+            return self.write(servo_id, register, to_count(goal))
+        group = GroupSyncWrite(self._link.port, self._link.packets, register.address, register.size)
+        for servo_id, goal in goals.items():
+            group.addParam(servo_id, list(register.encode(to_count(goal))))
+        return self._link.exchange(lambda: ((), group.txPacket(), 0), f"write of {register.name}")[2]
+
+    def _read_states(self, ids: tuple[int, ...]) -> tuple[bytes, Transaction]:
+        """Return the state blocks of several servos, one behind the other."""
+        if ids not in self._readers:
+            self._readers[ids] = GroupSyncRead(self._link.port, self._link.packets, _STATE_ADDRESS, _STATE_BYTES)
+            for servo_id in ids:
+                self._readers[ids].addParam(servo_id)
+        group = self._readers[ids]
+
+        def attempt() -> tuple[bytes, int, int]:
+            result = group.txRxPacket()
+            return b"".join(bytes(group.data_dict[servo_id]) for servo_id in ids), result, 0
+
+        data, _, transaction = self._link.exchange(
+            attempt, f"read of the state of servos {ids}", len(ids) * _STATE_BYTES
+        )
+        return data, transaction

@@ -1,0 +1,150 @@
+"""The safety gate: the last thing a command passes before it reaches an actuator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.errors import SafetyStop, UsageError
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """What a command may be.
+
+    Args:
+        limit: Largest magnitude, or (low, high), in the command's unit.
+        slew_per_s: Largest change per second; None: any.
+        command_timeout_s: A command older than this becomes zero.
+        max_speed_rad_s: A measured speed beyond this stops the robot; None: not watched.
+        node: Name of the actuator's node, for messages.
+    """
+
+    limit: float | tuple[float, float] = 1.0
+    slew_per_s: float | None = None
+    command_timeout_s: float = 0.1
+    max_speed_rad_s: float | None = None
+    node: str = "actuator"
+
+    def __post_init__(self) -> None:
+        """Refuse limits that let nothing through, or keep nothing out."""
+        low, high = self.range
+        if not low <= 0.0 <= high:
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
+        for name in ("slew_per_s", "command_timeout_s", "max_speed_rad_s"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The lowest and the highest command."""
+        return self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
+
+
+@dataclass
+class GateCounts:
+    """How often the gate was passed, and how often each of its limits changed a command.
+
+    Args:
+        passed: Calls that returned a command.
+        clamped: Calls with a value outside the limit.
+        slewed: Calls with a change that was too fast.
+        stale: Calls with a command that was too old.
+    """
+
+    passed: int = 0
+    clamped: int = 0
+    slewed: int = 0
+    stale: int = 0
+
+
+class SafetyGate:
+    """Clamps, slows down and refuses commands of one or several actuators.
+
+    Once it has stopped the robot it stays stopped: every later call raises the same SafetyStop, until `reset`.
+
+    Args:
+        config: The limits, the same for every actuator.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self.config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again: counts and slew limit at zero, no longer stopped."""
+        self.counts = GateCounts()
+        self._last: np.ndarray | None = None
+        self._last_s = 0.0
+        self._stop: SafetyStop | None = None
+
+    def apply(
+        self, command: np.ndarray, age_s: float, now_s: float, speed_rad_s: np.ndarray | float | None = None
+    ) -> np.ndarray:
+        """Return the command that may be sent.
+
+        A stale command becomes zero at once, whatever the slew limit: zero is the safe command. The slew limit starts
+        from zero at the first call.
+
+        Args:
+            command: (n,) What the policy wants.
+            age_s: Since the policy decided; NaN counts as stale.
+            now_s: Clock of the slew limit.
+            speed_rad_s: (n,) or scalar, measured, if there is a limit for it.
+
+        Returns:
+            (n,) float64.
+
+        Raises:
+            SafetyStop: A value is not finite, or a speed is beyond its limit or not finite.
+        """
+        if self._stop is not None:
+            raise self._stop
+        wanted = np.array(command, dtype=np.float64, ndmin=1)
+        self._require_finite("command", wanted)
+        self._require_slow(speed_rad_s)
+        if not age_s <= self.config.command_timeout_s:
+            self.counts.stale += 1
+            allowed = np.zeros_like(wanted)
+        else:
+            allowed = self._slew(self._clamp(wanted), now_s)
+        self._last, self._last_s = allowed, now_s
+        self.counts.passed += 1
+        return allowed.copy()
+
+    def _clamp(self, wanted: np.ndarray) -> np.ndarray:
+        clamped = np.clip(wanted, *self.config.range)
+        self.counts.clamped += bool(np.any(clamped != wanted))
+        return clamped
+
+    def _slew(self, wanted: np.ndarray, now_s: float) -> np.ndarray:
+        if self.config.slew_per_s is None:
+            return wanted
+        last, last_s = (np.zeros_like(wanted), now_s) if self._last is None else (self._last, self._last_s)
+        largest = self.config.slew_per_s * max(0.0, now_s - last_s)
+        slewed = np.clip(wanted, last - largest, last + largest)
+        self.counts.slewed += bool(np.any(slewed != wanted))
+        return slewed
+
+    def _require_finite(self, what: str, values: np.ndarray) -> None:
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            index = int(bad[0])
+            self._halt(f"{what}[{index}] = {values[index]} is not finite")
+
+    def _require_slow(self, speed_rad_s: np.ndarray | float | None) -> None:
+        limit = self.config.max_speed_rad_s
+        if limit is None or speed_rad_s is None:
+            return
+        speeds = np.array(speed_rad_s, dtype=np.float64, ndmin=1)
+        self._require_finite("speed_rad_s", speeds)
+        index = int(np.argmax(np.abs(speeds)))
+        if math.fabs(speeds[index]) > limit:
+            self._halt(f"speed_rad_s[{index}] = {speeds[index]:.4g} is beyond the limit of {limit:.4g} rad/s")
+
+    def _halt(self, reason: str) -> None:
+        self._stop = SafetyStop(f"node {self.config.node!r} stopped: {reason}")
+        raise self._stop

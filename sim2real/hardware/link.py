@@ -1,0 +1,236 @@
+"""One transaction at a time: the lock around ROBOTIS' SDK, the retries, and what a servo's refusal means."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Final, NoReturn, TypeVar
+
+from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
+from dynamixel_sdk.robotis_def import COMM_SUCCESS
+
+from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.port import WaitingPort
+from sim2real.hardware.protocol import ALERT_BIT, StatusError
+from sim2real.hardware.registers import Register
+
+_REASONS: Final[dict[int, str]] = {
+    StatusError.RESULT_FAIL: "it failed to carry it out",
+    StatusError.INSTRUCTION: "it does not know the instruction",
+    StatusError.CRC: "the instruction arrived with a wrong checksum",
+    StatusError.DATA_RANGE: "the value is out of the register's range",
+    StatusError.DATA_LENGTH: "the data are shorter than the register",
+    StatusError.DATA_LIMIT: "the value is beyond a limit set in the servo",
+    StatusError.ACCESS: "the register cannot be written or read now (EEPROM registers: not while torque is on)",
+}
+_LOCK_TIMEOUT_S: Final = 0.5
+_FORCED_ATTEMPTS: Final = 5
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class BusConfig:
+    """The port, and when a silent bus is given up.
+
+    Args:
+        port: Device file, e.g. /dev/ttyUSB0.
+        baud_rate: Bits per second.
+        reply_timeout_s: How long an answer may be late. A USB adapter whose latency timer is 16 ms needs more than
+            that, or, better, a latency timer of 1 ms.
+        max_consecutive_losses: So many answers missing in a row are a lost bus.
+        max_silence_s: So long without any answer, from the first that is missed, is a lost bus.
+        watchdog_s: The servos stop by themselves when they hear nothing for so long while torque is on; a multiple of
+            20 ms, at most 2.54 s; 0 switches it off. Some firmware of the 330 series notices but does not stop.
+    """
+
+    port: str
+    baud_rate: int = 1_000_000
+    reply_timeout_s: float = 0.008
+    max_consecutive_losses: int = 5
+    max_silence_s: float = 0.1
+    watchdog_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse a watchdog that the register cannot hold."""
+        longest_s = reg.WATCHDOG_MAX_COUNT * reg.WATCHDOG_UNIT_S
+        if not 0.0 <= self.watchdog_s <= longest_s:
+            raise UsageError(f"watchdog_s = {self.watchdog_s} is outside [0, {longest_s}]")
+
+    @property
+    def watchdog_count(self) -> int:
+        """The value of Bus Watchdog: `watchdog_s` rounded to 20 ms, and on unless that is 0."""
+        return max(1, round(self.watchdog_s / reg.WATCHDOG_UNIT_S)) if self.watchdog_s > 0.0 else 0
+
+
+@dataclass(frozen=True)
+class Transaction:
+    """What one instruction, with its answer and its retries, took.
+
+    Args:
+        t_sent_ns: When the instruction that was answered went out, CLOCK_MONOTONIC.
+        lock_wait_ns: Waiting for the bus while another thread had it.
+        transfer_ns: From having the bus to having the answer, retries included.
+        retries: Answers that were missed before.
+    """
+
+    t_sent_ns: int
+    lock_wait_ns: int
+    transfer_ns: int
+    retries: int
+
+
+class BusLink:
+    """Owner of port and lock. Every method may be called from any thread.
+
+    Args:
+        config: Port and limits.
+
+    Raises:
+        HardwareLost: The port cannot be opened.
+    """
+
+    def __init__(self, config: BusConfig) -> None:
+        self.config = config
+        self.port = WaitingPort(config.port, config.baud_rate, config.reply_timeout_s)
+        self.packets = Protocol2PacketHandler()
+        self.transactions = 0
+        self.retries = 0
+        self.lost_replies = 0
+        self.closed = False
+        self._lock = threading.Lock()
+
+    def read(self, servo_id: int, register: Register) -> int:
+        """Return a register's value in counts."""
+        what = f"read of {register.name}"
+        return register.decode(self.read_bytes(servo_id, register.address, register.size, what)[0])
+
+    def read_bytes(self, servo_id: int, address: int, length: int, what: str) -> tuple[bytes, Transaction]:
+        """Return `length` bytes of a servo's control table."""
+        data, error, transaction = self.exchange(
+            lambda: self.packets.readTxRx(self.port, servo_id, address, length), f"{what} of servo {servo_id}", length
+        )
+        if error:
+            self._refused(error, servo_id, what)
+        return bytes(data), transaction
+
+    def write(self, servo_id: int, register: Register, value: int) -> Transaction:
+        """Write a value in counts to a register, and wait for the servo to confirm it."""
+        data = list(register.encode(value))
+        what = f"write of {value} to {register.name}"
+        _, error, transaction = self.exchange(
+            lambda: ((), *self.packets.writeTxRx(self.port, servo_id, register.address, register.size, data)),
+            f"{what} of servo {servo_id}",
+        )
+        if error:
+            self._refused(error, servo_id, what)
+        return transaction
+
+    def force(self, servo_id: int, register: Register, value: int) -> bool:
+        """Write a register whatever stands in the way: a stuck lock, missed answers, errors. Never raises.
+
+        Returns:
+            Whether the servo confirmed.
+        """
+        data = list(register.encode(value))
+        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
+        try:
+            for _ in range(_FORCED_ATTEMPTS):
+                self.port.is_using = False
+                with suppress(Exception):
+                    result, error = self.packets.writeTxRx(self.port, servo_id, register.address, register.size, data)
+                    if result == COMM_SUCCESS and not error & ~ALERT_BIT:
+                        return True
+        finally:
+            if held:
+                self._lock.release()
+        return False
+
+    def close(self) -> None:
+        """Close the port; what is asked of it afterwards raises HardwareLost. Never raises itself."""
+        self.closed = True
+        with suppress(OSError):
+            self.port.closePort()
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Have the bus for oneself."""
+        with self._lock:
+            if self.closed:
+                raise HardwareLost(f"the bus on {self.config.port} is closed")
+            # An exception, such as Ctrl-C, may have left the SDK in the middle of a transaction; the lock is ours.
+            self.port.is_using = False
+            yield
+
+    def exchange(
+        self, attempt: Callable[[], tuple[_T, int, int]], what: str, length: int = 0
+    ) -> tuple[_T, int, Transaction]:
+        """Carry out an instruction until it is answered, or the bus is lost.
+
+        Args:
+            attempt: Sends and receives; returns the data, the SDK's result, the status packet's error byte.
+            what: For messages.
+            length: Number of data bytes that a good answer has; 0: whatever comes.
+
+        Returns:
+            The data, the error byte, and what it took.
+
+        Raises:
+            HardwareLost: No answer within the limits of the configuration.
+        """
+        asked_ns = time.monotonic_ns()
+        losses = 0
+        with self.hold():
+            began_ns = time.monotonic_ns()
+            while True:
+                try:
+                    data, result, error = attempt()
+                except OSError as failure:
+                    raise HardwareLost(f"{self.config.port} failed during {what}: {failure}") from failure
+                now_ns = time.monotonic_ns()
+                # The late answer to an instruction given up may be taken for this one's: its length tells, mostly.
+                if result == COMM_SUCCESS and (not length or error or len(data) == length):  # pyright: ignore
+                    self.transactions += 1
+                    transfer_ns = now_ns - began_ns
+                    return data, error, Transaction(self.port.t_sent_ns, began_ns - asked_ns, transfer_ns, losses)
+                losses += 1
+                self.lost_replies += 1
+                self._judge(losses, (now_ns - began_ns) * 1e-9, what)
+                self.retries += 1
+
+    def _judge(self, losses: int, silent_s: float, what: str) -> None:
+        if losses >= self.config.max_consecutive_losses or silent_s > self.config.max_silence_s:
+            raise HardwareLost(
+                f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
+                hint="check power and cable; is the adapter's latency timer longer than reply_timeout_s?",
+            )
+
+    def _refused(self, error: int, servo_id: int, what: str) -> NoReturn:
+        """Raise what a status packet's error means: SafetyStop if the servo has stopped itself."""
+        address = reg.HARDWARE_ERROR_STATUS.address
+        if error & ALERT_BIT:
+            bits, _, _ = self.exchange(
+                lambda: self.packets.readTxRx(self.port, servo_id, address, 1), f"hardware error of {servo_id}", 1
+            )
+            raise SafetyStop(
+                f"servo {servo_id} has stopped itself: {reg.describe_hardware_errors(bits[0] if bits else 0)}",
+                hint="remove the cause, then reboot the servo",
+            )
+        watchdog, _, _ = self.exchange(
+            lambda: self.packets.readTxRx(self.port, servo_id, reg.BUS_WATCHDOG.address, 1), "bus watchdog", 1
+        )
+        if watchdog and reg.BUS_WATCHDOG.decode(bytes(watchdog)) == reg.WATCHDOG_TRIPPED:
+            raise SafetyStop(*watchdog_message(servo_id))
+        raise Sim2RealError(f"servo {servo_id} refused {what}: {_REASONS.get(error, f'error {error}')}")
+
+
+def watchdog_message(servo_id: int) -> tuple[str, str]:
+    """Return the message and the hint for a servo whose bus watchdog has tripped."""
+    return (
+        f"the bus watchdog of servo {servo_id} has tripped: it heard nothing for longer than watchdog_s",
+        "look for a loop that stalls; switching torque on again clears it",
+    )

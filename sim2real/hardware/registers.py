@@ -1,0 +1,169 @@
+"""The control table of DYNAMIXEL X-series servos (Protocol 2.0), and the units of its registers.
+
+Addresses, sizes, ranges and defaults are those of ROBOTIS' e-Manual for the XL430-W250; the other X servos keep the
+addresses and differ in limits, gains and in what address 126 holds (load or current).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+COUNTS_PER_REVOLUTION: Final = 4096
+RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
+RAD_S_PER_COUNT: Final = 0.229 * 2.0 * math.pi / 60.0  # velocity registers count in units of 0.229 rpm
+PWM_FULL_SCALE: Final = 885  # counts at 100 % of the supply voltage
+LOAD_FULL_SCALE: Final = 1000  # load registers count in units of 0.1 %
+WATCHDOG_UNIT_S: Final = 0.020
+WATCHDOG_MAX_COUNT: Final = 127
+WATCHDOG_TRIPPED: Final = -1
+RETURN_DELAY_UNIT_S: Final = 2e-6
+
+MODEL_NAMES: Final[dict[int, str]] = {
+    1020: "XM430-W350",
+    1030: "XM430-W210",
+    1060: "XL430-W250",
+    1190: "XL330-M077",
+    1200: "XL330-M288",
+}
+# Bits of Hardware Error Status; the servo switches its own torque off when one of them is set.
+HARDWARE_ERRORS: Final[dict[int, str]] = {
+    0: "input voltage",
+    2: "overheating",
+    3: "motor encoder",
+    4: "electrical shock",
+    5: "overload",
+}
+
+
+class OperatingMode(IntEnum):
+    """What the goal registers command. OFF is no register value: it is what a plant is told while torque is off."""
+
+    OFF = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    PWM = 16
+
+
+@dataclass(frozen=True)
+class Register:
+    """One entry of the control table.
+
+    Args:
+        name: Lower-case name of the e-Manual.
+        address: First byte.
+        size: Bytes, little endian: 1, 2 or 4.
+        minimum: Smallest value that may be written, in counts.
+        maximum: Largest value that may be written, in counts.
+        default: Value after power-up, in counts.
+        signed: Whether the value is two's complement.
+        writable: False for a read-only register.
+        eeprom: EEPROM registers cannot be written while torque is on.
+    """
+
+    name: str
+    address: int
+    size: int
+    minimum: int = 0
+    maximum: int = 0
+    default: int = 0
+    signed: bool = False
+    writable: bool = False
+    eeprom: bool = False
+
+    @property
+    def end(self) -> int:
+        """The address after the register's last byte."""
+        return self.address + self.size
+
+    def decode(self, data: bytes | bytearray) -> int:
+        """Return the value held by `size` bytes, in counts."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    def encode(self, value: int) -> bytes:
+        """Return the bytes of a value in counts, wrapped to the register's size."""
+        return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
+
+
+def _eeprom(name: str, address: int, size: int, low: int, high: int, default: int, signed: bool = False) -> Register:
+    return Register(name, address, size, low, high, default, signed, writable=True, eeprom=True)
+
+
+def _ram(name: str, address: int, size: int, low: int, high: int, default: int = 0, signed: bool = False) -> Register:
+    return Register(name, address, size, low, high, default, signed, writable=True)
+
+
+MODEL_NUMBER = Register("model_number", 0, 2, default=1060, eeprom=True)
+FIRMWARE_VERSION = Register("firmware_version", 6, 1, default=47, eeprom=True)
+ID = _eeprom("id", 7, 1, 0, 252, 1)
+BAUD_RATE = _eeprom("baud_rate", 8, 1, 0, 7, 3)
+RETURN_DELAY_TIME = _eeprom("return_delay_time", 9, 1, 0, 254, 250)
+OPERATING_MODE = _eeprom("operating_mode", 11, 1, 0, 16, 3)
+HOMING_OFFSET = _eeprom("homing_offset", 20, 4, -1_044_479, 1_044_479, 0, signed=True)
+PWM_LIMIT = _eeprom("pwm_limit", 36, 2, 0, PWM_FULL_SCALE, PWM_FULL_SCALE)
+VELOCITY_LIMIT = _eeprom("velocity_limit", 44, 4, 0, 1023, 265)
+MAX_POSITION_LIMIT = _eeprom("max_position_limit", 48, 4, 0, 4095, 4095)
+MIN_POSITION_LIMIT = _eeprom("min_position_limit", 52, 4, 0, 4095, 0)
+TORQUE_ENABLE = _ram("torque_enable", 64, 1, 0, 1)
+LED = _ram("led", 65, 1, 0, 1)
+STATUS_RETURN_LEVEL = _ram("status_return_level", 68, 1, 0, 2, 2)
+HARDWARE_ERROR_STATUS = Register("hardware_error_status", 70, 1)
+POSITION_D_GAIN = _ram("position_d_gain", 80, 2, 0, 16383, 4000)
+POSITION_I_GAIN = _ram("position_i_gain", 82, 2, 0, 16383, 0)
+POSITION_P_GAIN = _ram("position_p_gain", 84, 2, 0, 16383, 640)
+BUS_WATCHDOG = _ram("bus_watchdog", 98, 1, 0, WATCHDOG_MAX_COUNT, 0, signed=True)
+GOAL_PWM = _ram("goal_pwm", 100, 2, -PWM_FULL_SCALE, PWM_FULL_SCALE, 0, signed=True)
+GOAL_VELOCITY = _ram("goal_velocity", 104, 4, -1023, 1023, 0, signed=True)
+PROFILE_ACCELERATION = _ram("profile_acceleration", 108, 4, 0, 32767)
+PROFILE_VELOCITY = _ram("profile_velocity", 112, 4, 0, 32767)
+GOAL_POSITION = _ram("goal_position", 116, 4, -1_048_575, 1_048_575, 0, signed=True)
+REALTIME_TICK = Register("realtime_tick", 120, 2)
+MOVING = Register("moving", 122, 1)
+PRESENT_PWM = Register("present_pwm", 124, 2, signed=True)
+PRESENT_LOAD = Register("present_load", 126, 2, signed=True)
+PRESENT_VELOCITY = Register("present_velocity", 128, 4, signed=True)
+PRESENT_POSITION = Register("present_position", 132, 4, signed=True)
+PRESENT_INPUT_VOLTAGE = Register("present_input_voltage", 144, 2, default=120)
+PRESENT_TEMPERATURE = Register("present_temperature", 146, 1, default=30)
+
+TABLE: Final[dict[int, Register]] = {r.address: r for r in list(globals().values()) if isinstance(r, Register)}
+TABLE_BYTES: Final = PRESENT_TEMPERATURE.end
+GOALS: Final = (GOAL_PWM, GOAL_VELOCITY, GOAL_POSITION)
+
+
+def rad_from_count(count: int) -> float:
+    """Return the angle in rad of a position count."""
+    return count * RAD_PER_COUNT
+
+
+def count_from_rad(angle_rad: float) -> int:
+    """Return the position count nearest to an angle in rad."""
+    return round(angle_rad / RAD_PER_COUNT)
+
+
+def rad_s_from_count(count: int) -> float:
+    """Return the speed in rad/s of a velocity count (0.229 rpm)."""
+    return count * RAD_S_PER_COUNT
+
+
+def count_from_rad_s(speed_rad_s: float) -> int:
+    """Return the velocity count nearest to a speed in rad/s."""
+    return round(speed_rad_s / RAD_S_PER_COUNT)
+
+
+def fraction_from_pwm(count: int) -> float:
+    """Return the share of the supply voltage, in [-1, 1], of a PWM count."""
+    return count / PWM_FULL_SCALE
+
+
+def pwm_from_fraction(fraction: float) -> int:
+    """Return the PWM count nearest to a share of the supply voltage in [-1, 1]."""
+    return round(fraction * PWM_FULL_SCALE)
+
+
+def describe_hardware_errors(bits: int) -> str:
+    """Return the names of the bits set in Hardware Error Status, or "none"."""
+    return ", ".join(name for bit, name in HARDWARE_ERRORS.items() if bits >> bit & 1) or "none"

@@ -1,0 +1,200 @@
+"""One emulated servo: its register file, and what the firmware allows, refuses and stops."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from sim2real.hardware import registers as reg
+from sim2real.hardware.protocol import ALERT_BIT, StatusError
+from sim2real.hardware.registers import OperatingMode, Register
+
+_MOVING_THRESHOLD_COUNT: Final = 10
+_OVERLOAD_BIT: Final = 5
+_FIXED: Final = (reg.ID, reg.BAUD_RATE)
+_MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS)
+
+
+class Servo:
+    """Registers and rules of one DYNAMIXEL X servo; it knows neither time nor wire nor physics.
+
+    Args:
+        servo_id: Its id on the bus.
+        model_number: What it says it is.
+        return_delay_us: Return Delay Time at power-up, rounded to the register's 2 us.
+        encoder_counts: Counts per revolution of the sensor behind Present Position.
+    """
+
+    def __init__(
+        self, servo_id: int, model_number: int = 1060, return_delay_us: int = 500, encoder_counts: int = 4096
+    ) -> None:
+        self.servo_id = servo_id
+        self._encoder_counts = encoder_counts
+        self._memory = bytearray(reg.TABLE_BYTES)
+        self._registered: tuple[int, bytes] | None = None
+        self.heard_ns = 0
+        for register in reg.TABLE.values():
+            self.put(register, register.default)
+        self.put(reg.MODEL_NUMBER, model_number)
+        self.put(reg.ID, servo_id)
+        self.put(reg.RETURN_DELAY_TIME, round(return_delay_us * 1e-6 / reg.RETURN_DELAY_UNIT_S))
+
+    def get(self, register: Register) -> int:
+        """Return a register's value in counts."""
+        return register.decode(self._memory[register.address : register.end])
+
+    def put(self, register: Register, value: int) -> None:
+        """Set a register without any of the checks that a write from the bus passes."""
+        self._memory[register.address : register.end] = register.encode(value)
+
+    @property
+    def alert(self) -> int:
+        """The alert bit of status packets: 0x80 while a hardware error is present, else 0."""
+        return ALERT_BIT if self.get(reg.HARDWARE_ERROR_STATUS) else 0
+
+    def command(self) -> tuple[int, float]:
+        """Return what the registers make the motor do now.
+
+        Returns:
+            (mode, goal): PWM with a fraction in [-1, 1], POSITION with rad, VELOCITY with rad/s, or OFF with 0.
+        """
+        if not self.get(reg.TORQUE_ENABLE):
+            return OperatingMode.OFF, 0.0
+        mode = self.get(reg.OPERATING_MODE)
+        if self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+            return OperatingMode.PWM, 0.0
+        if mode == OperatingMode.PWM:
+            return mode, reg.fraction_from_pwm(self.get(reg.GOAL_PWM))
+        if mode == OperatingMode.VELOCITY:
+            return mode, reg.rad_s_from_count(self.get(reg.GOAL_VELOCITY))
+        goal_count = self.get(reg.GOAL_POSITION) - self.get(reg.HOMING_OFFSET)
+        return OperatingMode.POSITION, reg.rad_from_count(goal_count)
+
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
+        """Set the Present registers from a measurement of the plant.
+
+        Args:
+            position_rad: Angle from the encoder's zero, in rad.
+            velocity_rad_s: Speed in rad/s.
+            load: Share of the largest load, in [-1, 1].
+            tick_ms: Milliseconds since power-up; wraps at 32768 as the servo's own counter does.
+        """
+        step_rad = 2.0 * math.pi / self._encoder_counts
+        count = reg.count_from_rad(round(position_rad / step_rad) * step_rad)
+        velocity_count = reg.count_from_rad_s(velocity_rad_s)
+        mode, goal = self.command()
+        self.put(reg.PRESENT_POSITION, count + self.get(reg.HOMING_OFFSET))
+        self.put(reg.PRESENT_VELOCITY, velocity_count)
+        self.put(reg.PRESENT_LOAD, round(max(-1.0, min(1.0, load)) * reg.LOAD_FULL_SCALE))
+        self.put(reg.PRESENT_PWM, reg.pwm_from_fraction(goal) if mode == OperatingMode.PWM else 0)
+        self.put(reg.MOVING, abs(velocity_count) > _MOVING_THRESHOLD_COUNT)
+        self.put(reg.REALTIME_TICK, tick_ms % 32768)
+
+    def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
+        """Return the error and the bytes of a READ."""
+        if length == 0 or address + length > reg.TABLE_BYTES:
+            return StatusError.ACCESS, b""
+        return StatusError.NONE, bytes(self._memory[address : address + length])
+
+    def write(self, address: int, data: bytes) -> tuple[StatusError, bool]:
+        """Write registers: all of them, or, on an error, none.
+
+        Returns:
+            The error, and whether the motor must be told (`command`): torque or a goal was written.
+        """
+        pairs: list[tuple[Register, int]] = []
+        error = self._split(address, data, pairs)
+        for register, value in pairs:
+            error = error or self._refusal(register, value)
+        if error:
+            return error, False
+        torque_was_on = self.get(reg.TORQUE_ENABLE)
+        for register, value in pairs:
+            self.put(register, value)
+        torque_on = self.get(reg.TORQUE_ENABLE)
+        if torque_on and not torque_was_on:
+            self._rest_goals()
+        moves = any(register in _MOTION for register, _ in pairs) and bool(torque_on or torque_was_on)
+        return StatusError.NONE, moves
+
+    def register_write(self, address: int, data: bytes) -> StatusError:
+        """Keep a REG_WRITE for the next ACTION."""
+        self._registered = (address, data)
+        return StatusError.NONE
+
+    def action(self) -> tuple[StatusError, bool]:
+        """Carry out the registered write; an instruction error if there is none."""
+        if self._registered is None:
+            return StatusError.INSTRUCTION, False
+        address, data = self._registered
+        self._registered = None
+        return self.write(address, data)
+
+    def reboot(self) -> None:
+        """Return every RAM register to its power-up value, which switches torque off."""
+        self._registered = None
+        for register in reg.TABLE.values():
+            if not register.eeprom:
+                self.put(register, register.default)
+
+    def watchdog_deadline_ns(self) -> int | None:
+        """Return when the bus watchdog trips unless an instruction comes first; None if it is not armed."""
+        value = self.get(reg.BUS_WATCHDOG)
+        if value <= 0 or not self.get(reg.TORQUE_ENABLE):
+            return None
+        return self.heard_ns + round(value * reg.WATCHDOG_UNIT_S * 1e9)
+
+    def trip_watchdog(self) -> None:
+        """Stop: goals to rest, and no goal can be written until the host has written 0 to Bus Watchdog."""
+        self._rest_goals()
+        self.put(reg.BUS_WATCHDOG, reg.WATCHDOG_TRIPPED)
+
+    def overload(self) -> None:
+        """Shut down as after an overload: torque off, error bit set until reboot."""
+        self.put(reg.HARDWARE_ERROR_STATUS, 1 << _OVERLOAD_BIT)
+        self.put(reg.TORQUE_ENABLE, 0)
+
+    def _rest_goals(self) -> None:
+        self.put(reg.GOAL_PWM, 0)
+        self.put(reg.GOAL_VELOCITY, 0)
+        self.put(reg.GOAL_POSITION, self.get(reg.PRESENT_POSITION))
+
+    def _split(self, address: int, data: bytes, pairs: list[tuple[Register, int]]) -> StatusError:
+        """Cut written bytes into whole registers, appended to `pairs`."""
+        if not data:
+            return StatusError.DATA_LENGTH
+        while data:
+            register = reg.TABLE.get(address)
+            if register is None:
+                return StatusError.ACCESS
+            if len(data) < register.size:
+                return StatusError.DATA_LENGTH
+            pairs.append((register, register.decode(data[: register.size])))
+            address, data = register.end, data[register.size :]
+        return StatusError.NONE
+
+    def _refusal(self, register: Register, value: int) -> StatusError:
+        """Return why the firmware refuses a value, or NONE."""
+        if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
+            return StatusError.ACCESS
+        if register in _FIXED and value != self.get(register):
+            return StatusError.RESULT_FAIL  # this emulation has no bus to move to
+        if register == reg.TORQUE_ENABLE and value and self.alert:
+            return StatusError.RESULT_FAIL  # after a shutdown only a reboot lets torque on again
+        if not register.minimum <= value <= register.maximum:
+            return StatusError.DATA_RANGE
+        if register == reg.OPERATING_MODE and value not in list(OperatingMode)[1:]:
+            return StatusError.DATA_RANGE
+        if register in reg.GOALS and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+            # e-Manual, Bus Watchdog(98): goals become read-only, a write is answered with a range error.
+            return StatusError.DATA_RANGE
+        return StatusError.DATA_LIMIT if self._beyond_limit(register, value) else StatusError.NONE
+
+    def _beyond_limit(self, register: Register, value: int) -> bool:
+        if register == reg.GOAL_PWM:
+            return abs(value) > self.get(reg.PWM_LIMIT)
+        if register == reg.GOAL_VELOCITY:
+            return abs(value) > self.get(reg.VELOCITY_LIMIT)
+        if register == reg.GOAL_POSITION and self.get(reg.OPERATING_MODE) == OperatingMode.POSITION:
+            return not self.get(reg.MIN_POSITION_LIMIT) <= value <= self.get(reg.MAX_POSITION_LIMIT)
+        return False

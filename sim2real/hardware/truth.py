@@ -1,0 +1,185 @@
+"""The emulator's own account of what happened when: true latencies and true states, to measure others against.
+
+The file is one line of JSON (the header) and then rows of one fixed size, flushed every 0.25 s: whatever is there of a
+file cut anywhere can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError
+
+FLUSH_PERIOD_NS: Final = 250_000_000
+_FIXED: Final = "<BB6xqqqq"
+_MIN_VALUES: Final = 3  # a sample's position, velocity and load
+
+
+class Kind(IntEnum):
+    """What a row is about, and so what its times and values mean.
+
+    For all: `t_host_ns` is when the emulator got the instruction's last bytes from the host.
+
+    Attributes:
+        SAMPLE: An answered read of present values: sampled at `t_ns`, answer with the host at `t_done_ns`, which was
+            `late_ns` after plan; position (rad), velocity (rad/s), load before quantisation.
+        EFFECT: A command reached the motor at `t_ns`, a point of the plant's grid, `late_ns` (signed) after plan;
+            mode and goal. `t_host_ns` is 0 for a command that came from the servo itself.
+        STATE: The plant's true state at `t_ns`, in the order of the header's `state_names`.
+        WATCHDOG: The bus watchdog tripped at `t_ns`.
+        LOSS: An answer that never left; times as of a SAMPLE.
+        REPLY: Any other answer: instruction complete on the wire at `t_ns`; otherwise as a SAMPLE.
+    """
+
+    SAMPLE = 1
+    EFFECT = 2
+    STATE = 3
+    WATCHDOG = 4
+    LOSS = 5
+    REPLY = 6
+
+
+def _dtype(values: int) -> np.dtype:
+    return np.dtype(
+        [
+            ("kind", "u1"),
+            ("servo_id", "u1"),
+            ("_", "V6"),
+            ("t_host_ns", "<i8"),
+            ("t_ns", "<i8"),
+            ("t_done_ns", "<i8"),
+            ("late_ns", "<i8"),
+            ("values", "<f8", (values,)),
+        ]
+    )
+
+
+class TruthLog:
+    """Appends rows to a truth file.
+
+    Args:
+        path: The file; an existing one is replaced.
+        header: Anything JSON holds; `state_names` must be among it.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any]) -> None:
+        self._values = max(_MIN_VALUES, len(header["state_names"]))
+        self._struct = struct.Struct(f"{_FIXED}{self._values}d")
+        self._padding = (0.0,) * self._values
+        self._rows: list[bytes] = []
+        self._flushed_ns = 0
+        self._file = path.open("wb")
+        self._file.write(json.dumps({**header, "values": self._values}).encode() + b"\n")
+        self._file.flush()
+
+    def write(
+        self,
+        kind: Kind,
+        servo_id: int,
+        t_host_ns: int,
+        t_ns: int,
+        t_done_ns: int,
+        late_ns: int,
+        values: Sequence[float] = (),
+    ) -> None:
+        """Buffer one row; `Kind` says what the arguments mean."""
+        padded = (*values, *self._padding[len(values) :])
+        self._rows.append(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
+
+    def flush_if_due(self, now_ns: int) -> None:
+        """Hand the buffered rows to the operating system if the last time is 0.25 s ago."""
+        if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+            self._flushed_ns = now_ns
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left and close the file; closing twice is fine."""
+        if not self._file.closed:
+            self._flush()
+            self._file.close()
+
+    def _flush(self) -> None:
+        self._file.write(b"".join(self._rows))
+        self._file.flush()
+        self._rows.clear()
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A truth file in memory.
+
+    Args:
+        header: Configuration (`config`), `servo_ids`, `start_ns`, `state_names`, and the plant's parameters (`truth`).
+        rows: Structured array; the fields are explained by `Kind`, `values` is (N, V).
+    """
+
+    header: dict[str, Any]
+    rows: np.ndarray
+
+    def of(self, kind: Kind, servo_id: int | None = None) -> np.ndarray:
+        """Return the rows of one kind, of one servo if given, in the order written."""
+        chosen = self.rows["kind"] == kind
+        if servo_id is not None:
+            chosen &= self.rows["servo_id"] == servo_id
+        return self.rows[chosen]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The plant's true parameters."""
+        return self.header["truth"]
+
+    def states(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return the times (N,) in ns and, by name, the true states (N,), sampled at 200 Hz."""
+        rows = self.of(Kind.STATE)
+        return rows["t_ns"], {name: rows["values"][:, i] for i, name in enumerate(self.header["state_names"])}
+
+    def mean_latencies(self) -> dict[str, float]:
+        """Return the session's mean latencies in seconds; NaN where nothing was read or written.
+
+        Returns:
+            `sensing_s`: age of a sample when its answer reaches the host.
+            `actuation_s`: from the arrival of a goal's bytes to its effect.
+            `sample_before_request_s`: from the sample to the arrival of the read's bytes; negative if sampled after.
+        """
+        samples = self.of(Kind.SAMPLE)
+        effects = self.of(Kind.EFFECT)
+        effects = effects[effects["t_host_ns"] > 0]
+        return {
+            "sensing_s": _mean_s(samples["t_done_ns"] - samples["t_ns"]),
+            "actuation_s": _mean_s(effects["t_ns"] - effects["t_host_ns"]),
+            "sample_before_request_s": _mean_s(samples["t_host_ns"] - samples["t_ns"]),
+        }
+
+    def lateness_s(self) -> np.ndarray:
+        """Return how late after plan each answer left, (N,) in seconds: the emulator's own real-time error."""
+        answers = np.isin(self.rows["kind"], (Kind.SAMPLE, Kind.REPLY))
+        return self.rows["late_ns"][answers] * 1e-9
+
+
+def _mean_s(durations_ns: np.ndarray) -> float:
+    return float(durations_ns.mean() * 1e-9) if durations_ns.size else float("nan")
+
+
+def read_truth(path: Path | str) -> Truth:
+    """Read a truth file, complete or cut off; a last row that is not whole is left out.
+
+    Raises:
+        Sim2RealError: The file does not exist or has no header.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise Sim2RealError(f"there is no truth file {path}")
+    head, newline, body = path.read_bytes().partition(b"\n")
+    if not newline:
+        raise Sim2RealError(f"truth file {path} has no header", hint="was the emulator killed while it started?")
+    header = json.loads(head)
+    dtype = _dtype(header["values"])
+    return Truth(header, np.frombuffer(body[: len(body) // dtype.itemsize * dtype.itemsize], dtype))

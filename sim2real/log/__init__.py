@@ -1,0 +1,10 @@
+"""Logs: one MCAP file a session, written while the robot runs and readable after any crash."""
+
+from sim2real.log.reader import TruncatedLogWarning as TruncatedLogWarning
+from sim2real.log.reader import read_attachment as read_attachment
+from sim2real.log.reader import read_log as read_log
+from sim2real.log.reader import read_session as read_session
+from sim2real.log.reader import summary as summary
+from sim2real.log.recover import Recovery as Recovery
+from sim2real.log.recover import recover as recover
+from sim2real.log.writer import McapRecorder as McapRecorder

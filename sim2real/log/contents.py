@@ -1,0 +1,187 @@
+"""What a log file holds, found in one walk from its first byte to its last, sorted by channel, not yet decoded."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Metadata
+
+from sim2real.errors import Sim2RealError
+from sim2real.log import document
+from sim2real.log.cdr import Layout
+from sim2real.log.recover import Damage, Record, chunk_content, chunk_times, cut_before_session, opened, parsed, records
+from sim2real.log.session_file import LIBRARY
+
+# A message record: opcode, length, channel; then sequence, log time, publish time and the message itself.
+_MESSAGE_PREFIX = struct.Struct("<BQH")
+_DATA_AT = 31
+_DECODED_ROLES = ("step", "output", "input", "events")
+
+
+@dataclass(frozen=True)
+class Range:
+    """A range of time [s from the episode's start], from ``start_s`` to just before ``end_s``; None: no limit."""
+
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def log_times(self, epoch_ns: int) -> tuple[int, int]:
+        """Return the range in log time [ns]."""
+        begin = 0 if self.start_s is None else max(0, epoch_ns + round(self.start_s * 1e6) * 1000)
+        end = 2**63 if self.end_s is None else max(0, epoch_ns + round(self.end_s * 1e6) * 1000)
+        return begin, end
+
+
+@dataclass
+class Contents:
+    """What a walk found.
+
+    Attributes:
+        library: Who wrote the file, by its header.
+        session: The session's metadata; None where damaged.
+        end: What was written when the session ended; None after a crash.
+        attachments: File name -> content.
+        epoch_ns: The wall clock at the episode's time 0 [ns]; 0 if it never started.
+        channels: Channel number -> channel.
+        messages: Channel number -> message records, in the file's order; only where the walk was to open chunks.
+        indexed: Channel number -> messages, by the chunks' indices.
+        chunks: How many chunks there are.
+        last_log_time: The last time in any chunk [ns].
+        damage: What could not be read.
+    """
+
+    library: str = ""
+    session: dict[str, Any] | None = None
+    end: dict[str, Any] | None = None
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    epoch_ns: int = 0
+    channels: dict[int, Channel] = field(default_factory=dict)
+    messages: dict[int, list[bytes]] = field(default_factory=dict)
+    indexed: dict[int, int] = field(default_factory=dict)
+    chunks: int = 0
+    last_log_time: int = 0
+    damage: Damage = field(default_factory=Damage)
+
+    def with_role(self, role: str) -> dict[int, Channel]:
+        """Return the channels that hold steps, outputs, inputs or events."""
+        return {number: c for number, c in self.channels.items() if c.metadata["role"] == role}
+
+    def columns(self, channel: int, layout: Layout, span: Range) -> np.ndarray:
+        """Decode a channel's messages of fixed layout.
+
+        Args:
+            channel: Its number.
+            layout: The layout of its messages.
+            span: Which log times to keep.
+
+        Returns:
+            Shape ``(N,)``: columns ``sequence``, ``log_time`` and ``publish_time`` [ns], and ``data`` with the
+            message's fields; by sequence.
+        """
+        dtype = np.dtype(
+            {
+                "names": ["sequence", "log_time", "publish_time", "data"],
+                "formats": ["<u4", "<u8", "<u8", layout.dtype],
+                "offsets": [11, 15, 23, _DATA_AT],
+                "itemsize": _DATA_AT + layout.size,
+            }
+        )
+        found = self.messages[channel]
+        if any(len(m) != dtype.itemsize for m in found):
+            raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
+        rows = np.frombuffer(b"".join(found), dtype)
+        begin, end = span.log_times(self.epoch_ns)
+        rows = rows[(rows["log_time"] >= begin) & (rows["log_time"] < end)]
+        return rows[np.argsort(rows["sequence"], kind="stable")]
+
+    def payloads(self, channel: int, span: Range) -> list[tuple[int, bytes]]:
+        """Return the log time [ns] and the undecoded bytes of a channel's messages."""
+        begin, end = span.log_times(self.epoch_ns)
+        found = [(int.from_bytes(m[15:23], "little"), m[_DATA_AT:]) for m in self.messages[channel]]
+        return [(time, payload) for time, payload in found if begin <= time < end]
+
+
+def walk(path: str | Path, span: Range | None = None) -> Contents:
+    """Go through a log once.
+
+    Args:
+        path: The file.
+        span: Open the chunks of this range, for their messages; None: open none.
+
+    Raises:
+        Sim2RealError: When the file is missing, no MCAP, no log of ours or cut before the end of its session metadata.
+    """
+    found = Contents()
+    with opened(path) as data:
+        for record in records(data, found.damage):
+            if record.opcode == Opcode.MESSAGE_INDEX:
+                channel = data[record.start] | data[record.start + 1] << 8
+                found.indexed[channel] = found.indexed.get(channel, 0) + (record.end - record.start - 6) // 16
+            elif record.opcode == Opcode.CHUNK:
+                _take_chunk(found, data, record, span)
+            else:
+                _take_other(found, data, record)
+    if found.session is None:
+        if found.library not in ("", LIBRARY):
+            raise Sim2RealError(
+                f"{path} is an MCAP file of {found.library!r}, not a log of sim2real",
+                hint="record with `sim2real record`, or convert it",
+            )
+        if not found.chunks:
+            raise cut_before_session(path)
+        found.damage.skipped.append("the session's metadata")
+    return found
+
+
+def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | None) -> None:
+    found.chunks += 1
+    first, last = chunk_times(data, record)
+    found.last_log_time = max(found.last_log_time, last)
+    if span is None:
+        return
+    begin, end = span.log_times(found.epoch_ns)
+    # The channels stand before the first chunk; where those are damaged there is no time 0 yet, and the chunk has them.
+    if found.channels and (last < begin or first >= end):
+        return
+    content = chunk_content(data, record, found.damage)
+    position = 0
+    while position < len(content):
+        opcode, length, channel = _MESSAGE_PREFIX.unpack_from(content, position)
+        stop = position + 9 + length
+        if opcode == Opcode.MESSAGE:
+            if channel in found.messages:
+                found.messages[channel].append(content[position:stop])
+        elif opcode == Opcode.CHANNEL:
+            _take_channel(found, Channel.read(ReadDataStream(BytesIO(content[position + 9 : stop]))))
+        position = stop
+
+
+def _take_channel(found: Contents, channel: Channel | None) -> None:
+    if channel is not None and channel.metadata.get("epoch_ns", "").isdigit() and "role" in channel.metadata:
+        found.channels[channel.id] = channel
+        found.epoch_ns = int(channel.metadata["epoch_ns"])
+        if channel.metadata["role"] in _DECODED_ROLES:
+            found.messages.setdefault(channel.id, [])
+
+
+def _take_other(found: Contents, data: mmap.mmap, record: Record) -> None:
+    if record.opcode == Opcode.CHANNEL:
+        _take_channel(found, parsed(Channel, data, record, found.damage))
+    elif record.opcode == Opcode.HEADER and (header := parsed(Header, data, record, found.damage)) is not None:
+        found.library = header.library
+    elif record.opcode == Opcode.ATTACHMENT:
+        if (attachment := parsed(Attachment, data, record, found.damage)) is not None:
+            found.attachments[attachment.name] = attachment.data
+    elif record.opcode == Opcode.METADATA and (entry := parsed(Metadata, data, record, found.damage)) is not None:
+        if entry.name == document.SESSION:
+            found.session = document.decode(entry.metadata)
+        elif entry.name == document.SESSION_END:
+            found.end = document.decode(entry.metadata)

@@ -1,0 +1,200 @@
+"""Reading a log back: the episode with its original names and shapes, whole or damaged."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode, Messages, Steps
+from sim2real.log.cdr import read_text
+from sim2real.log.contents import Contents, Range, walk
+from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields
+
+# Where an event's level stands, and where its name begins before alignment.
+_LEVEL_AT, _NAME_AT = 12, 13
+
+
+class TruncatedLogWarning(UserWarning):
+    """The log is not whole: its session crashed, or a part of the file is unreadable. What is there is used."""
+
+
+def read_log(path: str | Path, start_s: float | None = None, end_s: float | None = None) -> Episode:
+    """Read a log, all of it or a range of time.
+
+    A damaged log is read as far as it goes, with a warning. Beside the session's own entries the episode's metadata
+    has ``log``: ``epoch_ns``; ``session_end`` (None after a crash); ``attachments`` (names); ``events`` (time_s, level,
+    kind, text); ``first_seq``: node -> the seq of its first step in the episode, which is 0 in a whole log;
+    ``missing_steps``: node -> steps lost before or between those; ``skipped``: what was unreadable, in words.
+
+    Args:
+        path: The file.
+        start_s: Read the steps that ended and the messages that arrived at or after this time [s from the episode's
+            start]; None: from the start.
+        end_s: The same, before this time; None: to the end.
+
+    Returns:
+        The episode. ``seq_in`` is -1 where the consuming step is not in it.
+
+    Raises:
+        Sim2RealError: When the file is missing, no MCAP, no log of ours or cut before the end of its session metadata.
+
+    Warns:
+        TruncatedLogWarning: When the session has no end or something was unreadable.
+    """
+    if start_s is not None and end_s is not None and not start_s <= end_s:
+        raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
+    span = Range(start_s, end_s)
+    contents = walk(path, span)
+    steps, outputs, sequences = _steps_and_outputs(contents, span)
+    # A log that starts in the middle lost its beginning, unless only a range was asked for.
+    firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
+    missing = {
+        node: int(s[-1]) + 1 - len(s) - (firsts[node] if start_s else 0) for node, s in sequences.items() if len(s)
+    }
+    _warn(path, contents, missing)
+    facts = {
+        "epoch_ns": contents.epoch_ns,
+        "session_end": contents.end,
+        "attachments": list(contents.attachments),
+        "events": _events(contents, span),
+        "first_seq": firsts,
+        "missing_steps": missing,
+        "skipped": contents.damage.skipped,
+    }
+    return Episode(
+        steps=steps,
+        messages=_connections(contents, span, sequences),
+        outputs=outputs,
+        metadata={**(contents.session or {}), "log": facts},
+        complete=contents.end is not None,
+    )
+
+
+def read_session(path: str | Path) -> dict[str, Any]:
+    """Return what a session says about itself, without reading its data: the recorder's metadata.
+
+    Raises:
+        Sim2RealError: As ``read_log`` does, and when the metadata is damaged.
+    """
+    session = walk(path).session
+    if session is None:
+        raise Sim2RealError(f"the session metadata of {path} is damaged", hint="read_log still reads the data")
+    return session
+
+
+def read_attachment(path: str | Path, name: str) -> bytes:
+    """Return the content of a file that was attached to a log.
+
+    Raises:
+        Sim2RealError: As ``read_log`` does, and when there is no such attachment.
+    """
+    attachments = walk(path).attachments
+    if name not in attachments:
+        raise Sim2RealError(f"the log {path} has no attachment {name!r}. Available: {', '.join(attachments) or 'none'}")
+    return attachments[name]
+
+
+def summary(path: str | Path) -> dict[str, Any]:
+    """Return the facts about a log that need no decoding.
+
+    Returns:
+        ``bytes``, ``chunks``, ``epoch_ns``, ``duration_s``, ``complete``, ``session`` (None where damaged),
+        ``session_end`` (None after a crash), ``attachments`` (name -> bytes), ``topics`` (topic -> messages, counted by
+        the chunks' indices) and ``skipped``.
+
+    Raises:
+        Sim2RealError: As ``read_log`` does.
+    """
+    contents = walk(path)
+    return {
+        "bytes": Path(path).stat().st_size,
+        "chunks": contents.chunks,
+        "epoch_ns": contents.epoch_ns,
+        "duration_s": max(0, contents.last_log_time - contents.epoch_ns) / 1e9,
+        "complete": contents.end is not None,
+        "session": contents.session,
+        "session_end": contents.end,
+        "attachments": {name: len(content) for name, content in contents.attachments.items()},
+        "topics": {c.topic: contents.indexed.get(number, 0) for number, c in contents.channels.items()},
+        "skipped": contents.damage.skipped,
+    }
+
+
+def _steps_and_outputs(
+    contents: Contents, span: Range
+) -> tuple[dict[str, Steps], dict[str, dict[str, np.ndarray]], dict[str, np.ndarray]]:
+    """Return node -> steps, node -> outputs, and node -> the seq of each step."""
+    output_channels = {c.metadata["node"]: (n, c) for n, c in contents.with_role("output").items()}
+    steps, outputs, sequences = {}, {}, {}
+    for number, channel in contents.with_role("step").items():
+        node = channel.metadata["node"]
+        rows = contents.columns(number, STEP_LAYOUT, span)
+        outputs[node] = {}
+        if node in output_channels:
+            number, channel = output_channels[node]
+            described = json.loads(channel.metadata["fields"])
+            values = contents.columns(number, layout_of_fields(described), span)
+            # A step and its output may lie in different chunks, of which one may be lost.
+            _, in_steps, in_values = np.intersect1d(rows["sequence"], values["sequence"], return_indices=True)
+            rows, values = rows[in_steps], values[in_values]
+            for entry in described:
+                name, shape = entry["original"], (len(rows), *entry["shape"])
+                known = name in (values.dtype["data"].names or ())
+                outputs[node][name] = (
+                    np.ascontiguousarray(values["data"][name]) if known else np.zeros(shape, entry["dtype"])
+                )
+        data = rows["data"]
+        steps[node] = Steps(*(np.ascontiguousarray(data[f]) for f in Steps.__dataclass_fields__))
+        sequences[node] = np.ascontiguousarray(data["seq"])
+    return steps, outputs, sequences
+
+
+def _connections(
+    contents: Contents, span: Range, sequences: Mapping[str, np.ndarray]
+) -> dict[tuple[str, str], Messages]:
+    """Return (node, input name) -> messages."""
+    connections = {}
+    for number, channel in contents.with_role("input").items():
+        node = channel.metadata["node"]
+        rows = contents.columns(number, MESSAGE_LAYOUT, span)
+        seq_in = rows["data"]["seq_in"]
+        known = np.isin(seq_in, sequences.get(node, []))
+        sent, received = ((rows[f].astype(np.int64) - contents.epoch_ns) // 1000 for f in ("publish_time", "log_time"))
+        connections[node, channel.metadata["input"]] = Messages(
+            seq_out=np.ascontiguousarray(rows["data"]["seq_out"]),
+            seq_in=np.where(known, seq_in, -1),
+            sent=sent,
+            received=received,
+        )
+    return connections
+
+
+def _events(contents: Contents, span: Range) -> list[dict[str, Any]]:
+    events = []
+    for number in contents.with_role("events"):
+        for log_time, payload in contents.payloads(number, span):
+            kind, position = read_text(payload, _NAME_AT)
+            text, _ = read_text(payload, position)
+            time_s = (log_time - contents.epoch_ns) / 1e9
+            events.append({"time_s": time_s, "level": payload[_LEVEL_AT], "kind": kind, "text": text})
+    return events
+
+
+def _warn(path: str | Path, contents: Contents, missing: Mapping[str, int]) -> None:
+    """Warn, in the name of the caller of ``read_log``, of what the log lacks."""
+    lacks = []
+    if contents.end is None:
+        lacks.append("its session has no end: the process that recorded it crashed or still runs")
+    if contents.damage.skipped:
+        lacks.append(f"unreadable: {'; '.join(contents.damage.skipped)}")
+    lost = [f"{count} of node {node!r}" for node, count in missing.items() if count]
+    if lost:
+        lacks.append(f"steps are missing: {', '.join(lost)}")
+    if lacks:
+        warnings.warn(f"the log {path} is not whole: {'. '.join(lacks)}", TruncatedLogWarning, stacklevel=3)

@@ -1,0 +1,209 @@
+"""Topics: the name, the ROS schema and the byte layout of everything that a log holds."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError
+from sim2real.graph.episode import named_leaves
+from sim2real.log.cdr import ROS_TYPES, Constant, Field, Layout, length, text
+
+STEP_FIELDS = ("seq", "scheduled", "start", "woken", "ts_overwrite", "end", "drift")
+MESSAGE_FIELDS = ("seq_out", "seq_in")
+_INT64 = np.dtype("<i8")
+_RULE = "=" * 80
+_TIME = "int32 sec\nuint32 nanosec\n"
+EVENTS_TOPIC = "/rosout"
+EVENTS_SCHEMA = "rcl_interfaces/msg/Log"
+EVENTS_TEXT = (
+    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
+    f"{_RULE}\nMSG: builtin_interfaces/Time\n{_TIME}"
+)
+_JOINT_STATE_TEXT = (
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    f"{_RULE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{_RULE}\nMSG: builtin_interfaces/Time\n{_TIME}"
+)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A channel of the log.
+
+    Attributes:
+        name: The topic, ``/node/output``.
+        schema: Name of the message type.
+        schema_text: Its definition, in the ``ros2msg`` language.
+        layout: Where its bytes are.
+        metadata: What goes with the channel: role, original node and input names, the fields with original names.
+    """
+
+    name: str
+    schema: str
+    schema_text: str
+    layout: Layout
+    metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class JointSource:
+    """Where the joint states of one node come from.
+
+    Attributes:
+        topic: The joint state channel's topic, with the node's own joint names in its layout.
+        picks: For position, velocity and effort the ``(leaf, element)`` of every joint, -1 where there is none; no
+            picks at all for a quantity that no joint has.
+    """
+
+    topic: Topic
+    picks: tuple[tuple[tuple[int, int], ...], ...]
+
+
+def snake(name: str) -> str:
+    """Return a name as ROS wants it: ``lower_snake_case`` that starts with a letter."""
+    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name)
+    result = re.sub(r"[^A-Za-z0-9]+", "_", spaced).strip("_").lower()
+    return result if result[:1].isalpha() else f"field_{result}".rstrip("_")
+
+
+def output_topic(node: str, example: Any) -> Topic:
+    """Return the topic of a node's output.
+
+    Args:
+        node: The node's name.
+        example: One output, such as ``init_output`` returns.
+
+    Raises:
+        Sim2RealError: When two leaves get the same name, or one has a dtype that ROS does not know.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
+    names = unique_names(arrays, f"the output of node {node!r}", "field")
+    described = [
+        {"name": names[original], "original": original, "dtype": a.dtype.str, "shape": list(a.shape)}
+        for original, a in arrays.items()
+    ]
+    lines = []
+    for entry in described:
+        part = _field(entry)
+        count = f"[{part.size}]" if part.shape else ""
+        note = f"  # {entry['original']}, shape {tuple(part.shape)}" if len(part.shape) > 1 else ""
+        if part.size:
+            lines.append(f"{ROS_TYPES[part.dtype.str[1:]]}{count} {entry['name']}{note}\n")
+    return Topic(
+        f"/{snake(node)}/output",
+        f"sim2real_msgs/msg/{_camel(node)}Output",
+        "".join(lines),
+        layout_of_fields(described),
+        {"role": "output", "node": node, "fields": json.dumps(described)},
+    )
+
+
+def layout_of_fields(described: Sequence[Mapping[str, Any]]) -> Layout:
+    """Return the layout of an output from the fields in its channel's metadata; columns have the original names."""
+    return Layout(part for entry in described if (part := _field(entry)).size)
+
+
+def step_topic(node: str) -> Topic:
+    """Return the topic of a node's step records."""
+    metadata = {"role": "step", "node": node, "unit": "1e-6 s from the episode's start"}
+    return Topic(f"/{snake(node)}/step", "sim2real_msgs/msg/Step", _int64_text(STEP_FIELDS), STEP_LAYOUT, metadata)
+
+
+def input_topic(node: str, input_name: str) -> Topic:
+    """Return the topic of a connection's message records."""
+    metadata = {"role": "input", "node": node, "input": input_name}
+    name = f"/{snake(node)}/inputs/{snake(input_name)}"
+    return Topic(name, "sim2real_msgs/msg/Input", _int64_text(MESSAGE_FIELDS), MESSAGE_LAYOUT, metadata)
+
+
+def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]]) -> JointSource:
+    """Return how a node's output becomes ``sensor_msgs/msg/JointState``.
+
+    Args:
+        node: The node's name.
+        example: One output of the node.
+        joints: Joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the output: ``"th"``, or
+            ``"q[2]"`` for an element of the flattened field.
+
+    Raises:
+        Sim2RealError: When a quantity, a field or an element does not exist.
+    """
+    leaves = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
+    quantities = ("position", "velocity", "effort")
+    for joint, sources in joints.items():
+        if unknown := set(sources) - set(quantities):
+            raise Sim2RealError(
+                f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
+            )
+    picks = []
+    parts: list[Constant | Field] = [Field("sec", np.dtype("<i4")), Field("nanosec", np.dtype("<u4")), text("")]
+    parts += [length(len(joints)), *(text(joint) for joint in joints)]
+    for quantity in quantities:
+        given = any(quantity in sources for sources in joints.values())
+        chosen = [_pick(node, joint, s.get(quantity), leaves) for joint, s in joints.items()] if given else []
+        picks.append(tuple(chosen))
+        parts.append(length(len(chosen)))
+        if chosen:
+            parts.append(Field(quantity, np.dtype("<f8"), (len(chosen),)))
+    metadata = {"role": "joint_states"}
+    topic = Topic("/joint_states", "sensor_msgs/msg/JointState", _JOINT_STATE_TEXT, Layout(parts), metadata)
+    return JointSource(topic, tuple(picks))
+
+
+def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, str]:
+    """Return original name -> ROS name.
+
+    Raises:
+        Sim2RealError: When two originals become the same name.
+    """
+    taken: dict[str, str] = {}
+    for original in originals:
+        name = snake(original)
+        if name in taken:
+            raise Sim2RealError(
+                f"{kind}s {taken[name]!r} and {original!r} in {where} are both {name!r} in the log",
+                hint="ROS names are lower_snake_case: rename one of them",
+            )
+        taken[name] = original
+    return {original: name for name, original in taken.items()}
+
+
+def _field(entry: Mapping[str, Any]) -> Field:
+    return Field(entry["original"], np.dtype(entry["dtype"]), tuple(entry["shape"]))
+
+
+def _pick(node: str, joint: str, source: str | None, leaves: Mapping[str, np.ndarray]) -> tuple[int, int]:
+    if source is None:
+        return -1, 0
+    match = re.fullmatch(r"(.*)\[(\d+)\]", source)
+    name, element = (match[1], int(match[2])) if match else (source, 0)
+    if name not in leaves:
+        raise Sim2RealError(
+            f"joint {joint!r} reads {source!r}, but the output of node {node!r} has no field {name!r}. "
+            f"Available: {', '.join(leaves)}"
+        )
+    size = leaves[name].size
+    if element >= size or (match is None and size != 1):
+        raise Sim2RealError(
+            f"joint {joint!r} reads {source!r}, but field {name!r} of node {node!r} has {size} elements",
+            hint=f"name one of them: {name}[0] to {name}[{size - 1}]",
+        )
+    return list(leaves).index(name), element
+
+
+def _camel(name: str) -> str:
+    return "".join(part.capitalize() for part in snake(name).split("_"))
+
+
+def _int64_text(names: Sequence[str]) -> str:
+    return "".join(f"int64 {name}\n" for name in names)
+
+
+STEP_LAYOUT = Layout(Field(name, _INT64) for name in STEP_FIELDS)
+MESSAGE_LAYOUT = Layout(Field(name, _INT64) for name in MESSAGE_FIELDS)

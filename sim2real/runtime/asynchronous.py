@@ -1,0 +1,296 @@
+"""AsyncGraph: a graph whose nodes step one by one, on the wall clock or on a simulated one."""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.episode import Recorder
+from sim2real.graph.node import BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.graph.timeline import Timeline
+from sim2real.runtime.clock import Clock
+from sim2real.runtime.data import NodeData
+from sim2real.runtime.handover import Reply
+from sim2real.runtime.init import collect, init_graph_state
+from sim2real.runtime.simulated import SimulatedRun
+from sim2real.runtime.statistics import NodeStatistics
+from sim2real.runtime.stepper import Stepper
+from sim2real.runtime.wallclock import WallClockRun
+
+
+class AsyncGraph:
+    """Runs a graph: on hardware in real time, or in simulation in the order of events.
+
+    Two ways to run it. ``start`` and then ``run_for`` or ``wait``: the supervisor makes its own steps. Or, like a gym
+    environment, ``reset`` and then ``step``: each returns what the supervisor sees at its next step, and the caller
+    provides the output. ``with graph:`` stops it on the way out; so does the interpreter's exit.
+
+    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step, and the
+    call that waits, or else the next one, raises it with the node's name.
+
+    Args:
+        nodes: The nodes, by name or as a list.
+        supervisor: The node at whose steps ``reset``, ``step`` and ``run`` hand over.
+        clock: What moves time.
+        real_time_factor: Simulated seconds a second, at most; 0: as fast as possible. Simulated clock only.
+        recorder: Takes what happens.
+        duration_s: How long drawn timelines are [s]. Simulated clock only; needed unless ``timeline`` is given.
+        timeline: What happens when; the graph state's ``eps`` selects the episode. Simulated clock only.
+        timeout_s: How long a call waits for the next step, and the supervisor for its caller [s].
+        spin_s: How long threads poll before a step instead of sleeping [s]. Wall clock only.
+
+    Raises:
+        UsageError: When the nodes form no graph or an option does not go with the clock.
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
+        supervisor: BaseNode,
+        clock: Clock = Clock.WALL_CLOCK,
+        real_time_factor: float = 0.0,
+        recorder: Recorder | None = None,
+        duration_s: float | None = None,
+        timeline: Timeline | None = None,
+        timeout_s: float = 30.0,
+        spin_s: float = 0.0,
+    ) -> None:
+        self.nodes = collect(nodes, supervisor)
+        self.supervisor = supervisor
+        self.clock = Clock(clock)
+        self.recorder = recorder
+        self._factor, self._duration_s, self._timeline = real_time_factor, duration_s, timeline
+        self._timeout_s, self._spin_s = timeout_s, spin_s
+        self._steppers = {name: Stepper(node) for name, node in self.nodes.items()}
+        self._jit: dict[str, bool] = dict.fromkeys(self.nodes, True)
+        self._run: WallClockRun | SimulatedRun | None = None
+        self._run_data: dict[str, NodeData] = {}
+        self._check_options()
+
+    def init(
+        self, rng: jax.Array, params: Mapping[str, Any] | None = None, order: Sequence[str] | None = None
+    ) -> GraphState:
+        """Return the state in which the graph starts, see ``init_graph_state``."""
+        return init_graph_state(self.nodes, self.supervisor, rng, params, order)
+
+    def warmup(self, graph_state: GraphState, jit_step: bool | Mapping[str, bool] = True) -> None:
+        """Compile all steps ahead of time for graph states like this one, unless that is done.
+
+        Pure steps run once, and the result is dropped; a step with a callback, or in plain Python, does not run.
+
+        Args:
+            graph_state: As ``init`` returns it.
+            jit_step: Whether steps are compiled: of all nodes, or by name (default: True). Nodes with
+                ``jittable = False`` never are.
+
+        Raises:
+            UsageError: When a step's results do not fit its node's state or default output.
+        """
+        if isinstance(jit_step, Mapping):
+            unknown = [n for n in jit_step if n not in self.nodes]
+            if unknown:
+                raise UsageError(f"jit_step names {', '.join(unknown)}. Nodes: {', '.join(self.nodes)}")
+            self._jit = {name: bool(jit_step.get(name, True)) for name in self.nodes}
+        else:
+            self._jit = dict.fromkeys(self.nodes, bool(jit_step))
+        self._prepare(graph_state)
+
+    def start(self, graph_state: GraphState, timeout_s: float = 60.0) -> None:
+        """Start an episode in which the supervisor makes its own steps.
+
+        Args:
+            graph_state: As ``init`` returns it.
+            timeout_s: How long the nodes' startups may take [s]; if they fail, stopping may take as long again.
+
+        Raises:
+            UsageError: When the graph is running.
+            Sim2RealError: When a startup failed; all nodes are stopped then.
+        """
+        if self.running:
+            raise UsageError("the graph is running", hint="call stop() first")
+        self._start(graph_state, own=True, timeout_s=timeout_s)
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Stop the graph, from any state and any thread; does nothing when it is stopped.
+
+        Raises:
+            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
+        """
+        atexit.unregister(self.stop)
+        if self._run is not None:
+            self._run.stop(timeout_s)
+
+    def run_for(self, duration_s: float) -> GraphState:
+        """Let the running graph run on, the supervisor making its own steps, and return its state.
+
+        On the simulated clock all steps that start within the next ``duration_s`` are made. Returns early when
+        another thread stops the graph. After ``reset``, the next step is offered to the caller again.
+        """
+        run = self._running()
+        run.run_for(duration_s)
+        return run.snapshot()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the running graph ends: it is stopped, or the simulated timeline is over.
+
+        Returns:
+            Whether it ended in time.
+        """
+        if self._run is None:
+            raise UsageError("the graph is not running", hint="call start() first")
+        return self._run.wait(timeout_s)
+
+    def reset(self, graph_state: GraphState, timeout_s: float = 60.0) -> tuple[GraphState, StepState]:
+        """Start an episode, stopping one that runs, and return what the supervisor sees at its first step."""
+        self.stop()
+        run = self._start(graph_state, own=False, timeout_s=timeout_s)
+        step_state = run.observe(self._timeout_s)
+        return run.snapshot(), step_state
+
+    def step(
+        self, graph_state: GraphState, step_state: StepState | None = None, output: Any = None
+    ) -> tuple[GraphState, StepState]:
+        """Make the supervisor's step and return what it sees at its next one.
+
+        Args:
+            graph_state: What the call before returned; the nodes keep their own states while the graph runs.
+            step_state: The supervisor's step state after the step; None: as it was.
+            output: The step's output; None: the supervisor makes the step itself.
+
+        Raises:
+            UsageError: Before ``reset``, past the end of the timeline, or when the output does not look like the
+                supervisor's default output (the step is still on offer then).
+            GraphTimeout: When there was no next step in time.
+        """
+        del graph_state
+        run = self._running()
+        run.observe(self._timeout_s)
+        run.reply(self._reply(step_state, output))
+        observed = run.observe(self._timeout_s)
+        return run.snapshot(), observed
+
+    def run(self, graph_state: GraphState) -> GraphState:
+        """Run the graph to the end of the supervisor's next step, which it makes itself; start it if need be."""
+        run = self._run if self.running and self._run else self._restart(graph_state)
+        run.observe(self._timeout_s)
+        run.settle(run.reply(Reply()), self._timeout_s)
+        return run.snapshot()
+
+    @property
+    def running(self) -> bool:
+        """Whether an episode is on."""
+        return self._run is not None and not self._run.ended
+
+    @property
+    def graph_state(self) -> GraphState:
+        """The graph's state as of each node's last finished step, in the episode that runs or was the last."""
+        if self._run is None:
+            raise UsageError("the graph has not run", hint="call start() or reset()")
+        return self._run.snapshot()
+
+    def statistics(self) -> dict[str, NodeStatistics]:
+        """Return how well each node kept its times in the episode that runs or was the last."""
+        return {} if self._run is None else self._run.statistics()
+
+    def __enter__(self) -> AsyncGraph:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop()
+
+    def _check_options(self) -> None:
+        simulated = self.clock is Clock.SIMULATED
+        if simulated:
+            if (self._duration_s is None) == (self._timeline is None):
+                raise UsageError("the simulated clock needs a duration_s or a timeline, one of them")
+            if self._spin_s:
+                raise UsageError("spin_s is for the wall clock")
+        elif self._factor or self._duration_s is not None or self._timeline is not None:
+            raise UsageError("real_time_factor, duration_s and timeline are for the simulated clock")
+        if not (self._factor >= 0 and self._spin_s >= 0 and self._timeout_s > 0):
+            raise UsageError("real_time_factor and spin_s must be at least 0, timeout_s must be positive")
+        for node in self.nodes.values():
+            averaged = [c for c in node.inputs.values() if c.averaged]
+            if averaged and not simulated:
+                raise UsageError(
+                    f"node {node.name!r}: input {averaged[0].name!r} averages over messages of the tick that has only "
+                    "begun (interp='zoh_mean'), which the wall clock cannot",
+                    hint="use interp='zoh', or leave simulated worlds out of a graph on the wall clock",
+                )
+        if self._timeline is not None:
+            missing = [n for n in self.nodes if n not in self._timeline.vertices]
+            edges = {(n, i) for n, node in self.nodes.items() for i in node.inputs}
+            if missing or not edges <= set(self._timeline.edges):
+                lacks = missing or [f"{n}/{i}" for n, i in edges - set(self._timeline.edges)]
+                raise UsageError(
+                    f"the timeline lacks {', '.join(lacks)}",
+                    hint="draw what is missing: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
+                )
+
+    def _prepare(self, graph_state: GraphState) -> dict[str, NodeData]:
+        simulated = self.clock is Clock.SIMULATED
+        data = {name: NodeData(node, graph_state, simulated) for name, node in self.nodes.items()}
+        for name, stepper in self._steppers.items():
+            stepper.prepare(data[name], self._jit[name])
+        return data
+
+    def _start(self, graph_state: GraphState, own: bool, timeout_s: float) -> WallClockRun | SimulatedRun:
+        if self._run is not None:
+            self._run.check()
+            if self._run.alive:
+                raise Sim2RealError(
+                    f"{', '.join(self._run.alive)} did not end when the graph was stopped, and may still act",
+                    hint="start a new process",
+                )
+        data = self._prepare(graph_state)
+        common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, own)
+        if self.clock is Clock.SIMULATED:
+            timeline, episode = self._timeline_of(graph_state)
+            run = SimulatedRun(*common, timeline, episode, self._factor)
+        else:
+            run = WallClockRun(*common, self._spin_s, self._timeout_s)
+        self._run, self._run_data = run, data
+        atexit.register(self.stop)
+        try:
+            run.begin(timeout_s)
+        except BaseException:
+            self.stop(timeout_s)
+            raise
+        return run
+
+    def _timeline_of(self, graph_state: GraphState) -> tuple[Timeline, int]:
+        """Return the timeline and the episode in it; drawn ones depend on the graph state's keys alone."""
+        eps = int(graph_state.eps)
+        if self._timeline is not None:
+            if not 0 <= eps < self._timeline.episodes:
+                raise UsageError(f"there is no episode {eps}: the timeline has {self._timeline.episodes}")
+            return self._timeline, eps
+        key = graph_state.rng[self.supervisor.name]
+        if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key):
+            key = jax.random.key_data(key)
+        seed = np.random.default_rng([eps, *np.asarray(key).ravel().tolist()])
+        return draw(self.nodes, self._duration_s or 0.0, 1, seed), 0
+
+    def _running(self) -> WallClockRun | SimulatedRun:
+        if self._run is None:
+            raise UsageError("the graph is not running", hint="call start() or reset() first")
+        self._run.check()
+        if self._run.ended:
+            raise UsageError("the graph has been stopped", hint="call start() or reset() to run it again")
+        return self._run
+
+    def _restart(self, graph_state: GraphState) -> WallClockRun | SimulatedRun:
+        self.stop()
+        return self._start(graph_state, own=False, timeout_s=self._timeout_s)
+
+    def _reply(self, step_state: StepState | None, output: Any) -> Reply:
+        if output is None:
+            return Reply(step_state)
+        return Reply(step_state, self._run_data[self.supervisor.name].form.pack(output))

@@ -1,0 +1,110 @@
+"""A connection on the wall clock: messages in, stamped on arrival; messages out by the timing rules."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from sim2real.graph.episode import MessageRecord
+from sim2real.graph.node import Connection
+from sim2real.graph.schedule import eligible, quota
+from sim2real.runtime.clock import MonotonicClock
+from sim2real.runtime.data import Message
+from sim2real.runtime.failure import Stopped
+
+_CHUNK = 1024
+
+
+class Table:
+    """Values of a vectorised rule by step, computed in chunks: a numpy call a step would cost more than the rule."""
+
+    def __init__(self, rule: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._rule = rule
+        self._first, self._values = 0, rule(np.arange(_CHUNK)).tolist()
+
+    def __getitem__(self, k: int) -> int:
+        if not 0 <= k - self._first < _CHUNK:
+            self._first = k
+            self._values = self._rule(np.arange(k, k + _CHUNK)).tolist()
+        return self._values[k - self._first]
+
+
+class Channel:
+    """One connection's messages between two threads."""
+
+    def __init__(self, connection: Connection, clock: MonotonicClock) -> None:
+        self.connection = connection
+        self._clock = clock
+        self._condition = threading.Condition(threading.Lock())
+        self._queue: deque[Message] = deque()
+        self._arrived = 0
+        self._last_arrival = 0
+        self._taken: list[Message] = []
+        self._stopped = False
+        self._quota = Table(lambda k: quota(connection, k)) if connection.blocking else None
+
+    def put(self, seq: int, sent: int, leaves: list[np.ndarray]) -> None:
+        """Deliver a message (the sender's side): it arrives now, in order."""
+        with self._condition:
+            received = max(self._clock.now(), sent, self._last_arrival)
+            self._last_arrival = received
+            self._queue.append(Message(seq, sent, received, leaves))
+            self._arrived += 1
+            self._condition.notify()
+
+    def stop(self) -> None:
+        """Wake a reader that waits."""
+        with self._condition:
+            self._stopped = True
+            self._condition.notify_all()
+
+    def wait_group(self, k: int) -> int:
+        """Wait for the messages that step ``k`` waits for, if the input is blocking; return the last arrival, else 0.
+
+        Raises:
+            Stopped: When the graph stopped meanwhile.
+        """
+        if self._quota is None:
+            return 0
+        upto = self._quota[k]
+        with self._condition:
+            while self._arrived < upto and not self._stopped:
+                self._condition.wait()
+            if self._stopped:
+                raise Stopped
+            due = self._due(upto)
+            return self._queue[due - 1].received if due else 0
+
+    def take(self, k: int, begin: int) -> list[Message]:
+        """Return the messages that step ``k``, which starts at ``begin`` [ticks], consumes (rule 6)."""
+        with self._condition:
+            if not self._queue:
+                due = 0
+            elif self._quota is not None:
+                due = self._due(self._quota[k])
+            else:
+                received = np.array([m.received for m in self._queue], np.int64)
+                earliest = eligible(self.connection, received, self._queue[0].seq)
+                due = int(np.searchsorted(earliest, begin, side="right"))
+            self._taken = [self._queue.popleft() for _ in range(due)]
+        return self._taken
+
+    def consumed(self, k: int) -> Iterator[MessageRecord]:
+        """Yield the records of what step ``k`` took, now that it is finished."""
+        taken, self._taken = self._taken, []
+        return (self._record(m, k) for m in taken)
+
+    def leftover(self) -> Iterator[MessageRecord]:
+        """Yield the records of what no step consumed, once both threads have ended."""
+        return (self._record(m, -1) for m in (*self._taken, *self._queue))
+
+    def _due(self, upto: int) -> int:
+        """Return how many queued messages have a smaller seq."""
+        return min(len(self._queue), max(0, upto - self._queue[0].seq)) if self._queue else 0
+
+    def _record(self, m: Message, seq_in: int) -> MessageRecord:
+        c = self.connection
+        return MessageRecord(c.input_node.name, c.name, m.seq, seq_in, m.sent, m.received)

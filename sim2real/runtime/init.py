@@ -1,0 +1,137 @@
+"""The initial state of a graph: the same for the same seed in every runtime."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState
+from sim2real.graph.delays import TrainableDist
+from sim2real.graph.node import BaseNode, phase_ticks
+from sim2real.graph.schedule import waits_for_schedule
+
+OUTPUTS = "outputs"
+"""Key of ``GraphState.aux``: node name -> its default output, drawn once and shared by all its readers."""
+
+
+def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: BaseNode) -> dict[str, BaseNode]:
+    """Return the nodes by name, the supervisor among them, after checking that they form a graph.
+
+    Raises:
+        UsageError: When names clash, a sender is missing, connections form a loop, or ``advance`` cannot work.
+    """
+    given = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
+    if not any(node is supervisor for node in given):
+        given.append(supervisor)
+    found: dict[str, BaseNode] = {}
+    for node in given:
+        if node.name in found:
+            raise UsageError(f"two nodes are called {node.name!r}", hint="names are unique in a graph")
+        found[node.name] = node
+    if isinstance(nodes, Mapping):
+        for key, node in nodes.items():
+            if key != node.name:
+                raise UsageError(f"the key {key!r} stands for a node that is called {node.name!r}")
+    for node in found.values():
+        for c in node.inputs.values():
+            if found.get(c.output_node.name) is not c.output_node:
+                raise UsageError(
+                    f"node {node.name!r} listens to {c.output_node.name!r}, which is not in the graph. "
+                    f"Nodes: {', '.join(found)}",
+                    hint="pass every node that another one listens to",
+                )
+        phase_ticks(node)
+        waits_for_schedule(node)
+    return found
+
+
+def init_graph_state(
+    nodes: Mapping[str, BaseNode],
+    supervisor: BaseNode | str,
+    rng: jax.Array,
+    params: Mapping[str, Any] | None = None,
+    order: Sequence[str] | None = None,
+) -> GraphState:
+    """Return the state in which a graph starts; pure, so it can be traced and mapped.
+
+    Parameters of all nodes come first, then states, then default outputs (``aux["outputs"]``), then trainable delays
+    (the distributions, at their delay); each ``init_*`` method sees what was made before it. A node's keys depend on
+    ``rng`` and its name alone.
+
+    Args:
+        nodes: The nodes by name; their senders may be left out.
+        supervisor: The node at whose steps the graph is cut, or its name.
+        rng: Key.
+        params: Parameters that are kept as given; nodes without any call ``init_params``.
+        order: Names of nodes that are initialised first; then comes the supervisor, then the others.
+
+    Raises:
+        UsageError: When ``supervisor``, ``params`` or ``order`` name unknown nodes.
+    """
+    first = supervisor if isinstance(supervisor, str) else supervisor.name
+    names = _order(nodes, first, params or {}, order or ())
+    keys = {n: jax.random.split(jax.random.fold_in(rng, jnp.uint32(zlib.crc32(n.encode()))), 5) for n in nodes}
+    state = GraphState(
+        eps=jnp.int32(0),
+        step=jnp.int32(-1),
+        rng={n: keys[n][0] for n in nodes},
+        params={n: _fixed(nodes[n], p) for n, p in (params or {}).items()},
+        seq={n: jnp.int32(0) for n in nodes},
+    )
+    for n in names:
+        if n not in state.params:
+            made = _fixed(nodes[n], nodes[n].init_params(keys[n][1], state))
+            state = _replace(state, params={**state.params, n: made})
+    for n in names:
+        made = _fixed(nodes[n], nodes[n].init_state(keys[n][2], state))
+        state = _replace(state, state={**state.state, n: made})
+    outputs = {n: jax.tree_util.tree_map(_strong, nodes[n].init_output(keys[n][3], state)) for n in names}
+    state = _replace(state, aux={**state.aux, OUTPUTS: outputs})
+    return _replace(state, delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state))})
+
+
+def default_output(graph_state: GraphState, node: str) -> Any:
+    """Return the message that stands in the windows of a node's readers before its first one arrives."""
+    outputs = graph_state.aux.get(OUTPUTS, {})
+    if node not in outputs:
+        raise UsageError(f"the graph state has no default output of {node!r}", hint="make graph states with init()")
+    return outputs[node]
+
+
+def _order(
+    nodes: Mapping[str, BaseNode], supervisor: str, params: Mapping[str, Any], order: Sequence[str]
+) -> list[str]:
+    for what, given in (("supervisor", [supervisor]), ("params", params), ("order", order)):
+        unknown = [n for n in given if n not in nodes]
+        if unknown:
+            raise UsageError(f"{what} names {', '.join(unknown)}, not in the graph. Nodes: {', '.join(nodes)}")
+    return list(dict.fromkeys([*order, supervisor, *nodes]))
+
+
+def _delays(node: BaseNode, key: jax.Array, state: GraphState) -> dict[str, TrainableDist]:
+    """Return the distributions of a node's trainable inputs, at the delays that ``init_delays`` gives."""
+    trainable = {n: c.delay_dist for n, c in node.inputs.items() if isinstance(c.delay_dist, TrainableDist)}
+    if not trainable:
+        return {}
+    given = node.init_delays(key, state)
+    return {n: dist.with_delay(given[n]) if n in given else dist for n, dist in trainable.items()}
+
+
+def _fixed(node: BaseNode, tree: Any) -> Any:
+    """Give leaves a strong dtype; a node in plain Python keeps its own objects."""
+    return jax.tree_util.tree_map(_strong, tree) if node.jittable else tree
+
+
+def _strong(leaf: Any) -> Any:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return leaf
+    return jnp.asarray(leaf, dtype=jnp.result_type(leaf))
+
+
+def _replace(state: GraphState, /, **fields: Any) -> GraphState:
+    return state.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,282 @@
+"""A graph on the simulated clock: timelines first, then every step in the order of events, on the caller's thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
+from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
+from sim2real.graph.schedule import next_drift, slot, topological
+from sim2real.graph.timeline import Edge, Timeline
+from sim2real.runtime.data import Message, NodeData, snapshot
+from sim2real.runtime.failure import GraphTimeout, named
+from sim2real.runtime.handover import Reply
+from sim2real.runtime.statistics import NodeStatistics, StepLog
+from sim2real.runtime.stepper import Result, Stepper, overwritten
+
+_NEVER = 2**62
+
+
+class _Link:
+    """One connection of the timeline: which messages each step consumes."""
+
+    def __init__(self, edge: Edge, episode: int, steps: int) -> None:
+        self.sender = edge.sender
+        self.received: list[int] = edge.received[episode].tolist()
+        self.seq_in: list[int] = edge.seq_in[episode].tolist()
+        self.used = np.flatnonzero(edge.seq_in[episode] >= 0)
+        self.bounds: list[int] = np.searchsorted(edge.seq_in[episode][self.used], np.arange(steps + 1)).tolist()
+        self.waiting: dict[int, list[np.ndarray]] = {}
+
+    def consumed(self, k: int) -> list[int]:
+        """Return the messages that step ``k`` consumes, oldest first."""
+        return self.used[self.bounds[k] : self.bounds[k + 1]].tolist()
+
+    def put(self, m: int, leaves: list[np.ndarray]) -> None:
+        """Keep message ``m`` if a step will consume it."""
+        if self.seq_in[m] >= 0:
+            self.waiting[m] = leaves
+
+
+class _Player:
+    """One node's place in the timeline."""
+
+    def __init__(self, stepper: Stepper, data: NodeData, timeline: Timeline, episode: int) -> None:
+        node = stepper.node
+        vertex = timeline.vertices[node.name]
+        steps = int(vertex.count[episode])
+        self.stepper, self.data = stepper, data
+        self.begins: list[int] = [*vertex.start[episode, :steps].tolist(), _NEVER]
+        self.ends: list[int] = vertex.end[episode, :steps].tolist()
+        self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
+        self.links = {i: _Link(timeline.edges[node.name, i], episode, steps) for i in node.inputs}
+        self.outputs: list[_Link] = []
+        self.k = 0
+        self.drift = 0
+        self.log = StepLog()
+
+    def ready(self, players: Mapping[str, _Player]) -> bool:
+        """Return whether everything that the next step consumes has been sent."""
+        for link in self.links.values():
+            last = link.bounds[self.k + 1]
+            if last and link.used[last - 1] >= players[link.sender].k:
+                return False
+        return True
+
+
+class SimulatedRun:
+    """One episode on the simulated clock.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name.
+        steppers: Prepared steppers by name.
+        data: The nodes' data by name.
+        graph_state: Where the episode starts.
+        recorder: Takes records, or None.
+        own: Whether the supervisor makes its steps itself.
+        timeline: What happens when.
+        episode: Which of its episodes.
+        real_time_factor: Simulated seconds a second, at most; 0: as fast as possible.
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        supervisor: str,
+        steppers: Mapping[str, Stepper],
+        data: dict[str, NodeData],
+        graph_state: GraphState,
+        recorder: Recorder | None,
+        own: bool,
+        timeline: Timeline,
+        episode: int,
+        real_time_factor: float,
+    ) -> None:
+        self._nodes, self._supervisor, self._data = nodes, supervisor, data
+        self._graph_state, self._recorder, self._own, self._factor = graph_state, recorder, own, real_time_factor
+        # In the order of the graph: of two steps at one time, a sender comes before its reader.
+        self._players = {n: _Player(steppers[n], data[n], timeline, episode) for n in topological(nodes)}
+        for player in self._players.values():
+            for link in player.links.values():
+                self._players[link.sender].outputs.append(link)
+        self._now = 0
+        self._pending: StepState | None = None
+        self._stopping = threading.Event()
+        self._stop_lock = threading.Lock()
+        self._stopped = False
+        self._origin_s = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether the graph has stopped."""
+        return self._stopping.is_set()
+
+    @property
+    def alive(self) -> list[str]:
+        """Nodes whose threads have not ended: there are none."""
+        return []
+
+    def begin(self, timeout_s: float) -> None:
+        """Start the clock."""
+        del timeout_s
+        self._origin_s = time.monotonic()
+        for node in self._nodes.values():
+            node.set_clock(lambda: self._now / TICKS_PER_S)
+        if self._recorder is not None:
+            self._recorder.start(time.time_ns(), time.monotonic_ns())
+
+    def observe(self, timeout_s: float) -> StepState:
+        """Run the graph to the supervisor's next step and return what it sees."""
+        if self._own:
+            raise UsageError(
+                f"the supervisor {self._supervisor!r} makes its own steps",
+                hint="call reset() instead of start() to make them yourself",
+            )
+        deadline = time.monotonic() + timeout_s
+        player = self._players[self._supervisor]
+        while self._pending is None:
+            if player.begins[player.k] == _NEVER:
+                raise UsageError(
+                    f"the timeline ends after step {player.k - 1} of the supervisor {self._supervisor!r}",
+                    hint="reset the graph, or give AsyncGraph a longer duration_s or timeline",
+                )
+            if time.monotonic() > deadline:
+                raise GraphTimeout(f"no step of the supervisor {self._supervisor!r} within {timeout_s:g} s")
+            if self.ended:
+                raise Sim2RealError("the graph was stopped while a step was awaited", hint="call reset()")
+            self._event()
+        return self._pending
+
+    def reply(self, reply: Reply) -> int:
+        """Make the supervisor's step with the caller's reply; return how many steps it has made."""
+        given, self._pending = self._pending, None
+        if given is None:
+            raise UsageError("no step is on offer", hint="call reset() first")
+        player = self._players[self._supervisor]
+        self._make(player, given, reply)
+        return player.k
+
+    def settle(self, finished: int, timeout_s: float) -> None:
+        """Do nothing: a step is finished when ``reply`` returns."""
+
+    def run_for(self, duration_s: float) -> None:
+        """Run all steps that start within the next seconds, the supervisor making its own."""
+        self._run_until(self._now + to_ticks(duration_s), None)
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Run to the timeline's end; return whether it was reached in time."""
+        return self._run_until(_NEVER - 1, None if timeout_s is None else time.monotonic() + timeout_s)
+
+    def check(self) -> None:
+        """Do nothing: a failure is raised where it happens."""
+
+    def stop(self, timeout_s: float) -> None:
+        """End the episode."""
+        del timeout_s
+        self._stopping.set()
+        with self._stop_lock:
+            if self._stopped:
+                return
+            self._stopped = True
+        for node in self._nodes.values():
+            node.set_clock(None)
+        if self._recorder is not None:
+            for player in self._players.values():
+                for name, link in player.links.items():
+                    for m in range(self._players[link.sender].k):
+                        if not 0 <= link.seq_in[m] < player.k:
+                            self._recorder.message(self._message_record(player, name, m, -1))
+
+    def snapshot(self) -> GraphState:
+        """Return the graph's state as of each node's last finished step."""
+        return snapshot(self._graph_state, self._data, self._supervisor)
+
+    def statistics(self) -> dict[str, NodeStatistics]:
+        """Return how well each node kept its (simulated) times."""
+        return {name: self._players[name].log.summary() for name in self._nodes}
+
+    def _run_until(self, limit: int, deadline: float | None) -> bool:
+        """Run all steps that start before ``limit`` [ticks]; return False when ``deadline`` [s] came first."""
+        own, self._own = self._own, True
+        try:
+            if self._pending is not None:
+                self.reply(Reply())
+            while not self.ended and min(p.begins[p.k] for p in self._players.values()) < limit:
+                if deadline is not None and time.monotonic() > deadline:
+                    return False
+                self._event()
+        finally:
+            self._own = own
+        self._now = max(self._now, limit) if limit < _NEVER - 1 else self._now
+        return True
+
+    def _event(self) -> None:
+        """Make the next step of all, or offer it if it is the caller's; do nothing once the graph is stopped."""
+        ready = [p for p in self._players.values() if p.begins[p.k] < _NEVER and p.ready(self._players)]
+        if not ready:
+            raise Sim2RealError(
+                "no node can step: the timeline has steps that wait for messages which nobody sends",
+                hint="draw it with sim2real.graph.schedule.draw for these nodes",
+            )
+        player = min(ready, key=lambda p: p.begins[p.k])  # the first of several at one time
+        begin = player.begins[player.k]
+        self._now = max(self._now, begin)
+        if self._factor > 0:
+            rest = self._origin_s + begin / TICKS_PER_S / self._factor - time.monotonic()
+            self._stopping.wait(max(0.0, rest))
+        if self.ended:
+            return
+        for name, link in player.links.items():
+            messages = [self._message(link, m) for m in link.consumed(player.k)]
+            player.data.windows[name].push(messages)
+        given = player.data.step_state(player.k, begin)
+        if player.data.node.name == self._supervisor and not self._own:
+            self._pending = given
+        else:
+            self._make(player, given, Reply())
+
+    def _make(self, player: _Player, given: StepState, reply: Reply) -> None:
+        """Make a step, send its output and record it."""
+        node, k = player.data.node, player.k
+        begin, end = player.begins[k], player.ends[k]
+        try:
+            result = player.stepper.answer(player.data, given, player.data.ages(begin), reply)
+            moved = overwritten(result.ts, begin, end, node.name)
+        except Exception as error:
+            self.stop(0.0)
+            failure = named(error, node.name, f"step {k}")
+            raise failure from failure.__cause__
+        player.k += 1
+        for link in player.outputs:
+            link.put(k, result.leaves)
+        player.data.keep(result.changed)
+        later = int(next_drift(node.scheduling, player.slots[k], player.drift, player.ends[k - 1] if k else 0))
+        player.log.add(begin, begin, end, player.slots[k + 1] + later)
+        self._record(player, k, moved, result)
+        player.drift = later
+
+    def _record(self, player: _Player, k: int, moved: int, result: Result) -> None:
+        if self._recorder is None:
+            return
+        begin, name = player.begins[k], player.data.node.name
+        record = StepRecord(name, k, player.slots[k], begin, begin, moved, player.ends[k], player.drift)
+        self._recorder.step(record, player.data.form.unpack(result.leaves))
+        for input_name, link in player.links.items():
+            for m in link.consumed(k):
+                self._recorder.message(self._message_record(player, input_name, m, k))
+
+    def _message(self, link: _Link, m: int) -> Message:
+        sender = self._players[link.sender]
+        return Message(m, sender.ends[m], link.received[m], link.waiting.pop(m))
+
+    def _message_record(self, player: _Player, name: str, m: int, seq_in: int) -> MessageRecord:
+        link = player.links[name]
+        sent = self._players[link.sender].ends[m]
+        return MessageRecord(player.data.node.name, name, m, seq_in, sent, link.received[m])

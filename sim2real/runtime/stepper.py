@@ -1,0 +1,160 @@
+"""Calling a node's step: compiled ahead of time, or as plain Python, with the same checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import InputState, StepState
+from sim2real.graph.delays import TrainableDist
+from sim2real.graph.node import BaseNode, to_ticks
+from sim2real.runtime.data import NodeData
+from sim2real.runtime.handover import Reply
+
+_CARRIED = ("rng", "params", "state")
+
+
+class Result(NamedTuple):
+    """What a step did.
+
+    Attributes:
+        changed: Those of ``rng``, ``params`` and ``state`` that it replaced.
+        ts: The start that it set itself [s], or None.
+        leaves: Its output, packed.
+    """
+
+    changed: dict[str, Any]
+    ts: Any
+    leaves: list[np.ndarray]
+
+
+class Stepper:
+    """Runs the steps of one node, over any number of episodes."""
+
+    def __init__(self, node: BaseNode) -> None:
+        self.node = node
+        self._compiled: Any = None
+        self._signature: Any = None
+
+    def prepare(self, data: NodeData, jit: bool) -> None:
+        """Compile the step for data like these, unless that is done; nothing is run that has side effects.
+
+        Raises:
+            UsageError: When the step's results do not fit the node's state or default output.
+        """
+        jit = jit and self.node.jittable
+        arguments = (data.step_state(0, 0), data.ages(0))
+        leaves, tree = jax.tree_util.tree_flatten(arguments)
+        signature = (jit, tree, [(np.shape(x), jnp.result_type(x)) for x in leaves] if jit else None)
+        if signature == self._signature:
+            return
+        self._compiled = None
+        if jit:
+            traced = jax.jit(self._call).trace(*arguments)
+            self._check(data, arguments[0], traced.out_info)
+            self._compiled = traced.lower().compile()
+            if not traced.jaxpr.effects:  # pure: a first call fills caches, its result is dropped
+                jax.block_until_ready(self._compiled(*arguments))
+        self._signature = signature
+
+    def run(self, data: NodeData, step_state: StepState, ages: Mapping[str, np.ndarray]) -> Result:
+        """Run one step to its end."""
+        if self._compiled is not None:
+            changed, output = jax.block_until_ready(self._compiled(step_state, dict(ages)))
+            leaves = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(output)]
+        else:
+            if self.node.jittable:  # eager JAX: steps may use `.at[...]` on their inputs
+                step_state = jax.tree_util.tree_map(jnp.asarray, step_state)
+            changed, output = self._call(step_state, ages)
+            leaves = data.form.pack(output)
+        return Result(changed, changed.pop("ts", None), leaves)
+
+    def answer(self, data: NodeData, given: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> Result:
+        """Return the result of a step that the caller made, or changed before the node makes it."""
+        before = {} if reply.step_state is None else _changed(given, reply.step_state)
+        if reply.leaves is not None:
+            return Result(before, before.pop("ts", None), reply.leaves)
+        made = self.run(data, reply.step_state or given, ages)
+        return Result({**before, **made.changed}, made.ts, made.leaves)
+
+    def _call(self, step_state: StepState, ages: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+        result = self.node.step(_served(self.node, step_state, ages))
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], StepState)):
+            raise UsageError(
+                f"node {self.node.name!r}: step returned {type(result).__name__}",
+                hint="return the new step state and the output: `return step_state.replace(...), output`",
+            )
+        return _changed(step_state, result[0]), result[1]
+
+    def _check(self, data: NodeData, given: StepState, out: Any) -> None:
+        changed, output = out
+        for field in _CARRIED:
+            if field in changed:
+                self._compare(f"the {field} that step returns", changed[field], "the one it got", getattr(given, field))
+        self._compare("the output of step", output, "that of init_output", data.form.unpack(data.form.default))
+
+    def _compare(self, what: str, got: Any, reference: str, expected: Any) -> None:
+        where = f"node {self.node.name!r}: {what} differs from {reference}"
+        if jax.tree_util.tree_structure(got) != jax.tree_util.tree_structure(expected):
+            trees = [jax.tree_util.tree_structure(t) for t in (got, expected)]
+            raise UsageError(f"{where}: {trees[0]} instead of {trees[1]}")
+        flat, _ = jax.tree_util.tree_flatten_with_path(expected)
+        for (path, old), new in zip(flat, jax.tree_util.tree_leaves(got), strict=True):
+            if np.shape(old) != new.shape or jnp.result_type(old) != new.dtype:
+                raise UsageError(
+                    f"{where}: {jax.tree_util.keystr(path) or 'the value'} is {new.dtype}{list(new.shape)} "
+                    f"instead of {jnp.result_type(old)}{list(np.shape(old))}",
+                    hint="keep shapes and dtypes fixed, e.g. jnp.float32(0.0) in init, x.astype(...) in step",
+                )
+
+
+def overwritten(ts: Any, begin: int, now: int, node: str) -> int:
+    """Return the start that a step set itself [ticks], or -1 if it left its start alone (rule 4).
+
+    Compared in float32, as that is how the step got its start.
+
+    Args:
+        ts: What the step left in ``ts`` [s]; None if it left it alone.
+        begin: Its start [ticks].
+        now: The time after the step [ticks].
+        node: The node's name.
+
+    Raises:
+        Sim2RealError: Unless ``begin <= ts < now``.
+    """
+    if ts is None:
+        return -1
+    ts_s, begin_s, now_s = float(ts), begin / 1e6, now / 1e6
+    if np.float32(ts_s) == np.float32(begin_s):
+        return -1
+    if not np.float32(begin_s) < np.float32(ts_s) <= np.float32(now_s):
+        raise Sim2RealError(
+            f"node {node!r}: its step moved ts to {ts_s} s, outside of [{begin_s}, {now_s}) s, from its start to now",
+            hint="set ts to a time of this step, from the node's now()",
+        )
+    return min(max(to_ticks(ts_s), begin), now - 1)
+
+
+def _changed(given: StepState, new: StepState) -> dict[str, Any]:
+    """Return the fields that a step replaced: what it leaves alone need not leave the compiled program."""
+    return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(given, f)}
+
+
+def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Any]) -> StepState:
+    """Return the step state with trainable delays applied to the inputs that have ``ages``."""
+    if not ages:
+        return step_state
+    inputs = dict(step_state.inputs)
+    for name, age in ages.items():
+        wide = inputs[name]
+        dist = wide.delay_dist
+        if isinstance(dist, TrainableDist):
+            bare = InputState(wide.seq, wide.ts_sent, wide.ts_recv, wide.data)
+            served = dist.apply(bare, age, node.inputs[name].window, 1.0 / node.rate)
+            inputs[name] = served.replace(delay_dist=dist)  # pyright: ignore[reportAttributeAccessIssue]
+    return step_state.replace(inputs=inputs)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,212 @@
+"""A graph on the wall clock: one thread a node, the timing rules with measured times."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import NoReturn
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.episode import Recorder
+from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.runtime.channel import Channel
+from sim2real.runtime.clock import MonotonicClock, realtime
+from sim2real.runtime.data import NodeData, snapshot
+from sim2real.runtime.failure import GraphTimeout
+from sim2real.runtime.handover import Handover, Reply
+from sim2real.runtime.nodethread import NodeThread, Shared
+from sim2real.runtime.statistics import NodeStatistics
+from sim2real.runtime.stepper import Stepper
+
+_LEAD_S = 0.005
+_LAST_RESORT_S = 1.0
+
+
+class WallClockRun:
+    """One episode on the wall clock.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name.
+        steppers: Prepared steppers by name.
+        data: The nodes' data by name.
+        graph_state: Where the episode starts.
+        recorder: Takes records, or None.
+        own: Whether the supervisor makes its steps itself.
+        spin_s: How long threads poll before a step instead of sleeping [s].
+        timeout_s: How long the supervisor waits for its caller [s].
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        supervisor: str,
+        steppers: Mapping[str, Stepper],
+        data: dict[str, NodeData],
+        graph_state: GraphState,
+        recorder: Recorder | None,
+        own: bool,
+        spin_s: float,
+        timeout_s: float,
+    ) -> None:
+        self._nodes, self._supervisor, self._data = nodes, supervisor, data
+        self._graph_state, self._recorder, self._gym = graph_state, recorder, not own
+        self._clock = MonotonicClock()
+        self._handover = Handover(own)
+        self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
+        self._channels = {(n, c.name): Channel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
+        self._threads: dict[str, NodeThread] = {}
+        for name, node in nodes.items():
+            inputs = {i: self._channels[name, i] for i in node.inputs}
+            outputs = [self._channels[c.input_node.name, c.name] for c in node.outputs if c.input_node.name in nodes]
+            handover = self._handover if name == supervisor else None
+            self._threads[name] = NodeThread(steppers[name], data[name], inputs, outputs, self._shared, handover)
+        self._process = ExitStack()
+        self._stop_lock = threading.Lock()
+        self._stopped = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the graph has stopped, or is about to."""
+        return self._shared.stopping.is_set()
+
+    @property
+    def alive(self) -> list[str]:
+        """Nodes whose threads have not ended."""
+        return [n for n, t in self._threads.items() if t.is_alive()]
+
+    def begin(self, timeout_s: float) -> None:
+        """Start the nodes up, each in its thread, and then the clock."""
+        self._shared.timeout_s = timeout_s
+        deadline = time.monotonic() + timeout_s
+        for thread in self._threads.values():
+            thread.start()
+        for name, thread in self._threads.items():
+            if not thread.ready.wait(max(0.0, deadline - time.monotonic())):
+                self._shared.fail(
+                    GraphTimeout(
+                        f"node {name!r} has not finished its startup after {timeout_s:g} s",
+                        hint="see what it waits for, or start with a longer timeout_s",
+                    )
+                )
+        self.check()
+        with self._stop_lock:
+            if self._stopped:
+                raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
+            self._process.enter_context(realtime())
+        self._clock.begin(_LEAD_S)
+        for node in self._nodes.values():
+            node.set_clock(self._clock.now_s, self._clock.origin_ns)
+        if self._recorder is not None:
+            ahead_ns = self._clock.origin_ns - time.monotonic_ns()
+            self._recorder.start(time.time_ns() + ahead_ns, self._clock.origin_ns)
+        self._shared.go.set()
+
+    def check(self) -> None:
+        """Stop and raise the failure, if there was one that nobody has heard of."""
+        if self._shared.failure is not None:
+            self.stop(self._shared.timeout_s)
+
+    def observe(self, timeout_s: float) -> StepState:
+        """Wait for the supervisor's next step."""
+        if self._handover.own:
+            raise UsageError(
+                f"the supervisor {self._supervisor!r} makes its own steps",
+                hint="call reset() instead of start() to make them yourself",
+            )
+        step_state = self._handover.observe(timeout_s)
+        self.check()
+        if step_state is None:
+            self._missing(f"no step of the supervisor {self._supervisor!r} within {timeout_s:g} s")
+        return step_state
+
+    def reply(self, reply: Reply) -> int:
+        """Give the step on offer back to the supervisor; return how many steps are finished once it is."""
+        return self._handover.reply(reply)
+
+    def settle(self, finished: int, timeout_s: float) -> None:
+        """Wait until the supervisor has finished that many steps."""
+        done = self._handover.settle(finished, timeout_s)
+        self.check()
+        if not done:
+            self._missing(f"the supervisor {self._supervisor!r} has not finished its step after {timeout_s:g} s")
+
+    def run_for(self, duration_s: float) -> None:
+        """Let the graph run, the supervisor making its own steps; return early when it is stopped."""
+        self._handover.set_own(True)
+        self._shared.stopping.wait(duration_s)
+        self.check()
+        if self._gym:
+            self._handover.set_own(False)
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Wait for the graph's end; return whether it came."""
+        ended = self._shared.stopping.wait(timeout_s)
+        self.check()
+        return ended
+
+    def stop(self, timeout_s: float) -> None:
+        """Stop all nodes and make them safe; raise the first failure that nobody has heard of."""
+        deadline = time.monotonic() + timeout_s
+        self._shared.stop(timeout_s)
+        if threading.current_thread() in self._threads.values():
+            return  # a node that stops its own graph; whoever else calls stop() waits for it
+        with self._stop_lock:
+            if not self._stopped:
+                self._stopped = True
+                self._end(deadline, timeout_s)
+            failure = self._shared.deliver()
+        if failure is not None:
+            raise failure
+
+    def snapshot(self) -> GraphState:
+        """Return the graph's state as of each node's last finished step."""
+        return snapshot(self._graph_state, self._data, self._supervisor)
+
+    def statistics(self) -> dict[str, NodeStatistics]:
+        """Return how well each node kept its times."""
+        return {name: thread.log.summary() for name, thread in self._threads.items()}
+
+    def _wake(self) -> None:
+        """Wake everybody who waits for something that will not come."""
+        self._handover.close()
+        for channel in self._channels.values():
+            channel.stop()
+
+    def _end(self, deadline: float, timeout_s: float) -> None:
+        for thread in self._threads.values():
+            if thread.ident is not None:
+                thread.join(max(0.0, deadline - time.monotonic()))
+        self._process.close()
+        for name, thread in self._threads.items():
+            if thread.is_alive():
+                thread.make_safe_from_outside(_LAST_RESORT_S)
+                self._shared.fail(
+                    GraphTimeout(
+                        f"node {name!r} is still in its {thread.during} {timeout_s:g} s after the stop; "
+                        "its stop() was called from outside",
+                        hint="give what it waits for a timeout of its own",
+                    )
+                )
+        for node in self._nodes.values():
+            node.set_clock(None)
+        self._record_leftovers()
+
+    def _record_leftovers(self) -> None:
+        if self._recorder is None:
+            return
+        try:
+            for (name, _), channel in self._channels.items():
+                if not self._threads[name].is_alive():
+                    for record in channel.leftover():
+                        self._recorder.message(record)
+        except Exception as error:  # the nodes' own failure, if there is one, must still reach the caller
+            self._shared.fail(Sim2RealError(f"the recorder failed at the end: {type(error).__name__}: {error}"))
+
+    def _missing(self, what: str) -> NoReturn:
+        if self.ended:
+            raise Sim2RealError("the graph was stopped while a step was awaited", hint="call reset() to start it again")
+        raise GraphTimeout(what, hint="is one of its blocking inputs silent?")

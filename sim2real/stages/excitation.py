@@ -1,0 +1,56 @@
+"""Command signals that make a robot show its dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.stages.config import RecordConfig
+
+
+def excitation(config: RecordConfig, rate_hz: float) -> np.ndarray:
+    """Return the command of every step, shape ``(N,)`` [the command's unit].
+
+    ``multisine`` holds twelve lines of random phase between ``low_hz`` and ``high_hz``; ``chirp`` sweeps from one to
+    the other and back every 10 s; ``steps`` holds random levels for random times of half a period of these frequencies.
+    All start from zero within half a second and stay within the amplitude.
+
+    Raises:
+        UsageError: When the highest frequency is above half the rate of steps.
+    """
+    if config.high_hz > rate_hz / 2:
+        raise UsageError(
+            f"high_hz = {config.high_hz} Hz is above half the command rate of {rate_hz:g} Hz",
+            hint=f"choose at most {rate_hz / 2:g} Hz",
+        )
+    rng = np.random.default_rng(config.seed)
+    t = np.arange(round(config.duration_s * rate_hz)) / rate_hz
+    make = {"multisine": _multisine, "chirp": _chirp, "steps": _steps}[config.excitation]
+    signal = make(t, config.low_hz, config.high_hz, rng)
+    return config.amplitude * np.clip(signal, -1.0, 1.0) * np.minimum(1.0, t / 0.5)
+
+
+def _multisine(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    lines_hz = np.geomspace(low_hz, high_hz, 12)
+    phases = rng.uniform(0, 2 * np.pi, lines_hz.size)
+    signal = np.sin(2 * np.pi * np.outer(t, lines_hz) + phases).sum(axis=1)
+    # Scaled to three deviations: the rare peaks beyond are cut, and the rest has twice the power of an uncut one.
+    return signal / (3 * signal.std() / np.sqrt(2))
+
+
+def _chirp(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    sweep = 1.0 - np.abs((t / 10.0) % 2.0 - 1.0)  # 0 to 1 and back in 20 s
+    frequency_hz = low_hz * (high_hz / low_hz) ** sweep
+    step_s = t[1] - t[0]
+    return np.sin(2 * np.pi * np.cumsum(frequency_hz) * step_s + rng.uniform(0, 2 * np.pi))
+
+
+def _steps(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:
+    signal = np.empty_like(t)
+    step_s, begin = t[1] - t[0], 0
+    while begin < t.size:
+        hold_s = 0.5 / np.exp(rng.uniform(np.log(low_hz), np.log(high_hz)))
+        end = begin + max(1, round(hold_s / step_s))
+        signal[begin:end] = rng.uniform(-1.0, 1.0)
+        begin = end
+    return signal

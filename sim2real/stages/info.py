@@ -1,0 +1,99 @@
+"""What ``sim2real info`` tells: about the installation, a pipeline, a log or a run."""
+
+from __future__ import annotations
+
+import json
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+from sim2real.stages.console import pairs, shown, table
+from sim2real.stages.flags import flag_names
+from sim2real.stages.manifest import plain, versions
+from sim2real.stages.pipeline import available, load_pipeline
+from sim2real.stages.runs import STAGES, attempts, run_folders
+
+
+def installation() -> str:
+    """Return versions and the pipelines found."""
+    rows = []
+    for name, source in sorted(available().items()):
+        origin = shown(source) if isinstance(source, Path) else f"entry point {source.value}"
+        try:
+            summary = load_pipeline(name).summary
+        except Exception as error:  # one broken pipeline must not hide the others
+            summary = f"cannot be imported: {type(error).__name__}: {error}"
+        rows.append([name, summary, origin])
+    return f"{pairs(versions())}\n\n{table(rows, ['pipeline', 'summary', 'from'])}"
+
+
+def pipeline(name: str, root: Path) -> str:
+    """Return a pipeline's defaults and how many runs it has."""
+    found = load_pipeline(name)
+    head = {
+        "pipeline": found.name,
+        "summary": found.summary,
+        "runs": f"{len(run_folders(root, name))} in {shown(root)}",
+    }
+    blocks = [pairs(head)]
+    for stage in STAGES:
+        config = getattr(found, stage)
+        rows = [[flag, _value(config, flag)] for flag in flag_names(config)]
+        blocks.append(table(rows, [stage, "default"]))
+    return "\n\n".join(blocks)
+
+
+def run(run_dir: Path) -> str:
+    """Return the stages of a run, their inputs and outputs."""
+    rows, files = [], []
+    for stage in STAGES:
+        for attempt in attempts(run_dir, stage):
+            manifest = attempt.manifest
+            started, sha = manifest["started"][:19], (manifest.get("git") or {}).get("sha") or "-"
+            duration = manifest.get("duration_s")
+            rows.append([attempt.folder.name, manifest["status"], manifest["exit_code"], started, duration, sha[:10]])
+            for kind in ("inputs", "outputs"):
+                entries = manifest[kind].items()
+                files += [[attempt.folder.name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]
+    return "\n\n".join(
+        [
+            f"run  {shown(run_dir)}",
+            table(rows, ["stage", "status", "exit", "started (UTC)", "duration [s]", "git"]),
+            table(files, ["stage", "", "name", "path", "sha256"]),
+        ]
+    )
+
+
+def log(path: Path) -> str:
+    """Return what a log says about itself, and its topics; a log that was cut is read up to the cut.
+
+    Raises:
+        Sim2RealError: When the file is no log, or cut within its first record.
+    """
+    from sim2real.log import summary  # imports JAX, which the rest of `info` does without
+
+    facts = summary(path)
+    head = {
+        "log": shown(path),
+        "size": f"{facts['bytes'] / 1e6:.3f} MB in {facts['chunks']} chunks",
+        "duration": f"{facts['duration_s']:.3f} s",
+        "complete": facts["complete"],
+        "unreadable": facts["skipped"],
+        "attachments": {name: f"{size} B" for name, size in facts["attachments"].items()},
+    }
+    blocks = [pairs(head), table(sorted(facts["topics"].items()), ["topic", "messages"])]
+    for title in ("session", "session_end"):
+        values = {name: _one_line(value) for name, value in (facts[title] or {}).items()}
+        blocks.append(f"{title}\n{pairs(values) or '-'}")
+    return "\n\n".join(blocks)
+
+
+def _one_line(value: Any) -> str:
+    """Return a metadata value on one line, cut after 160 characters."""
+    text = " ".join(value.split()) if isinstance(value, str) else json.dumps(plain(value))
+    return text if len(text) <= 160 else f"{text[:157]}..."
+
+
+def _value(config: Any, flag: str) -> Any:
+    """Return the value of a flag like ``--gate.limit``."""
+    return reduce(getattr, flag.removeprefix("--").replace("-", "_").split("."), config)

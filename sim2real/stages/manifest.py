@@ -1,0 +1,130 @@
+"""A stage's ``manifest.json``: what it ran on, with what, and what came out; plain JSON, replaced atomically."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from enum import Enum
+from importlib import metadata
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+from sim2real.errors import Sim2RealError
+
+MANIFEST = "manifest.json"
+PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return a stage folder's manifest, or None if there is none or it is not readable as one."""
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return manifest if isinstance(manifest, dict) else None
+
+
+def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Write a stage folder's manifest; a reader sees the old one or the new one, never a part.
+
+    Raises:
+        TypeError: When a value has no plain JSON form.
+    """
+    text = json.dumps(plain(manifest), indent=2, allow_nan=False)
+    draft = folder / f".{MANIFEST}.tmp"
+    with draft.open("w", encoding="utf-8") as file:
+        file.write(text + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(draft, folder / MANIFEST)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as dicts, lists, strings, numbers, booleans and None.
+
+    Dataclasses become dicts, arrays nested lists, enums their names, paths strings; numbers that JSON lacks become the
+    strings 'inf', '-inf' and 'nan'.
+
+    Raises:
+        TypeError: When the value, or one inside it, is none of these.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Integral):
+        return int(value)
+    if isinstance(value, Real):
+        number = float(value)
+        return number if math.isfinite(number) else str(number)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        return {str(name): plain(v) for name, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    import numpy as np  # only for arrays: `sim2real info` does without
+
+    array = np.asarray(value)
+    if array.dtype == object:
+        raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")
+    return plain(array.tolist())
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, or of a folder: of its files' relative names and hashes in order of name.
+
+    Raises:
+        Sim2RealError: When there is no such file or folder.
+    """
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+            digest.update(f"{file.relative_to(path).as_posix()}\0{sha256(file)}\n".encode())
+        return digest.hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise Sim2RealError(f"cannot read {path}: {error.strerror}") from error
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions that a result may depend on; None for a package that is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def git_state(folder: Path | None = None) -> dict[str, Any] | None:
+    """Return the commit of the repository that holds a folder (default: the working directory) and if it is dirty.
+
+    Files that git does not track do not make it dirty: run folders usually lie beside the code. None outside of a
+    repository, or without git.
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", *arguments]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True)
+        return done.stdout.strip()
+
+    try:
+        return {
+            "sha": git("rev-parse", "--verify", "HEAD"),
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no")),
+        }
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,52 @@
+"""Record the robot under an excitation."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import cast
+
+from sim2real.stages.config import RecordConfig
+from sim2real.stages.console import note, table
+from sim2real.stages.excitation import excitation
+from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.robot import Robot
+from sim2real.stages.runs import StageFolder, open_stage
+from sim2real.stages.session import run_episode, timing_rows
+
+LOG = "session.mcap"
+TRUTH = "truth.bin"
+
+
+def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
+    """Play the excitation on the robot and write the log.
+
+    Args:
+        pipeline: The robot.
+        config: The stage's configuration.
+        root: Folder of all runs.
+        run_dir: Run folder to add to; None makes a new one.
+    """
+    robot = cast(Robot, pipeline.load())
+    signal = excitation(config, robot.RATE_HZ)
+    with open_stage(root, pipeline.name, "record", config, run_dir=run_dir) as stage:
+        log = stage.output("log", LOG)
+        note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
+        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session:
+            nodes = robot.recording_nodes(session, signal)
+            summary = run_episode(
+                pipeline, robot, session, nodes, {}, log, config.duration_s, config, config.strict_timing, "record"
+            )
+            if session.embedded is not None:
+                stage.output("truth", TRUTH)
+        stage.output("timing", "timing.json").write_text(json.dumps(summary, indent=1))
+        print(table(*timing_rows(summary)))
+        stage.summary(
+            {
+                "seconds": config.duration_s,
+                "lost replies": summary["lost_replies"],
+                "transactions": summary["transactions"],
+                "commands clamped": summary["gate"]["clamped"],
+            }
+        )
+    return stage.result

@@ -1,0 +1,79 @@
+"""What the stages need of a robot: the protocol that ``pipelines/NAME/robot.py`` fulfils with its functions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from sim2real.graph.delays import DelayDistribution
+from sim2real.graph.node import BaseNode
+from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.rig import ServoRig
+from sim2real.identify.problem import IdentifiableModel
+from sim2real.stages.config import GateLimits
+from sim2real.train.env import Task
+
+
+class Session(AbstractContextManager["Session"], Protocol):
+    """An open robot; leaving it takes the torque off."""
+
+    rig: ServoRig
+    embedded: EmbeddedRobot | None
+
+
+class Robot(Protocol):
+    """A robot's parts.
+
+    Attributes:
+        RATE_HZ: Rate of the supervisor [Hz].
+        SUPERVISOR: Name of the node that the policy acts for.
+        COMMAND: Node and field of the command that reaches the motors.
+        JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
+        OBSERVATION: Names of the policy's observation entries, with units, in order.
+        ACTION: Names of the actions, with units, in order.
+    """
+
+    RATE_HZ: float
+    SUPERVISOR: str
+    COMMAND: tuple[str, str]
+    JOINTS: Mapping[str, Any]
+    OBSERVATION: list[tuple[str, str]]
+    ACTION: list[tuple[str, str]]
+
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
+        """Open the robot, with torque off."""
+        ...
+
+    def recording_nodes(self, session: Session, signal: np.ndarray) -> dict[str, BaseNode]:
+        """Return the graph on hardware that plays a signal, one command a step ``(N,)``."""
+        ...
+
+    def deployment_nodes(self, session: Session, policy: Any) -> tuple[dict[str, BaseNode], dict[str, Any]]:
+        """Return the graph on hardware that runs a policy, and parameters of its nodes."""
+        ...
+
+    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model to identify."""
+        ...
+
+    def training(
+        self,
+        values: Mapping[str, float],
+        spread: Mapping[str, float],
+        computation: Mapping[str, DelayDistribution],
+        delays: bool,
+    ) -> tuple[dict[str, BaseNode], Task]:
+        """Return the graph in simulation and the task, for parameters that vary by ``spread`` (a share of each)."""
+        ...
+
+    def nominal(self) -> dict[str, float]:
+        """Return the data sheet's values of the parameters, without any delay."""
+        ...
+
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return how well a deployment went, ``success`` among it, from states over time ``(N,)``."""
+        ...

@@ -1,0 +1,301 @@
+"""Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a manifest.
+
+A stage that is run again in the same run folder moves the earlier attempt to ``<stage>.1``, ``<stage>.2``, ...: nothing
+recorded is ever overwritten, and a failed attempt does not hide a finished one.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.stages.manifest import git_state, plain, read_manifest, sha256, versions, write_manifest
+
+STAGES = ("record", "identify", "train", "deploy")
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """A stage's folder and what its manifest says."""
+
+    folder: Path
+    manifest: Mapping[str, Any]
+
+    @property
+    def run_dir(self) -> Path:
+        """The run folder it lies in."""
+        return self.folder.parent
+
+    @property
+    def stage(self) -> str:
+        """The stage's name."""
+        return self.manifest["stage"]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the stage came to its end."""
+        return self.manifest.get("status") == "finished"
+
+    @property
+    def outputs(self) -> dict[str, Path]:
+        """Name -> path of what the stage wrote."""
+        return {name: self.folder / entry["path"] for name, entry in self.manifest.get("outputs", {}).items()}
+
+    def output(self, name: str) -> Path:
+        """Return the path of one output.
+
+        Raises:
+            Sim2RealError: When the stage wrote none of this name, or it has been deleted.
+        """
+        paths = self.outputs
+        if name not in paths:
+            raise Sim2RealError(
+                f"{self.folder} has no output {name!r}. Available: {', '.join(sorted(paths)) or 'none'}"
+            )
+        if not paths[name].exists():
+            raise Sim2RealError(
+                f"{paths[name]} is missing, though the manifest lists it", hint=f"run the stage {self.stage!r} again"
+            )
+        return paths[name]
+
+
+@dataclass
+class OpenStage:
+    """A stage that is running: it writes into ``folder`` and says what it wrote."""
+
+    folder: Path
+    _outputs: dict[str, Path] = field(default_factory=dict)
+    _summary: dict[str, Any] = field(default_factory=dict)
+    _result: StageFolder | None = None
+
+    @property
+    def run_dir(self) -> Path:
+        """The run folder it lies in."""
+        return self.folder.parent
+
+    def output(self, name: str, path: Path | str) -> Path:
+        """Name a file or folder that the stage writes, before or after writing it; it is hashed when the stage ends.
+
+        Args:
+            name: What later stages ask for.
+            path: Inside of the stage's folder; relative paths are relative to it.
+
+        Returns:
+            The absolute path.
+        """
+        full = self.folder / path
+        if not full.resolve().is_relative_to(self.folder.resolve()):
+            raise UsageError(f"output {name!r} must lie in {self.folder}, got {path}")
+        self._outputs[name] = full
+        return full
+
+    def summary(self, values: Mapping[str, Any]) -> None:
+        """Add the numbers that belong in the table at the end and in the manifest; call it as often as needed."""
+        self._summary.update(plain(values))
+
+    @property
+    def result(self) -> StageFolder:
+        """The finished stage: what a stage function returns; available after the ``with`` block."""
+        if self._result is None:
+            raise RuntimeError("the stage is still running: ask for its result after the `with` block")
+        return self._result
+
+
+@contextmanager
+def open_stage(
+    root: Path,
+    pipeline: str,
+    stage: str,
+    config: Any,
+    inputs: Mapping[str, Path] | None = None,
+    run_dir: Path | None = None,
+) -> Iterator[OpenStage]:
+    """Run a stage in a folder of its own, with a manifest from the first moment to the last.
+
+    Args:
+        root: Folder of all runs.
+        pipeline: Name of the pipeline.
+        stage: One of ``STAGES``.
+        config: The resolved configuration, a dataclass.
+        inputs: Name -> file or folder that the stage reads; hashed before it starts.
+        run_dir: Run folder to add to; None makes a new one.
+
+    Yields:
+        The running stage. When the block ends the manifest says 'finished', 'failed' or 'interrupted' (Ctrl-C, a
+        signal), with the exit code that the command ends with.
+
+    Raises:
+        UsageError: When there is no such stage.
+        Sim2RealError: When an input, or an output after the block, does not exist.
+    """
+    if stage not in STAGES:
+        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
+    hashed = {n: {"path": str(Path(p).resolve()), "sha256": sha256(Path(p))} for n, p in (inputs or {}).items()}
+    folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
+    running = OpenStage(folder)
+    manifest: dict[str, Any] = {
+        "format": 1,
+        "pipeline": pipeline,
+        "stage": stage,
+        "status": "running",
+        "exit_code": None,
+        "started": datetime.now(UTC).isoformat(timespec="microseconds"),
+        "duration_s": None,
+        "command": sys.argv,
+        "config": config,
+        "inputs": hashed,
+        "outputs": {},
+        "summary": {},
+        "versions": versions(),
+        "git": git_state(),
+    }
+    write_manifest(folder, manifest)
+    start = time.monotonic()
+    try:
+        yield running
+        _close(running, manifest, start, "finished", OK)
+    except BaseException as error:
+        status, code = _failure(error)
+        _close(running, manifest, start, status, code, error)
+        raise
+
+
+def new_run(root: Path, pipeline: str) -> Path:
+    """Make a run folder named by the time (UTC, to the millisecond): the names are unique and sort by age."""
+    while True:
+        now = datetime.now(UTC)
+        folder = Path(root) / pipeline / f"{now:%Y%m%d-%H%M%S}-{now.microsecond // 1000:03d}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            time.sleep(0.001)  # two runs started in the same millisecond
+        else:
+            return folder
+
+
+def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
+    """Return all attempts at a stage in a run folder, the latest first."""
+
+    def age(folder: Path) -> int:
+        # `train` is the current attempt; of the earlier ones the highest number is the latest.
+        return -int(folder.suffix[1:]) if folder.suffix else -sys.maxsize
+
+    folders = [run_dir / stage, *(f for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdigit())]
+    found = [(folder, read_manifest(folder)) for folder in sorted(folders, key=age)]
+    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
+
+
+def finished(run_dir: Path, stage: str) -> StageFolder | None:
+    """Return the latest finished attempt at a stage in a run folder, or None."""
+    return next((attempt for attempt in attempts(run_dir, stage) if attempt.finished), None)
+
+
+def run_folders(root: Path, pipeline: str) -> list[Path]:
+    """Return a pipeline's run folders, the oldest first."""
+    return sorted(f for f in (Path(root) / pipeline).glob("*") if any(attempts(f, stage) for stage in STAGES))
+
+
+def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -> StageFolder:
+    """Return the newest finished artifact of a stage.
+
+    Args:
+        root: Folder of all runs.
+        pipeline: Name of the pipeline.
+        stage: The stage whose artifact is wanted.
+        run_dir: Run folder that is asked first; without the artifact there, the newest of all runs is taken.
+
+    Raises:
+        Sim2RealError: When there is none; the message says what was looked for and the hint which command makes it.
+    """
+    own = finished(run_dir, stage) if run_dir else None
+    if own is not None:
+        return own
+    candidates = [done for folder in run_folders(root, pipeline) if (done := finished(folder, stage)) is not None]
+    if not candidates:
+        unfinished = sum(len(attempts(folder, stage)) for folder in run_folders(root, pipeline))
+        also = f" ({unfinished} unfinished)" if unfinished else ""
+        raise Sim2RealError(
+            f"no finished {stage!r} of pipeline {pipeline!r} in {root}{also}",
+            hint=f"make one with `sim2real {stage} {pipeline}`, or name another folder with --runs DIR",
+        )
+    return max(candidates, key=lambda c: c.manifest["started"])
+
+
+def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
+    """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
+
+    Args:
+        root: Folder of all runs.
+        target: What the user typed.
+        pipeline: The pipeline that the run has to belong to; None allows any.
+
+    Raises:
+        UsageError: When there is no such run, or it belongs to another pipeline.
+    """
+    path = Path(target)
+    options = [path, path.parent, *([Path(root) / pipeline / path] if pipeline else Path(root).glob(f"*/{path.name}"))]
+    for folder in options:
+        owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
+        if owners and pipeline and pipeline not in owners:
+            raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
+        if owners:
+            return folder
+    if pipeline is None and (known := run_folders(root, str(target))):
+        return known[-1]
+    names = [f"{f.parent.name}/{f.name}" for p in Path(root).glob("*") for f in run_folders(root, p.name)]
+    raise UsageError(
+        f"no run folder or pipeline with runs: {str(target)!r}. Runs in {root}: {', '.join(names[-5:]) or 'none'}",
+        hint="make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR",
+    )
+
+
+def _stage_folder(run_dir: Path, stage: str) -> Path:
+    """Make a stage's folder; an earlier attempt is moved aside, under the next free number."""
+    folder = run_dir / stage
+    if folder.exists():
+        number = 1
+        while (run_dir / f"{stage}.{number}").exists():
+            number += 1
+        folder.rename(run_dir / f"{stage}.{number}")
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _failure(error: BaseException) -> tuple[str, int]:
+    """Return the status and the exit code that an exception ends a stage with."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", INTERRUPTED
+    if isinstance(error, SystemExit | GeneratorExit):
+        code = error.code if isinstance(error, SystemExit) else None
+        return "interrupted", code if isinstance(code, int) else ERROR
+    return "failed", error.exit_code if isinstance(error, Sim2RealError) else ERROR
+
+
+def _close(
+    stage: OpenStage,
+    manifest: dict[str, Any],
+    start: float,
+    status: str,
+    code: int,
+    error: BaseException | None = None,
+) -> None:
+    """Write the last manifest; a stage that failed lists only the outputs that exist."""
+    paths = stage._outputs if error is None else {n: p for n, p in stage._outputs.items() if p.exists()}
+    manifest["outputs"] = {
+        name: {"path": path.relative_to(stage.folder).as_posix(), "sha256": sha256(path)}
+        for name, path in paths.items()
+    }
+    manifest |= {"status": status, "exit_code": code, "summary": stage._summary}
+    manifest["duration_s"] = round(time.monotonic() - start, 3)
+    if error is not None:
+        manifest["error"] = f"{type(error).__name__}: {error}"
+    write_manifest(stage.folder, manifest)
+    stage._result = StageFolder(stage.folder, read_manifest(stage.folder) or manifest)

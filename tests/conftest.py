@@ -1,0 +1,17 @@
+"""One JAX configuration for all tests; set in the environment, before anything imports JAX."""
+
+import os
+from pathlib import Path
+
+from hypothesis import settings
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Programs compiled by an earlier run are read from disk, those of subprocesses too.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
+# A machine with two busy cores misses hypothesis's deadlines without anything being wrong.
+settings.register_profile("sim2real", deadline=None)
+settings.load_profile("sim2real")

@@ -1,0 +1,302 @@
+"""The bus against the emulator's process."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.truth import Kind
+from sim2real.hardware.wire import EmulatorConfig
+
+PWM = OperatingMode.PWM
+
+
+def effects_of(robot):
+    """The goals that reached the motor, once the robot has stopped."""
+    robot.stop()
+    return robot.truth().of(Kind.EFFECT)
+
+
+def test_handshake_checks_ids_and_models(start_robot):
+    robot = start_robot(ids=[1, 3])
+    with ServoBus(BusConfig(robot.port)) as bus:
+        assert bus.handshake({1: 1060, 3: None}) == {1: 1060, 3: 1060}
+        assert bus.ids == (1, 3)
+        with pytest.raises(HardwareLost, match=r"model 1060 \(XL430-W250\), expected 1200 \(XL330-M288\)"):
+            bus.handshake({1: 1200})
+        with pytest.raises(HardwareLost, match=r"servo 2 does not answer .* Available: \[1, 3\]"):
+            bus.handshake({2: None})
+
+
+def test_setup_prepares_the_servo_and_torque_arms_the_watchdog(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=PWM, watchdog_s=0.1)
+    values = {r.name: bus.read(1, r) for r in (reg.OPERATING_MODE, reg.RETURN_DELAY_TIME, reg.TORQUE_ENABLE)}
+    assert values == {"operating_mode": 16, "return_delay_time": 0, "torque_enable": 1}
+    assert bus.read(1, reg.BUS_WATCHDOG) == 5
+    bus.torque(False)
+    assert bus.read(1, reg.BUS_WATCHDOG) == 0
+
+
+@pytest.mark.parametrize("ids", [(1,), (1, 2, 3)])
+def test_pwm_turns_and_state_tells(start_robot, open_bus, ids):
+    bus = open_bus(start_robot(ids=list(ids)), ids, PWM)
+    goals = {servo_id: 0.2 * servo_id for servo_id in ids}
+    for _ in range(15):
+        bus.write_goal_pwm(goals)
+        before_ns = time.monotonic_ns()
+        state = bus.read_state()
+        time.sleep(0.02)
+    assert state.velocity_rad_s == pytest.approx([1.2 * i for i in ids], abs=0.08)
+    assert state.load == pytest.approx([0.2 * i for i in ids], abs=0.002)
+    assert np.all(state.position_rad > 0.1)
+    transaction = state.transaction
+    assert before_ns <= transaction.t_sent_ns <= before_ns + transaction.lock_wait_ns + transaction.transfer_ns
+    assert 250_000 < transaction.transfer_ns < 50_000_000
+    assert transaction.retries == 0
+
+
+def test_velocity_and_position_goals(start_robot, open_bus):
+    robot = start_robot(ids=[1, 2])
+    bus = open_bus(robot, (1, 2), OperatingMode.EXTENDED_POSITION, watchdog_s=0.0)
+    bus.write_goal_position({1: 0.5, 2: -0.5})
+    time.sleep(0.8)
+    assert bus.read_state().position_rad == pytest.approx([0.5, -0.5], abs=0.01)
+    bus.setup(OperatingMode.VELOCITY)
+    bus.torque(True)
+    bus.write_goal_velocity({1: 1.0})
+    time.sleep(0.3)
+    assert bus.read_state([1]).velocity_rad_s == pytest.approx([1.0], abs=0.05)
+
+
+@pytest.mark.parametrize("goal", [1.01, -2.0, float("nan"), float("inf")])
+def test_goals_out_of_range_are_refused(start_robot, open_bus, goal):
+    bus = open_bus(start_robot())
+    with pytest.raises(SafetyStop, match=r"goal_pwm of servo 1: .* is outside \[-1, 1\]"):
+        bus.write_goal_pwm({1: goal})
+
+
+def test_refusals_of_the_servo_are_explained(start_robot, open_bus):
+    bus = open_bus(start_robot(), mode=PWM)
+    with pytest.raises(Sim2RealError, match="servo 1 refused write of 3 to operating_mode: the register cannot"):
+        bus.write(1, reg.OPERATING_MODE, 3)
+
+
+def test_lost_replies_are_counted_and_asked_for_again(start_robot, open_bus):
+    robot = start_robot(config=EmulatorConfig(reply_loss=0.2, seed=4))
+    bus = open_bus(robot)
+    worst_ns = 0
+    for _ in range(60):
+        transaction = bus.read_state().transaction
+        if transaction.retries == 1:
+            worst_ns = max(worst_ns, transaction.transfer_ns)
+    robot.stop()
+    assert bus.lost_replies == bus.retries >= 4
+    assert robot.truth().of(Kind.LOSS).size >= 4
+    # One loss costs the timeout of 8 ms and the time to ask again.
+    assert 8e6 < worst_ns < 30e6
+
+
+def test_corrupt_replies_are_asked_for_again(start_robot, open_bus):
+    robot = start_robot("Ramp", config=EmulatorConfig(corrupt=0.2, seed=4))
+    bus = open_bus(robot)
+    positions_rad = [bus.read_state().position_rad[0] for _ in range(60)]
+    assert bus.lost_replies >= 4
+    assert np.all(np.diff(positions_rad) >= 0.0)
+    assert positions_rad[-1] < 2.0
+
+
+def test_silent_servo_is_lost_soon(start_robot, open_bus):
+    robot = start_robot(config=EmulatorConfig(silent_after_s=0.4))
+    bus = open_bus(robot, max_consecutive_losses=5, max_silence_s=0.1)
+    time.sleep(0.4)
+    began_s = time.monotonic()
+    with pytest.raises(HardwareLost, match=r"no answer to read .* 5 missed in a row"):
+        bus.read_state()
+    assert time.monotonic() - began_s < 0.2
+    began_s = time.monotonic()
+    bus.close()
+    assert time.monotonic() - began_s < 0.3
+
+
+def test_unplugged_port_is_lost(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot)
+    robot.stop()
+    with pytest.raises(HardwareLost, match="read of the state"):
+        bus.read_state()
+    bus.close()
+    with pytest.raises(HardwareLost, match="closed"):
+        bus.read_state()
+
+
+def test_missing_port():
+    with pytest.raises(HardwareLost, match=r"(?s)/dev/ttyNONE cannot be opened.*hint: serial ports here:"):
+        ServoBus(BusConfig("/dev/ttyNONE"))
+
+
+def test_port_in_use(start_robot, open_bus):
+    robot = start_robot()
+    open_bus(robot)
+    code = f"from sim2real.hardware.bus import *; ServoBus(BusConfig({robot.port!r}))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "HardwareLost" in result.stderr
+    assert "cannot be opened" in result.stderr
+
+
+def test_a_plant_that_raises_is_a_lost_bus_and_leaves_its_message(start_robot, open_bus, caplog):
+    robot = start_robot("Breaks")
+    bus = open_bus(robot)
+    deadline_s = time.monotonic() + 5.0
+    while robot.running and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    with pytest.raises(HardwareLost):
+        bus.read_state()
+    robot.stop()
+    assert "the plant broke" in caplog.text
+
+
+def test_reading_needs_servos(start_robot):
+    with ServoBus(BusConfig(start_robot().port)) as bus, pytest.raises(UsageError, match="handshake"):
+        bus.read_state()
+
+
+def test_configurations_that_make_no_sense():
+    with pytest.raises(UsageError, match="watchdog_s"):
+        BusConfig("/dev/null", watchdog_s=3.0)
+    with pytest.raises(UsageError, match=r"baud rate 1234 .* Available: \[9600"):
+        ServoBus(BusConfig("/dev/null", baud_rate=1234))
+
+
+def test_threads_share_the_bus(start_robot, open_bus):
+    bus = open_bus(start_robot(), mode=PWM)
+    waits_ns = []
+
+    def read():
+        waits_ns.extend(bus.read_state().transaction.lock_wait_ns for _ in range(40))
+
+    threads = [threading.Thread(target=read) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for i in range(40):
+        bus.write_goal_pwm({1: i / 100})
+    for thread in threads:
+        thread.join()
+    assert bus.lost_replies == 0
+    assert max(waits_ns) > 200_000
+
+
+def test_servo_watchdog_stops_the_motor_and_is_named(start_robot, open_bus):
+    robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.005))
+    bus = open_bus(robot, mode=PWM, watchdog_s=0.06)
+    sent_ns = bus.write_goal_pwm({1: 1.0}).t_sent_ns
+    time.sleep(0.2)
+    with pytest.raises(SafetyStop, match="bus watchdog of servo 1 has tripped"):
+        bus.write_goal_pwm({1: 1.0})
+    with pytest.raises(SafetyStop, match="bus watchdog"):
+        bus.check()
+    bus.torque(True)
+    bus.write_goal_pwm({1: 0.5})
+    bus.check()
+    robot.stop()
+    truth = robot.truth()
+    trip_ns = truth.of(Kind.WATCHDOG)["t_ns"][0]
+    assert 0.060 < (trip_ns - sent_ns) * 1e-9 < 0.075
+    effects = truth.of(Kind.EFFECT)
+    zero = effects[effects["t_ns"] >= trip_ns - 500_000][0]
+    assert zero["values"][1] == 0.0
+    assert abs(zero["t_ns"] - trip_ns) <= 500_000
+
+
+def test_motor_stops_within_200_ms_of_the_hosts_kill(start_robot):
+    robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.01))
+    code = f"""
+import time
+from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.registers import OperatingMode
+bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.1))
+bus.handshake({{1: None}})
+bus.setup(OperatingMode.PWM)
+bus.torque(True)
+print("ready", flush=True)
+while True:
+    bus.write_goal_pwm({{1: 0.7}})
+    time.sleep(0.02)
+"""
+    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert host.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    killed_ns = time.monotonic_ns()
+    host.kill()
+    host.wait()
+    time.sleep(0.25)
+    effects = effects_of(robot)
+    before = effects[effects["t_ns"] <= killed_ns]
+    assert before["values"][-1, 1] == pytest.approx(0.7, abs=1e-3)
+    zero = effects[-1]
+    assert zero["values"][1] == 0.0
+    assert (zero["t_ns"] - killed_ns) * 1e-9 < 0.2
+
+
+def test_overload_stops_with_its_name(start_robot, open_bus):
+    bus = open_bus(start_robot(config=EmulatorConfig(overload_after_s=0.5)), mode=PWM)
+    time.sleep(0.5)
+    with pytest.raises(SafetyStop, match="servo 1 has stopped itself: overload"):
+        bus.read_state()
+
+
+def test_close_takes_torque_off_through_lost_replies(start_robot, open_bus):
+    robot = start_robot(config=EmulatorConfig(reply_loss=0.3, seed=2))
+    bus = open_bus(robot, mode=PWM, watchdog_s=0.0)
+    bus.write_goal_pwm({1: 0.5})
+    bus.close()
+    bus.close()
+    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
+
+
+def test_make_safe_needs_no_lock(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=PWM)
+    bus.write_goal_pwm({1: 0.5})
+    with bus._link.hold():
+        bus.make_safe()
+    with pytest.raises(SafetyStop, match="made safe"):
+        bus.torque(True)
+    assert bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_with_torque_off(start_robot, number):
+    robot = start_robot()
+    code = f"""
+import signal, sys, time
+from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.registers import OperatingMode
+bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.0))
+bus.handshake({{1: None}})
+bus.setup(OperatingMode.PWM)
+bus.torque(True)
+def stop(number, frame):
+    bus.make_safe()
+    sys.exit(128 + number)
+signal.signal({int(number)}, stop)
+print("ready", flush=True)
+while True:
+    bus.write_goal_pwm({{1: 0.7}})
+"""
+    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert host.stdout.readline() == "ready\n"
+    time.sleep(0.1)
+    os.kill(host.pid, number)
+    assert host.wait(3.0) == 128 + number
+    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF

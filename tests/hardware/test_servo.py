@@ -1,0 +1,175 @@
+import math
+
+import pytest
+
+from sim2real.hardware import registers as reg
+from sim2real.hardware.protocol import StatusError
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.servo import Servo
+
+
+def write(servo, register, value):
+    return servo.write(register.address, register.encode(value))[0]
+
+
+@pytest.fixture
+def servo():
+    servo = Servo(1)
+    servo.refresh(1.0, 0.0, 0.0, 0)
+    return servo
+
+
+def in_mode(servo, mode):
+    write(servo, reg.OPERATING_MODE, mode)
+    write(servo, reg.TORQUE_ENABLE, 1)
+    return servo
+
+
+@pytest.mark.parametrize(
+    ("address", "data", "error"),
+    [
+        (reg.PRESENT_POSITION.address, bytes(4), StatusError.ACCESS),  # read only
+        (200, bytes(1), StatusError.ACCESS),  # nothing there
+        (reg.GOAL_POSITION.address + 1, bytes(2), StatusError.ACCESS),  # not the start of a register
+        (reg.GOAL_POSITION.address, bytes(2), StatusError.DATA_LENGTH),
+        (reg.GOAL_POSITION.address, b"", StatusError.DATA_LENGTH),
+        (reg.OPERATING_MODE.address, b"\x07", StatusError.DATA_RANGE),
+        (reg.OPERATING_MODE.address, b"\x00", StatusError.DATA_RANGE),
+        (reg.TORQUE_ENABLE.address, b"\x02", StatusError.DATA_RANGE),
+        (reg.BUS_WATCHDOG.address, b"\xff", StatusError.DATA_RANGE),
+        (reg.GOAL_POSITION.address, (4096).to_bytes(4, "little"), StatusError.DATA_LIMIT),
+        (reg.GOAL_VELOCITY.address, (266).to_bytes(4, "little"), StatusError.DATA_LIMIT),
+        (reg.ID.address, b"\x05", StatusError.RESULT_FAIL),
+        (reg.ID.address, b"\x01", StatusError.NONE),
+        (reg.LED.address, b"\x01", StatusError.NONE),
+    ],
+)
+def test_writes_that_are_refused(servo, address, data, error):
+    assert servo.write(address, data)[0] == error
+
+
+def test_pwm_limit(servo):
+    assert write(servo, reg.PWM_LIMIT, 400) == StatusError.NONE
+    assert write(servo, reg.GOAL_PWM, -401) == StatusError.DATA_LIMIT
+    assert write(servo, reg.GOAL_PWM, -400) == StatusError.NONE
+
+
+def test_extended_position_mode_knows_no_position_limit(servo):
+    in_mode(servo, OperatingMode.EXTENDED_POSITION)
+    assert write(servo, reg.GOAL_POSITION, -5000) == StatusError.NONE
+    assert servo.command() == (OperatingMode.POSITION, pytest.approx(-5000 * reg.RAD_PER_COUNT))
+
+
+def test_a_write_of_several_registers_is_all_or_nothing(servo):
+    led_on_torque_wrong = b"\x02\x01"
+    assert servo.write(reg.TORQUE_ENABLE.address, led_on_torque_wrong)[0] == StatusError.DATA_RANGE
+    assert servo.get(reg.LED) == 0
+    assert servo.write(reg.TORQUE_ENABLE.address, b"\x01\x01") == (StatusError.NONE, True)
+    assert servo.get(reg.LED) == 1
+
+
+def test_eeprom_is_locked_while_torque_is_on(servo):
+    in_mode(servo, OperatingMode.PWM)
+    assert write(servo, reg.OPERATING_MODE, OperatingMode.POSITION) == StatusError.ACCESS
+    assert write(servo, reg.RETURN_DELAY_TIME, 0) == StatusError.ACCESS
+    write(servo, reg.TORQUE_ENABLE, 0)
+    assert write(servo, reg.OPERATING_MODE, OperatingMode.POSITION) == StatusError.NONE
+
+
+def test_goals_move_nothing_while_torque_is_off(servo):
+    write(servo, reg.OPERATING_MODE, OperatingMode.PWM)
+    assert servo.write(reg.GOAL_PWM.address, reg.GOAL_PWM.encode(500)) == (StatusError.NONE, False)
+    assert servo.command() == (OperatingMode.OFF, 0.0)
+    write(servo, reg.TORQUE_ENABLE, 1)
+    assert servo.command() == (OperatingMode.PWM, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "register", "value", "goal"),
+    [
+        (OperatingMode.PWM, reg.GOAL_PWM, -885, -1.0),
+        (OperatingMode.VELOCITY, reg.GOAL_VELOCITY, 100, 100 * reg.RAD_S_PER_COUNT),
+        (OperatingMode.POSITION, reg.GOAL_POSITION, 2048, math.pi),
+    ],
+)
+def test_commands_in_the_plants_units(servo, mode, register, value, goal):
+    in_mode(servo, mode)
+    write(servo, register, value)
+    assert servo.command() == (mode, pytest.approx(goal))
+
+
+def test_torque_on_holds_the_present_position(servo):
+    in_mode(servo, OperatingMode.POSITION)
+    assert servo.command()[1] == pytest.approx(1.0, abs=reg.RAD_PER_COUNT)
+
+
+def test_homing_offset_shifts_present_and_goal_alike(servo):
+    write(servo, reg.HOMING_OFFSET, 100)
+    servo.refresh(1.0, 0.0, 0.0, 0)
+    assert servo.get(reg.PRESENT_POSITION) == reg.count_from_rad(1.0) + 100
+    in_mode(servo, OperatingMode.POSITION)
+    assert servo.command()[1] == pytest.approx(1.0, abs=reg.RAD_PER_COUNT)
+
+
+def test_present_registers():
+    servo = in_mode(Servo(1, encoder_counts=1024), OperatingMode.PWM)
+    write(servo, reg.GOAL_PWM, 442)
+    servo.refresh(-1.0, 2.0, 3.0, tick_ms=40_000)
+    assert servo.get(reg.PRESENT_POSITION) % 4 == 0
+    assert servo.get(reg.PRESENT_POSITION) * reg.RAD_PER_COUNT == pytest.approx(-1.0, abs=math.pi / 1024)
+    assert servo.get(reg.PRESENT_VELOCITY) == round(2.0 / reg.RAD_S_PER_COUNT)
+    assert servo.get(reg.PRESENT_LOAD) == 1000
+    assert servo.get(reg.PRESENT_PWM) == 442
+    assert servo.get(reg.MOVING) == 1
+    assert servo.get(reg.REALTIME_TICK) == 40_000 - 32_768
+
+
+def test_tripped_watchdog_blocks_goals_until_zero_is_written(servo):
+    in_mode(servo, OperatingMode.PWM)
+    write(servo, reg.GOAL_PWM, 300)
+    write(servo, reg.BUS_WATCHDOG, 5)
+    servo.heard_ns = 7
+    assert servo.watchdog_deadline_ns() == 100_000_007
+    servo.trip_watchdog()
+    assert servo.read(reg.BUS_WATCHDOG.address, 1) == (StatusError.NONE, b"\xff")
+    assert servo.command() == (OperatingMode.PWM, 0.0)
+    assert servo.watchdog_deadline_ns() is None
+    assert write(servo, reg.GOAL_PWM, 300) == StatusError.DATA_RANGE
+    assert write(servo, reg.BUS_WATCHDOG, 0) == StatusError.NONE
+    assert servo.command() == (OperatingMode.PWM, 0.0)
+    assert write(servo, reg.GOAL_PWM, 300) == StatusError.NONE
+
+
+def test_watchdog_watches_only_while_torque_is_on(servo):
+    write(servo, reg.BUS_WATCHDOG, 5)
+    assert servo.watchdog_deadline_ns() is None
+
+
+def test_overload_takes_torque_off_until_reboot(servo):
+    in_mode(servo, OperatingMode.PWM)
+    servo.overload()
+    assert servo.alert == 0x80
+    assert write(servo, reg.TORQUE_ENABLE, 1) == StatusError.RESULT_FAIL
+    servo.reboot()
+    assert servo.alert == 0
+    assert write(servo, reg.TORQUE_ENABLE, 1) == StatusError.NONE
+
+
+def test_reboot_keeps_eeprom_only(servo):
+    write(servo, reg.RETURN_DELAY_TIME, 0)
+    write(servo, reg.LED, 1)
+    servo.reboot()
+    assert servo.get(reg.RETURN_DELAY_TIME) == 0
+    assert servo.get(reg.LED) == 0
+
+
+def test_action_needs_a_registered_write(servo):
+    assert servo.action() == (StatusError.INSTRUCTION, False)
+    servo.register_write(reg.LED.address, b"\x01")
+    assert servo.get(reg.LED) == 0
+    assert servo.action()[0] == StatusError.NONE
+    assert servo.get(reg.LED) == 1
+
+
+def test_reading_past_the_table(servo):
+    assert servo.read(140, 100) == (StatusError.ACCESS, b"")

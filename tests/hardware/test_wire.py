@@ -1,0 +1,252 @@
+"""Timing of the emulated bus in virtual time, where every instant can be told exactly."""
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.protocol import BROADCAST_ID, Instruction, build
+from sim2real.hardware.truth import Kind
+from sim2real.hardware.wire import EmulatorConfig
+
+MS = 1_000_000
+STEP_NS = 500_000
+READ_POSITION = build(1, Instruction.READ, b"\x84\x00\x04\x00")
+
+
+def goal_pwm(value, servo_id=1):
+    return build(servo_id, Instruction.WRITE, b"\x64\x00" + value.to_bytes(2, "little", signed=True))
+
+
+def position_rad(answer):
+    return int.from_bytes(answer[9:13], "little", signed=True) * reg.RAD_PER_COUNT
+
+
+def test_read_takes_the_time_of_its_bytes_and_the_return_delay(make_bench):
+    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=100))
+    bench.send(50 * MS, READ_POSITION)
+    bench.run_until(60 * MS)
+    ((t_ns, answer),) = bench.sent
+    assert len(READ_POSITION) == 14
+    assert len(answer) == 15
+    assert t_ns == 50 * MS + (14 + 15) * 10_000 + 100_000
+
+
+def test_baud_rate_stretches_every_byte(make_bench):
+    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, baud_rate=57_600))
+    bench.send(50 * MS, READ_POSITION)
+    bench.run_until(80 * MS)
+    assert bench.sent[0][0] == pytest.approx(50 * MS + (14 + 15) * 1e10 / 57_600, abs=2)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.0001, 0.0037, 0.02])
+def test_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
+    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, sensing_latency_s=latency_s))
+    bench.send(3_000 * MS + 123_457, READ_POSITION)
+    bench.run_until(3_010 * MS)
+    complete_ns = 3_000 * MS + 123_457 + 14 * 10_000
+    (sample,) = bench.truth().of(Kind.SAMPLE)
+    assert sample["t_ns"] == complete_ns - round(latency_s * 1e9)
+    # The plant's position is a ramp: what was read tells when it was sampled.
+    expected_rad = bench.plant.SPEED_RAD_S * sample["t_ns"] * 1e-9
+    assert sample["values"][0] == pytest.approx(expected_rad, abs=1e-9)
+    assert position_rad(bench.sent[0][1]) == pytest.approx(expected_rad, abs=reg.RAD_PER_COUNT / 2 * 1.001)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.0049, 0.03])
+def test_goal_takes_effect_after_the_actuation_latency(make_bench, latency_s):
+    bench = make_bench("FirstOrder", EmulatorConfig(return_delay_us=0, actuation_latency_s=latency_s))
+    bench.start_turning(pwm=0)
+    sent_ns = [50 * MS + i * 7_123_457 for i in range(40)]
+    for i, t_ns in enumerate(sent_ns):
+        bench.send(t_ns, goal_pwm(20 * i))
+    bench.run_until(sent_ns[-1] + 60 * MS)
+    effects = bench.truth().of(Kind.EFFECT)
+    planned_ns = np.array(sent_ns) + len(goal_pwm(0)) * 10_000 + round(latency_s * 1e9)
+    assert np.array_equal(effects["t_host_ns"], sent_ns)
+    assert np.allclose(effects["values"][:, 1], 20 * np.arange(40) / 885)
+    assert np.array_equal(effects["t_ns"] - effects["late_ns"], planned_ns)
+    assert np.all(effects["t_ns"] % STEP_NS == 0)
+    assert np.all(np.abs(effects["late_ns"]) <= STEP_NS / 2)
+    assert abs(effects["late_ns"].mean()) < 0.1 * STEP_NS
+
+
+def test_true_speed_answers_from_the_effect_on(make_bench):
+    bench = make_bench(config=EmulatorConfig(return_delay_us=0, actuation_latency_s=0.0200))
+    bench.start_turning(pwm=0)
+    bench.send(100 * MS, goal_pwm(885))
+    bench.run_until(400 * MS)
+    truth = bench.truth()
+    t_ns, states = truth.states()
+    (effect,) = truth.of(Kind.EFFECT)
+    age_s = (t_ns - effect["t_ns"]) * 1e-9
+    expected = np.where(age_s > 0, 6.0 * (1.0 - np.exp(-age_s / 0.05)), 0.0)
+    assert np.abs(states["dq1"] - expected).max() < 0.02
+    assert np.diff(t_ns).tolist() == [5 * MS] * (len(t_ns) - 1)
+
+
+def test_jitter_is_uniform_and_keeps_the_order(make_bench):
+    config = EmulatorConfig(actuation_latency_s=0.01, actuation_jitter_s=0.01, sensing_latency_s=0.004, seed=3)
+    bench = make_bench(config=EmulatorConfig(**{**config.__dict__, "sensing_jitter_s": 0.002}))
+    bench.start_turning()
+    for i in range(300):
+        bench.send((50 + 4 * i) * MS, goal_pwm(i), READ_POSITION)
+    bench.run_until(1400 * MS)
+    truth = bench.truth()
+    effects = truth.of(Kind.EFFECT)
+    assert np.all(np.diff(effects["t_ns"]) >= 0)
+    assert np.allclose(effects["values"][:, 1] * 885, np.arange(300))
+    samples = truth.of(Kind.SAMPLE)
+    age_s = (samples["t_host_ns"] + 27 * 10_000 - samples["t_ns"]) * 1e-9
+    assert age_s.min() == pytest.approx(0.002, abs=1e-4)
+    assert age_s.max() == pytest.approx(0.006, abs=1e-4)
+    assert age_s.mean() == pytest.approx(0.004, abs=3e-4)
+
+
+def test_sync_read_answers_in_the_order_asked_one_after_the_other(make_bench):
+    bench = make_bench("Ramp", ids=[1, 2, 3])
+    packet = build(BROADCAST_ID, Instruction.SYNC_READ, b"\x84\x00\x04\x00" + bytes([3, 9, 1]))
+    bench.send(50 * MS, packet)
+    bench.run_until(60 * MS)
+    begin_ns = 50 * MS + len(packet) * 10_000
+    assert [answer[4] for _, answer in bench.sent] == [3, 1]
+    assert [t_ns for t_ns, _ in bench.sent] == [begin_ns + 150_000, begin_ns + 300_000]
+
+
+def test_bulk_read(make_bench):
+    bench = make_bench("Ramp", ids=[1, 2])
+    items = b"\x02\x84\x00\x04\x00" + b"\x01\x90\x00\x02\x00"
+    bench.send(50 * MS, build(BROADCAST_ID, Instruction.BULK_READ, items))
+    bench.run_until(60 * MS)
+    assert [(answer[4], len(answer)) for _, answer in bench.sent] == [(2, 15), (1, 13)]
+
+
+def test_half_duplex_wire_makes_instructions_wait(make_bench):
+    bench = make_bench("Ramp")
+    bench.send(50 * MS, READ_POSITION)
+    bench.run_until(50 * MS + 200_000)  # the answer is on the wire
+    bench.send(50 * MS + 200_000, READ_POSITION)
+    bench.run_until(60 * MS)
+    assert [t_ns for t_ns, _ in bench.sent] == [50 * MS + 290_000, 50 * MS + 580_000]
+
+
+def test_two_instructions_in_one_chunk_are_complete_one_after_the_other(make_bench):
+    bench = make_bench("Ramp")
+    bench.send(50 * MS, READ_POSITION, READ_POSITION)
+    bench.run_until(60 * MS)
+    samples = bench.truth().of(Kind.SAMPLE)
+    assert np.diff(samples["t_ns"]).tolist() == [140_000]
+
+
+def test_watchdog_trips_exactly_when_nothing_was_heard(make_bench):
+    bench = make_bench(config=EmulatorConfig(return_delay_us=0, actuation_latency_s=0.01))
+    bench.start_turning(watchdog=5)
+    for i in range(10):
+        bench.send((50 + 90 * i) * MS, goal_pwm(100 + i))
+    last_ns = (50 + 90 * 9) * MS + len(goal_pwm(0)) * 10_000
+    bench.run_until(last_ns + 300 * MS)
+    truth = bench.truth()
+    assert truth.of(Kind.WATCHDOG)["t_ns"].tolist() == [last_ns + 100 * MS]
+    final = truth.of(Kind.EFFECT)[-1]
+    assert final["values"][:2].tolist() == [16.0, 0.0]
+    assert abs(final["t_ns"] - last_ns - 100 * MS) <= STEP_NS
+    assert final["t_host_ns"] == 0
+
+
+def test_traffic_for_others_does_not_feed_the_watchdog(make_bench):
+    bench = make_bench(ids=[1, 2])
+    bench.start_turning(watchdog=5)
+    for i in range(30):
+        bench.send(50 * MS + i * 9 * MS, build(2, Instruction.PING))
+    assert [row["servo_id"] for row in bench.truth().of(Kind.WATCHDOG)] == [1]
+
+
+def test_broadcasts_feed_the_watchdog(make_bench):
+    bench = make_bench(ids=[1, 2])
+    bench.start_turning(watchdog=5)
+    for i in range(30):
+        bench.send(50 * MS + i * 9 * MS, build(BROADCAST_ID, Instruction.SYNC_WRITE, b"\x41\x00\x01\x00\x02\x01"))
+    assert bench.truth().of(Kind.WATCHDOG).size == 0
+
+
+def test_watchdog_drops_what_the_host_still_had_on_the_way(make_bench):
+    bench = make_bench(config=EmulatorConfig(actuation_latency_s=0.05))
+    bench.start_turning(watchdog=1)
+    bench.send(10 * MS, goal_pwm(885))
+    bench.run_until(200 * MS)
+    assert bench.truth().of(Kind.EFFECT)["values"][:, 1].tolist() == [0.0]
+
+
+def test_a_late_emulator_trips_no_watchdog(make_bench):
+    bench = make_bench()
+    bench.start_turning(watchdog=5)
+    bench.send(50 * MS, goal_pwm(100))
+    bench.run_until(60 * MS)
+    # The process slept for 200 ms; the bytes found then may have come at any time in between.
+    bench.now_ns = 260 * MS
+    bench.bus.feed(goal_pwm(200), bench.now_ns)
+    bench.bus.run_until(bench.now_ns)
+    bench.run_until(300 * MS)
+    assert bench.truth().of(Kind.WATCHDOG).size == 0
+
+
+def test_lost_answers_are_logged_and_instructions_still_work(make_bench):
+    bench = make_bench(config=EmulatorConfig(reply_loss=0.5, seed=1))
+    bench.start_turning()
+    for i in range(200):
+        bench.send((50 + i) * MS, goal_pwm(i))
+    bench.run_until(300 * MS)
+    truth = bench.truth()
+    assert 70 < truth.of(Kind.LOSS).size < 130
+    assert truth.of(Kind.REPLY).size + truth.of(Kind.LOSS).size == 200
+    assert truth.of(Kind.EFFECT).size == 200
+
+
+def test_silent_servos_hear_nothing(make_bench):
+    bench = make_bench(config=EmulatorConfig(silent_after_s=0.1))
+    bench.start_turning(watchdog=5)
+    bench.send(50 * MS, goal_pwm(100))
+    bench.run_until(90 * MS)
+    bench.send(110 * MS, goal_pwm(200))
+    bench.run_until(400 * MS)
+    assert len(bench.sent) == 1
+    assert bench.truth().of(Kind.WATCHDOG).size == 1
+
+
+def test_rest_of_a_packet_that_never_comes_is_forgotten(make_bench):
+    bench = make_bench("Ramp")
+    bench.send(50 * MS, READ_POSITION[:9])
+    bench.send(60 * MS, READ_POSITION)
+    bench.run_until(70 * MS)
+    assert len(bench.sent) == 1
+
+
+def test_status_return_level(make_bench):
+    bench = make_bench()
+    bench.servos[1].put(reg.STATUS_RETURN_LEVEL, 1)
+    bench.send(50 * MS, goal_pwm(1))
+    bench.send(60 * MS, READ_POSITION)
+    bench.run_until(65 * MS)
+    bench.servos[1].put(reg.STATUS_RETURN_LEVEL, 0)
+    bench.send(70 * MS, READ_POSITION)
+    bench.send(80 * MS, build(1, Instruction.PING))
+    bench.run_until(90 * MS)
+    assert [len(answer) for _, answer in bench.sent] == [15, 14]
+
+
+def test_truth_lateness_is_against_the_plan(make_bench):
+    bench = make_bench("Ramp")
+    bench.send(50 * MS, READ_POSITION)
+    bench.now_ns = 53 * MS  # the process came around late
+    bench.bus.run_until(bench.now_ns)
+    truth = bench.truth()
+    assert truth.lateness_s().tolist() == pytest.approx([0.003 - 290e-6])
+    assert truth.mean_latencies()["sensing_s"] == pytest.approx(0.003 - 140e-6)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"sensing_jitter_s": 0.001}, {"reply_loss": 1.5}, {"plant_step_s": 0.01}, {"return_delay_us": 600}]
+)
+def test_configurations_that_make_no_sense(bad):
+    with pytest.raises(UsageError, match=next(iter(bad))):
+        EmulatorConfig(**bad)

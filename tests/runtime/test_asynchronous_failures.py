@@ -1,0 +1,224 @@
+"""What goes wrong on the wall clock: exceptions, silence, every order of calls."""
+
+import contextlib
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+from asynchronous_nodes import Plain, Value, pair
+
+from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
+from sim2real.runtime.failure import GraphTimeout, NodeFailed
+
+pytestmark = pytest.mark.timeout(60)
+KEY = jax.random.key(0)
+
+
+def run(sensor, agent, seconds):
+    with AsyncGraph([sensor, agent], agent) as graph:
+        graph.start(graph.init(KEY))
+        graph.run_for(seconds)
+
+
+class Breaks(Plain):
+    error: Exception = KeyError("gone")
+
+    def step(self, step_state):
+        if step_state.seq == 5:
+            raise self.error
+        return super().step(step_state)
+
+
+def run_until_it_breaks(graph, gs, how):
+    if how == "step":
+        step_many(graph, gs)
+    else:
+        graph.start(gs)
+        time.sleep(0.3 if how in ("stop", "reset") else 0.0)
+        calls = {"run_for": (5.0,), "wait": (5.0,), "stop": (), "reset": (gs,)}
+        getattr(graph, how)(*calls[how])
+
+
+def step_many(graph, gs):
+    gs, ss = graph.reset(gs)
+    for _ in range(10_000):
+        gs, ss = graph.step(gs, ss, Value(x=0))
+
+
+@pytest.mark.parametrize("how", ["run_for", "wait", "step", "stop", "reset"])
+def test_an_exception_stops_the_graph_and_reaches_the_caller(how):
+    sensor, agent = pair(Breaks)
+    slow = Plain("slow", 1)
+    graph = AsyncGraph([sensor, agent, slow], agent)
+    gs = graph.init(KEY)
+    graph.warmup(gs)
+    with pytest.raises(NodeFailed, match=r"node 'sensor' failed in its step 5: KeyError: 'gone'") as caught:
+        run_until_it_breaks(graph, gs, how)
+    assert caught.value.node == "sensor"
+    assert isinstance(caught.value.__cause__, KeyError)
+    assert [n.calls for n in (sensor, agent, slow)] == [["startup", "stop"]] * 3
+    graph.stop()  # heard of once
+    assert not graph.running
+    graph.start(gs)
+    graph.stop()
+
+
+def test_the_projects_own_errors_keep_their_type():
+    class Limit(Breaks):
+        error = SafetyStop("too hot", hint="let it cool")
+
+    sensor, agent = pair(Limit)
+    begin = time.monotonic()
+    with pytest.raises(SafetyStop, match="too hot") as caught:
+        run(sensor, agent, 20.0)
+    assert time.monotonic() - begin < 10.0
+    assert caught.value.exit_code == 3
+    assert "node 'sensor', step 5" in caught.value.__notes__
+
+
+def test_every_node_is_stopped_although_one_stop_fails():
+    class BadStop(Plain):
+        def stop(self, timeout=None):
+            super().stop(timeout)
+            raise OSError("port")
+
+    class StopsNot(Plain):
+        def stop(self, timeout=None):
+            super().stop(timeout)
+            return False
+
+    nodes = [BadStop("a", 50), Plain("b", 50), StopsNot("c", 50)]
+    graph = AsyncGraph(nodes, nodes[0])
+    graph.start(graph.init(KEY))
+    with pytest.raises(Sim2RealError) as caught:
+        graph.stop()
+    told = str(caught.value) + "".join(caught.value.__notes__ if hasattr(caught.value, "__notes__") else [])
+    assert "OSError: port" in told
+    assert "'c' did not succeed" in told
+    assert all(n.calls == ["startup", "stop"] for n in nodes)
+
+
+def test_a_failed_startup_stops_everything():
+    class Unplugged(Plain):
+        def startup(self, graph_state, timeout=None):
+            super().startup(graph_state, timeout)
+            return False
+
+    class Slow(Plain):
+        def startup(self, graph_state, timeout=None):
+            super().startup(graph_state, timeout)
+            time.sleep(0.5)
+            return True
+
+    for cls, seconds, match in ((Unplugged, 5.0, "startup of node 'sensor'"), (Slow, 0.1, "'sensor' has not finished")):
+        sensor, agent = pair(cls)
+        graph = AsyncGraph([sensor, agent], agent)
+        with pytest.raises(Sim2RealError, match=match):
+            graph.start(graph.init(KEY), timeout_s=seconds)
+        time.sleep(0.6)
+        assert sensor.calls == agent.calls == ["startup", "stop"]
+        assert sensor.seqs == agent.seqs == []
+
+
+class Hangs(Plain):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.release = threading.Event()
+
+    def step(self, step_state):
+        self.release.wait(20)
+        return super().step(step_state)
+
+
+def test_calls_honour_their_timeouts():
+    sensor, agent = pair(Hangs, blocking=True)
+    graph = AsyncGraph([sensor, agent], agent, timeout_s=0.3)
+    gs = graph.init(KEY)
+    graph.warmup(gs)
+    begin = time.monotonic()
+    with pytest.raises(GraphTimeout, match="no step of the supervisor 'agent' within"):
+        graph.reset(gs)
+    assert graph.wait(0.1) is False
+    with pytest.raises(GraphTimeout, match="'sensor' is still in its step 0"):
+        graph.stop(timeout_s=0.2)
+    assert time.monotonic() - begin < 5.0
+    assert sensor.calls == ["startup", "stop"]
+    graph.stop()
+    with pytest.raises(Sim2RealError, match="sensor did not end"):
+        graph.start(gs)
+    sensor.release.set()
+    time.sleep(0.1)
+    graph.start(gs)
+    graph.stop()
+    assert sensor.calls == ["startup", "stop"] * 2
+
+
+def test_a_supervisor_without_a_caller_stops_the_graph():
+    sensor, agent = pair()
+    graph = AsyncGraph([sensor, agent], agent, timeout_s=0.2)
+    gs, _ = graph.reset(graph.init(KEY))
+    time.sleep(0.4)
+    assert not graph.running
+    assert sensor.calls == ["startup", "stop"]
+    with pytest.raises(GraphTimeout, match="waited"):
+        graph.step(gs, None, Value(x=0))
+
+
+@pytest.mark.parametrize("mode", ["run_for", "wait", "step"])
+def test_stop_from_another_thread_or_a_node(mode):
+    class Stops(Plain):
+        def step(self, step_state):
+            if step_state.seq == 5:
+                graph.stop()
+            return super().step(step_state)
+
+    for cls in (Plain, Stops):
+        sensor, agent = pair(cls)
+        graph = AsyncGraph([sensor, agent], agent)
+        gs = graph.init(KEY)
+        if cls is Plain:
+            threading.Timer(0.15, graph.stop).start()
+        if mode == "step":
+            with pytest.raises(Sim2RealError, match="stopped"):
+                step_many(graph, gs)
+        else:
+            graph.start(gs)
+            getattr(graph, mode)(10.0)
+        graph.stop()
+        assert sensor.calls == agent.calls == ["startup", "stop"]
+
+
+@pytest.mark.parametrize(("clock", "sequences"), [(Clock.SIMULATED, 300), (Clock.WALL_CLOCK, 60)])
+def test_any_order_of_calls(clock, sequences):
+    rng = np.random.default_rng(int(clock is Clock.SIMULATED))
+    sensor, agent = pair(rate=400.0)
+    options = {"duration_s": 0.2} if clock is Clock.SIMULATED else {}
+    graph = AsyncGraph([sensor, agent], agent, clock, timeout_s=5.0, **options)
+    gs = graph.init(KEY)
+    calls = {
+        "start": lambda: graph.start(gs),
+        "run_for": lambda: graph.run_for(0.005),
+        "run": lambda: graph.run(gs),
+        "reset": lambda: graph.reset(gs),
+        "step": lambda: graph.step(gs, None, Value(x=1)),
+        "own": lambda: graph.step(gs),
+        "stop": lambda: graph.stop(),
+        "wait": lambda: graph.wait(0.002),
+        "state": lambda: graph.graph_state,
+    }
+    made = 0
+    for _ in range(sequences):
+        for name in rng.choice(list(calls), rng.integers(1, 7)):
+            with contextlib.suppress(UsageError):  # out of place, and said so
+                calls[name]()
+                made += 1
+    graph.stop()
+    assert made > sequences
+    assert not [t for t in threading.enumerate() if t.name.startswith("sim2real:")]
+    if clock is Clock.WALL_CLOCK:
+        assert sensor.calls == ["startup", "stop"] * (len(sensor.calls) // 2)
+        assert len(sensor.calls) > 20

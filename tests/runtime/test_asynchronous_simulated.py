@@ -1,0 +1,343 @@
+"""The simulated clock: the rules as an independent simulation, determinism, trainable delays, the gym-like calls."""
+
+import math
+import time
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from asynchronous_nodes import HashInJax, HashInPython, Jitted, Plain, Value, jittery, mix, random_graph
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, Timeline, TrainableDist
+from sim2real.graph.episode import MemoryRecorder
+from sim2real.graph.schedule import draw
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
+from sim2real.runtime.init import OUTPUTS
+
+
+class Reference:
+    """The timing rules by the letter, in Python integers, one message at a time; for one episode."""
+
+    def __init__(self, nodes, timeline, outputs, states):
+        self.nodes = nodes
+        self.starts = {n: [] for n in nodes}
+        self.ends = {n: [] for n in nodes}
+        self.busy = {n: (timeline.vertices[n].end - timeline.vertices[n].start)[0].tolist() for n in nodes}
+        self.travel = {}
+        for key, edge in timeline.edges.items():
+            self.travel[key] = (edge.received - timeline.vertices[edge.sender].end)[0].tolist()
+        self.count = {n: int(timeline.vertices[n].count[0]) for n in nodes}
+        self.outputs, self.hashes, self.made = outputs, {n: [s] for n, s in states.items()}, {}
+        while any([self._advance(n) for n in nodes]):
+            pass
+        self.seq_in = {(n, i): self._consumers(node, c) for n, node in nodes.items() for i, c in node.inputs.items()}
+
+    def phase(self, node):
+        return max([0, *(self.arrival(c) for c in node.inputs.values() if not c.skip)])
+
+    def arrival(self, c):
+        return self.phase(c.output_node) + round(c.output_node.delay * 1e6) + round(c.delay * 1e6)
+
+    def slot(self, node, k):
+        return math.floor(Fraction(k * 1_000_000) / Fraction(node.rate) + Fraction(1, 2)) + self.phase(node)
+
+    def group(self, c, k):
+        """Messages that step k of a blocking input waits for."""
+        out, high = [], self.slot(c.input_node, k)
+        low = self.slot(c.input_node, k - 1) if k else None
+        for i in range(len(self.busy[c.output_node.name])):
+            s = self.slot(c.output_node, i)
+            if s > high:
+                break
+            after = low is None or (s >= low if c.skip else s > low)
+            if after and not (c.skip and s == high):
+                out.append(i)
+        return out
+
+    def received(self, c, i):
+        travel, ends = self.travel[c.input_node.name, c.name], self.ends[c.output_node.name]
+        return max(ends[j] + travel[j] for j in range(i + 1))
+
+    def _advance(self, name):
+        node, starts, ends = self.nodes[name], self.starts[name], self.ends[name]
+        k, blocked = len(starts), 0
+        if k == len(self.busy[name]):
+            return False
+        for c in node.inputs.values():
+            if c.blocking:
+                group = self.group(c, k)
+                if group and group[-1] >= len(self.ends[c.output_node.name]):
+                    return False
+                if group:
+                    blocked = max(blocked, self.received(c, group[-1]))
+        previous = ends[-1] if ends else 0
+        drift = 0
+        for j in range(k):  # what the overruns before this step added up to
+            end_before = ends[j - 1] if j else 0
+            if node.scheduling is Scheduling.FREQUENCY:
+                drift += max(0, end_before - self.slot(node, j) - drift)
+        begin = max(previous, blocked)
+        if not (node.advance and all(c.blocking for c in node.inputs.values())):
+            begin = max(begin, self.slot(node, k) + drift)
+        starts.append(begin)
+        ends.append(begin + self.busy[name][k])
+        return True
+
+    def _consumers(self, node, c):
+        sent = self.count[c.output_node.name]
+        out, head = [-1] * sent, 0
+        for k in range(self.count[node.name]):
+            group = self.group(c, k) if c.blocking else []
+            while head < sent:
+                if c.blocking:
+                    take = head in group
+                else:
+                    t, r = self.starts[node.name][k], self.received(c, head)
+                    take = r < t if c.skip else r <= t
+                    if c.jitter is Jitter.BUFFER:
+                        nominal = self.slot(c.output_node, head) - self.phase(c.output_node) + self.arrival(c)
+                        take = take and nominal <= t
+                if not take:
+                    break
+                out[head] = k
+                head += 1
+        return out
+
+    def hash(self, name, k):
+        """State after step k."""
+        hashes = self.hashes[name]
+        while len(hashes) <= k + 1:
+            step = len(hashes) - 1
+            acc = mix(hashes[-1], step)
+            for i in sorted(self.nodes[name].inputs):
+                c = self.nodes[name].inputs[i]
+                sender = c.output_node.name
+                window = [m for m, s in enumerate(self.seq_in[name, i]) if 0 <= s <= step][-c.window :]
+                for m in [-1] * (c.window - len(window)) + window:
+                    x = self.outputs[sender] if m < 0 else mix(self.hash(sender, m), 7)
+                    acc = mix(mix(acc, m), x)
+            hashes.append(acc)
+        return hashes[k + 1]
+
+
+def hash_graph(seed):
+    classes = [HashInPython, HashInJax]
+    nodes = random_graph(seed, lambda name, *a, **k: classes[int(name[1:]) % 4 == 1](name, *a, **k), jittery)
+    return {n.name: n for n in nodes}
+
+
+def record(nodes, supervisor, seed=0, **options):
+    recorder = MemoryRecorder()
+    graph = AsyncGraph(nodes, nodes[supervisor], Clock.SIMULATED, recorder=recorder, **options)
+    graph.start(graph.init(jax.random.key(seed)))
+    assert graph.wait(timeout_s=60)
+    state = graph.graph_state
+    graph.stop()
+    return recorder.episode(), state
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_matches_an_independent_simulation(seed):
+    nodes = hash_graph(seed)
+    timeline = draw(nodes, 0.9, rng=seed)
+    supervisor = list(nodes)[-1]
+    initial = AsyncGraph(nodes, nodes[supervisor], Clock.SIMULATED, timeline=timeline).init(jax.random.key(seed))
+    outputs = {n: int(o.x) for n, o in initial.aux[OUTPUTS].items()}
+    expected = Reference(nodes, timeline, outputs, {n: int(s) for n, s in initial.state.items()})
+    episode, final = record(nodes, supervisor, seed=seed, timeline=timeline)
+    for n in nodes:
+        count = expected.count[n]
+        assert len(episode.steps[n]) == count > 5
+        np.testing.assert_array_equal(episode.steps[n].start, expected.starts[n][:count])
+        np.testing.assert_array_equal(episode.steps[n].end, expected.ends[n][:count])
+        assert int(final.state[n]) == expected.hash(n, count - 1)
+        assert int(final.seq[n]) == count
+        assert [int(x) for x in episode.outputs[n]["x"]] == [mix(expected.hash(n, k), 7) for k in range(count)]
+    for key, seq_in in expected.seq_in.items():
+        np.testing.assert_array_equal(episode.messages[key].seq_in, seq_in)
+
+
+def test_start_and_drift_explain_each_other():
+    node = Jitted("a", 50, delay_dist=0.03, delay=0.0)
+    episode, _ = record({"a": node}, "a", duration_s=0.5)
+    steps = episode.steps["a"]
+    previous = np.concatenate([[0], steps.end[:-1]])
+    np.testing.assert_array_equal(steps.start, np.maximum(steps.scheduled + steps.drift, previous))
+    assert steps.drift[-1] > 100_000
+
+
+def chain(cls=Jitted, **options):
+    world, agent = cls("world", 100, delay_dist=0.002), cls("agent", 50, delay_dist=0.004)
+    agent.connect(world, window=2, delay_dist=0.001, **options)
+    world.connect(agent, skip=True)
+    return {"world": world, "agent": agent}
+
+
+def same_trees(a, b):
+    equal = jax.tree.map(lambda x, y: bool(np.array_equal(np.asarray(x), np.asarray(y))), a, b)
+    return all(jax.tree.leaves(equal))
+
+
+def test_the_same_seed_gives_the_same_episode():
+    def one(seed):
+        episode, _ = record(hash_graph(3), "n0", seed=seed, duration_s=0.5)
+        columns = {n: {f: getattr(s, f) for f in s.__dataclass_fields__} for n, s in episode.steps.items()}
+        messages = {k: {f: getattr(m, f) for f in m.__dataclass_fields__} for k, m in episode.messages.items()}
+        return columns, messages, episode.outputs
+
+    first, second, other = one(1), one(1), one(2)
+    assert same_trees(first, second)
+    assert not all(np.array_equal(first[0][n]["end"], other[0][n]["end"]) for n in first[0])
+
+
+def test_gym_calls_see_what_the_supervisor_would_have_seen():
+    own, _ = record(chain(), "agent", duration_s=0.5)
+    recorder = MemoryRecorder()
+    nodes = chain()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=0.5, recorder=recorder)
+    gs, ss = graph.reset(graph.init(jax.random.key(0)))
+    assert int(gs.step) == 0
+    for k in range(20):
+        assert int(ss.seq) == k
+        gs, ss = graph.step(gs, ss.replace(state=ss.state + 1), Value(x=np.int32(ss.seq)))
+        assert int(gs.step) == int(gs.state["agent"]) == k + 1
+        assert int(ss.inputs["world"].seq[-1]) == int(gs.seq["world"]) - 1
+    graph.stop()
+    seen = recorder.episode()
+    np.testing.assert_array_equal(seen.steps["agent"].start, own.steps["agent"].start[:20])
+    seq_in = seen.messages["agent", "world"].seq_in
+    np.testing.assert_array_equal(seq_in[seq_in >= 0], own.messages["agent", "world"].seq_in[: (seq_in >= 0).sum()])
+
+
+def test_step_takes_a_changed_step_state_and_keeps_aux():
+    nodes = chain()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1)
+    gs = graph.init(jax.random.key(0))
+    gs, ss = graph.reset(gs.replace(aux={**gs.aux, "mine": 5}))
+    gs, ss = graph.step(gs, ss.replace(state=jnp.int32(41)))  # the node makes the step itself, from this state
+    assert int(gs.state["agent"]) == 42
+    assert gs.aux["mine"] == 5
+    gs = graph.run(gs)
+    assert int(gs.state["agent"]) == 43
+    gs = graph.run_for(0.2)
+    assert int(gs.seq["agent"]) > 8
+
+
+def test_a_wrong_output_is_refused_and_the_step_stays_on_offer():
+    nodes = chain()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1)
+    gs, ss = graph.reset(graph.init(jax.random.key(0)))
+    for wrong in (Value(x=np.zeros(2, np.int32)), Value(x=np.float32(0.5)), {"x": 1}):
+        with pytest.raises(UsageError, match="'agent'"):
+            graph.step(gs, ss, wrong)
+    _, ss = graph.step(gs, ss, Value(x=3))
+    assert int(ss.seq) == 1
+
+
+def test_past_the_end_is_an_error():
+    nodes = chain()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=0.1)
+    gs = graph.init(jax.random.key(0))
+    with pytest.raises(UsageError, match="reset"):
+        graph.step(gs)
+    gs, ss = graph.reset(gs)
+    for _ in range(4):
+        gs, ss = graph.step(gs, ss, Value(x=0))
+    with pytest.raises(UsageError, match="timeline ends after step 4"):
+        graph.step(gs, ss, Value(x=0))
+
+
+def test_a_node_that_raises_is_named():
+    class Breaks(Plain):
+        def step(self, step_state):
+            if step_state.seq == 3:
+                raise KeyError("servo")
+            return super().step(step_state)
+
+    nodes = chain(Breaks)
+    recorder = MemoryRecorder()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1, recorder=recorder)
+    gs = graph.init(jax.random.key(0))
+    graph.start(gs)
+    with pytest.raises(Sim2RealError, match=r"node 'world' failed in its step 3: KeyError") as caught:
+        graph.run_for(1.0)
+    assert isinstance(caught.value.__cause__, KeyError)
+    assert not graph.running
+    graph.stop()
+    episode = recorder.episode()
+    assert len(episode.messages["agent", "world"]) == len(episode.steps["world"]) == 3
+    with pytest.raises(UsageError, match="stopped"):
+        graph.step(gs)
+
+
+def test_real_time_factor_throttles():
+    nodes = chain()
+    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1, real_time_factor=2.0)
+    gs = graph.init(jax.random.key(0))
+    graph.warmup(gs)
+    graph.start(gs)
+    begin = time.monotonic()
+    graph.run_for(0.4)
+    assert 0.18 < time.monotonic() - begin < 2.0
+
+
+class Command(BaseNode):
+    def init_output(self, rng=None, graph_state=None):
+        return Value(x=jnp.float32(-1.0))
+
+    def step(self, step_state):
+        return step_state, Value(x=step_state.seq.astype(jnp.float32))
+
+
+class World(BaseWorld):
+    def init_output(self, rng=None, graph_state=None):
+        return Value(x=jnp.float32(-1.0))
+
+    def init_delays(self, rng=None, graph_state=None):
+        return {"command": 0.025, "nonsense": 1.0}
+
+    def step(self, step_state):
+        assert step_state.inputs["command"].seq.shape == (1,)
+        return step_state, Value(x=step_state.inputs["command"][-1].data.x)
+
+
+@pytest.mark.parametrize("interp", ["zoh", "zoh_mean"])
+def test_trainable_delays_are_applied(interp):
+    command, world = Command("command", 100), World("world", 100)
+    world.connect(command, delay_dist=TrainableDist.create(0.01, 0.0, 0.05, interp))
+    nodes = {"command": command, "world": world}
+    episode, final = record(nodes, "world", duration_s=0.5)
+    assert float(final.delays["world"]["command"].delay) == pytest.approx(0.025)
+    steps, sent = episode.steps["world"], episode.steps["command"].end
+    for k, t in enumerate(steps.start):
+        newest = np.searchsorted(sent + 25_000, t, side="right") - 1
+        if interp == "zoh_mean":  # the command that arrives halfway through the tick counts for its half
+            arrivals = np.array([max(0, sent[newest + 1] + 25_000 - t)]) if newest + 1 < len(sent) else np.array([0])
+            share = min(1.0, arrivals[0] / 10_000)
+            expected = newest * share + (newest + 1) * (1 - share)
+        else:
+            expected = newest
+        if newest >= 1:
+            assert float(episode.outputs["world"]["x"][k]) == pytest.approx(float(expected), abs=0.01)
+
+
+def test_options_that_do_not_fit_are_refused():
+    nodes = chain()
+    with pytest.raises(UsageError, match="duration_s or a timeline"):
+        AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED)
+    with pytest.raises(UsageError, match="simulated clock"):
+        AsyncGraph(nodes, nodes["agent"], duration_s=1.0)
+    with pytest.raises(UsageError, match="lacks world"):
+        AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, timeline=Timeline({}, {}))
+    with pytest.raises(UsageError, match="not in the graph"):
+        AsyncGraph({"agent": nodes["agent"]}, nodes["agent"])
+    with pytest.raises(UsageError, match="two nodes are called"):
+        AsyncGraph([*nodes.values(), Jitted("world", 1)], nodes["agent"])
+    world, command = World("world", 100), Command("command", 100)
+    world.connect(command, delay_dist=TrainableDist.create(0.01, 0.0, 0.05, "zoh_mean"))
+    with pytest.raises(UsageError, match="zoh_mean"):
+        AsyncGraph([world, command], command)

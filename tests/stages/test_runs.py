@@ -1,0 +1,205 @@
+"""Run folders and manifests."""
+
+import json
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.stages import runs
+from sim2real.stages.config import RecordConfig, TrainConfig
+from sim2real.stages.manifest import git_state, plain, sha256, write_manifest
+
+
+def record(root, run_dir=None, pipeline="pendulum", text="log"):
+    with runs.open_stage(root, pipeline, "record", RecordConfig(), run_dir=run_dir) as stage:
+        stage.output("log", "session.mcap").write_text(text)
+    return stage.result
+
+
+def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
+    source = tmp_path / "parameters.json"
+    source.write_text("{}")
+    with runs.open_stage(tmp_path / "runs", "pendulum", "train", TrainConfig(seed=3), {"parameters": source}) as stage:
+        running = json.loads((stage.folder / "manifest.json").read_text())
+        stage.output("bundle", "bundle").mkdir()
+        (stage.folder / "bundle" / "policy.json").write_text("{}")
+        stage.summary({"return": np.float32(1.5), "steps": np.int64(4)})
+        stage.summary({"curve": np.arange(3)})
+    done = json.loads((stage.folder / "manifest.json").read_text())
+    assert (running["status"], running["exit_code"], running["outputs"]) == ("running", None, {})
+    assert (done["status"], done["exit_code"], done["pipeline"], done["stage"]) == ("finished", 0, "pendulum", "train")
+    assert done["inputs"] == {"parameters": {"path": str(source), "sha256": sha256(source)}}
+    assert done["outputs"]["bundle"] == {"path": "bundle", "sha256": sha256(stage.folder / "bundle")}
+    assert done["summary"] == {"return": 1.5, "steps": 4, "curve": [0, 1, 2]}
+    assert done["config"]["seed"] == 3
+    assert done["duration_s"] >= 0
+    assert done["versions"]["jax"]
+    assert set(done) >= {"started", "git", "command", "versions"}
+    assert stage.result.output("bundle") == stage.folder / "bundle"
+    assert [p.name for p in stage.folder.iterdir() if p.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "code"),
+    [
+        (SafetyStop("too fast"), "failed", 3),
+        (ZeroDivisionError("x"), "failed", 1),
+        (KeyboardInterrupt(), "interrupted", 130),
+        (SystemExit(143), "interrupted", 143),
+    ],
+)
+def test_manifest_says_how_a_stage_ended(tmp_path, error, status, code):
+    def stopped():
+        with runs.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
+            stage.output("log", "session.mcap").write_text("half")
+            stage.output("never", "written.txt")
+            raise error
+
+    with pytest.raises(type(error)):
+        stopped()
+    (path,) = tmp_path.glob("pendulum/*/record/manifest.json")
+    manifest = json.loads(path.read_text())
+    assert (manifest["status"], manifest["exit_code"], list(manifest["outputs"])) == (status, code, ["log"])
+    assert manifest["error"].startswith(type(error).__name__)
+
+
+def test_a_promised_output_that_is_missing_fails_the_stage(tmp_path):
+    def broken():
+        with runs.open_stage(tmp_path, "pendulum", "record", None) as stage:
+            stage.output("log", "session.mcap")
+
+    with pytest.raises(Sim2RealError, match=r"session\.mcap"):
+        broken()
+    with pytest.raises(Sim2RealError, match="no finished 'record'"):
+        runs.newest(tmp_path, "pendulum", "record")
+
+
+def test_outputs_stay_in_the_stages_folder(tmp_path):
+    with runs.open_stage(tmp_path, "pendulum", "record", None) as stage, pytest.raises(UsageError, match="must lie in"):
+        stage.output("log", "../log.mcap")
+
+
+def test_missing_inputs_are_errors_before_a_folder_is_made(tmp_path):
+    with (
+        pytest.raises(Sim2RealError, match="cannot read"),
+        runs.open_stage(tmp_path / "runs", "pendulum", "train", None, {"log": tmp_path / "none.mcap"}),
+    ):
+        pass
+    assert not (tmp_path / "runs").exists()
+
+
+def test_unknown_stages_are_named(tmp_path):
+    with (
+        pytest.raises(UsageError, match="Available: record, identify, train, deploy"),
+        runs.open_stage(tmp_path, "pendulum", "fly", None),
+    ):
+        pass
+
+
+def test_run_names_are_unique_and_sort_by_age(tmp_path):
+    names = [runs.new_run(tmp_path, "pendulum").name for _ in range(20)]
+    assert names == sorted(set(names))
+
+
+def test_newest_is_the_last_finished_one(tmp_path):
+    first, second = record(tmp_path), record(tmp_path)
+    record(tmp_path, pipeline="arm")
+    assert runs.newest(tmp_path, "pendulum", "record").folder == second.folder
+    with pytest.raises(KeyboardInterrupt), runs.open_stage(tmp_path, "pendulum", "record", None):
+        raise KeyboardInterrupt
+    assert runs.newest(tmp_path, "pendulum", "record").folder == second.folder
+    assert runs.newest(tmp_path, "pendulum", "record", run_dir=first.run_dir).folder == first.folder
+    again = record(tmp_path, run_dir=first.run_dir)
+    assert runs.newest(tmp_path, "pendulum", "record").folder == again.folder
+
+
+def test_a_missing_artifact_is_named_with_the_command_that_makes_it(tmp_path):
+    with pytest.raises(Sim2RealError) as caught:
+        runs.newest(tmp_path, "pendulum", "identify")
+    assert "no finished 'identify' of pipeline 'pendulum'" in str(caught.value)
+    assert "sim2real identify pendulum" in str(caught.value)
+
+
+def test_running_a_stage_again_keeps_the_earlier_attempts(tmp_path):
+    first = record(tmp_path, text="1")
+    run_dir = first.run_dir
+    record(tmp_path, run_dir, text="2")
+    latest = record(tmp_path, run_dir, text="3")
+    assert latest.output("log").read_text() == "3"
+    assert [a.output("log").read_text() for a in runs.attempts(run_dir, "record")] == ["3", "2", "1"]
+    with (
+        pytest.raises(SafetyStop),
+        runs.open_stage(tmp_path, "pendulum", "record", None, run_dir=run_dir),
+    ):
+        raise SafetyStop("too fast")
+    found = runs.finished(run_dir, "record")
+    assert found is not None
+    assert found.output("log").read_text() == "3"
+
+
+def test_outputs_that_are_unknown_or_gone(tmp_path):
+    done = record(tmp_path)
+    with pytest.raises(Sim2RealError, match=r"no output 'bundle'\. Available: log"):
+        done.output("bundle")
+    done.output("log").unlink()
+    with pytest.raises(Sim2RealError, match="is missing"):
+        done.output("log")
+
+
+def test_runs_are_found_by_path_name_stage_folder_and_pipeline(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    root = Path("runs")
+    run_dir = record(root).run_dir
+    latest = record(root).run_dir
+    for target in (run_dir, run_dir / "record", run_dir.name):
+        assert runs.find_run(root, target, "pendulum") == run_dir
+        assert runs.find_run(root, target) == run_dir
+    assert runs.find_run(root, "pendulum") == latest
+    with pytest.raises(UsageError, match="a run of pendulum, not of arm"):
+        runs.find_run(root, run_dir, "arm")
+    with pytest.raises(UsageError, match=latest.name):
+        runs.find_run(root, "nothing")
+
+
+class Colour(Enum):
+    RED = 1
+
+
+@dataclass
+class Nested:
+    where: Path
+    colour: Colour
+    values: tuple[float, ...]
+
+
+def test_plain_types_only():
+    value = plain({"a": Nested(Path("x/y"), Colour.RED, (1, float("inf"))), 2: {"z", "y"}, "b": np.bool_(True)})
+    assert value == {"a": {"where": "x/y", "colour": "RED", "values": [1, "inf"]}, "2": ["y", "z"], "b": True}
+    assert json.loads(json.dumps(value, allow_nan=False)) == value
+    with pytest.raises(TypeError, match="no plain JSON form"):
+        plain(object())
+
+
+def test_a_manifest_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    write_manifest(tmp_path, {"status": "running"})
+    with pytest.raises(TypeError):
+        write_manifest(tmp_path, {"status": object()})
+    assert json.loads((tmp_path / "manifest.json").read_text()) == {"status": "running"}
+
+
+def test_hash_of_a_folder_depends_on_names_and_contents(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "f").write_text("1")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "f").write_text("1")
+    assert sha256(tmp_path / "a") == sha256(tmp_path / "b")
+    (tmp_path / "b" / "f").rename(tmp_path / "b" / "g")
+    assert sha256(tmp_path / "a") != sha256(tmp_path / "b")
+
+
+def test_no_git_state_outside_of_a_repository(tmp_path):
+    assert git_state(tmp_path) is None

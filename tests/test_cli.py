@@ -1,0 +1,343 @@
+"""The command line: what it says, where it says it, and the exit codes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from sim2real import cli, errors
+from sim2real.stages import runs
+from sim2real.stages.config import RecordConfig
+
+QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
+
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path):
+    """Stand-ins for the four stages, in an empty working directory; returns the calls they got."""
+    monkeypatch.chdir(tmp_path)
+    seen = []
+
+    def stand_in(stage):
+        def run(pipeline, config, root, run_dir):
+            seen.append((stage, config, run_dir))
+            with runs.open_stage(root, pipeline.name, stage, config, run_dir=run_dir) as folder:
+                folder.output("result", "result.txt").write_text(stage)
+                folder.summary({"seed": config.seed})
+            return folder.result
+
+        module = ModuleType(f"sim2real.stages.{stage}")
+        module.run = run
+        return module
+
+    for stage in runs.STAGES:
+        monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}", stand_in(stage))
+    return seen
+
+
+def fail_with(monkeypatch, error):
+    module = ModuleType("sim2real.stages.record")
+
+    def run(*_):
+        raise error
+
+    module.run = run
+    monkeypatch.setitem(sys.modules, "sim2real.stages.record", module)
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+def test_help_teaches_commands_examples_and_exit_codes(capsys, arguments):
+    assert cli.main(arguments) == 0
+    out, err = capsys.readouterr()
+    for word in [*cli.COMMANDS, "examples", "exit codes", "130, 143"]:
+        assert word in out
+    assert not err
+
+
+def test_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("sim2real ")
+
+
+def test_stage_help_has_every_field_as_a_flag(capsys):
+    assert cli.main(["record", "pendulum", "--help"]) == 0
+    out, err = capsys.readouterr()
+    for flag in ["--duration-s", "--gate.slew-per-s", "--strict-timing", "--runs", "--run", "Length of the recording"]:
+        assert flag in out
+    assert "exit codes" in out
+    assert not err
+    assert "\x1b" not in out
+
+
+def test_run_help_nests_the_stages(capsys):
+    assert cli.main(["run", "pendulum", "--help"]) == 0
+    out = capsys.readouterr().out
+    for flag in ["--record.duration-s", "--identify.held-out", "--deploy.gate.limit", "--seed", "--resume"]:
+        assert flag in out
+
+
+@pytest.mark.parametrize("command", ["record", "identify", "train", "deploy", "run", "demo", "view", "report", "info"])
+def test_every_command_has_help(capsys, command):
+    assert cli.main([command, "--help"]) == 0
+    assert f"usage: sim2real {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["recrod"], "record, identify, train, deploy, run, demo, view, report, info"),
+        (["--sed"], "--version"),
+        (["record"], "pendulum"),
+        (["record", "no_such_robot"], "pendulum"),
+        (["record", "pendulum", "--durations-s", "3"], "did you mean --duration-s?"),
+        (["record", "pendulum", "--gate.limt", "3"], "--gate.slew-per-s"),
+        (["record", "pendulum", "--duration-s", "long"], "long"),
+        (["record", "pendulum", "--excitation", "noise"], "multisine"),
+        (["record", "pendulum", "--duration-s", "0"], "[1, 3600] s"),
+        (["record", "pendulum", "surplus"], "surplus"),
+        (["run", "pendulum", "--record.sed", "3"], "--record.seed"),
+        (["demo", "--speed", "3"], "--seed"),
+        (["view"], "pendulum"),
+        (["report", "no_such_run"], "no_such_run"),
+        (["info", "no_such_log.mcap"], "no_such_log.mcap"),
+        (["train", "pendulum", "--run", "no_such_run"], "no_such_run"),
+    ],
+)
+def test_wrong_commands_exit_2_and_name_what_there_is(capsys, calls, arguments, named):
+    assert cli.main(arguments) == errors.USAGE
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ")
+    assert "\n\nhint: " in err or named in err.splitlines()[0]
+    assert named in err
+    assert not out
+    assert not calls
+
+
+def test_the_configurations_own_error_keeps_its_hint(capsys):
+    assert cli.main(["record", "pendulum", "--amplitude", "5"]) == errors.USAGE
+    hint = "raise --gate.limit only if the robot bears it"
+    assert capsys.readouterr().err == f"error: the amplitude must lie in (0, 2.0], got 5.0\n\nhint: {hint}\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        (errors.Sim2RealError, 1),
+        (errors.UsageError, 2),
+        (errors.SafetyStop, 3),
+        (errors.HardwareLost, 4),
+        (errors.DeadlineExceeded, 5),
+    ],
+)
+def test_errors_become_exit_codes(monkeypatch, capsys, kind, code):
+    fail_with(monkeypatch, kind("it broke", hint="mend it"))
+    assert cli.main(["record", "pendulum"]) == code
+    assert capsys.readouterr() == ("", "error: it broke\n\nhint: mend it\n")
+
+
+def test_debug_adds_the_traceback(monkeypatch, capsys):
+    monkeypatch.setenv("SIM2REAL_DEBUG", "1")
+    fail_with(monkeypatch, errors.SafetyStop("too fast"))
+    assert cli.main(["record", "pendulum"]) == errors.SAFETY_STOP
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_unexpected_errors_name_the_saved_traceback(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    fail_with(monkeypatch, ZeroDivisionError("division\nby zero"))
+    assert cli.main(["record", "pendulum"]) == errors.ERROR
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ZeroDivisionError: division by zero (traceback in ")
+    (saved,) = tmp_path.glob("*.traceback.txt")
+    assert str(saved) in line
+    assert "Traceback" in saved.read_text()
+
+
+def test_flags_reach_the_stage_and_the_result_goes_to_stdout(calls, capsys, tmp_path):
+    arguments = ["--duration-s", "7", "--gate.limit", "1.9", "--no-strict-timing", "--runs", "elsewhere"]
+    assert cli.main(["record", "pendulum", *arguments]) == 0
+    ((stage, config, run_dir),) = calls
+    assert (stage, config.duration_s, config.gate.limit, run_dir) == ("record", 7.0, 1.9, None)
+    out, err = capsys.readouterr()
+    (folder,) = (tmp_path / "elsewhere" / "pendulum").iterdir()
+    assert f"wrote elsewhere/pendulum/{folder.name}/record/result.txt" in out
+    assert "seed  0" in out
+    assert not err
+
+
+def test_run_is_all_four_stages_in_one_folder_with_one_seed(calls, capsys):
+    assert cli.main(["run", "pendulum", "--seed", "3", "--train.seed", "9", "--record.duration-s", "5"]) == 0
+    assert [stage for stage, *_ in calls] == list(runs.STAGES)
+    assert [config.seed for _, config, _ in calls] == [3, 3, 9, 3]
+    assert calls[0][1].duration_s == 5.0
+    assert len({run_dir for *_, run_dir in calls[1:]}) == 1
+    assert "record (1/4)" in capsys.readouterr().err
+
+
+def test_demo_is_a_run_of_the_embedded_pendulum(calls):
+    assert cli.main(["demo", "--seed", "4"]) == 0
+    assert [config.seed for _, config, _ in calls] == [4] * 4
+    assert {config.port for stage, config, _ in calls if stage in ("record", "deploy")} == {"embedded"}
+
+
+def test_resume_skips_what_is_finished(calls, capsys):
+    with runs.open_stage(Path("runs"), "pendulum", "record", RecordConfig()) as stage:
+        pass
+    assert cli.main(["run", "pendulum", "--resume", str(stage.run_dir)]) == 0
+    assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
+    assert {run_dir for *_, run_dir in calls} == {stage.run_dir}
+    assert "record (1/4): finished before, skipped" in capsys.readouterr().err
+
+
+def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
+    for name in ("record", "train"):
+        with runs.open_stage(Path("runs"), "pendulum", name, None, run_dir=Path("runs/pendulum/1")):
+            pass
+    assert cli.main(["run", "pendulum", "--resume", "1"]) == 0
+    assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
+
+
+def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_path):
+    recording, page = ModuleType("sim2real.view.recording"), ModuleType("sim2real.view.page")
+    seen = []
+    recording.view = lambda run_dir, save: seen.append((run_dir, save))
+    page.report = lambda run_dir: run_dir / "report.html"
+    monkeypatch.setitem(sys.modules, recording.__name__, recording)
+    monkeypatch.setitem(sys.modules, page.__name__, page)
+    cli.main(["record", "pendulum"])
+    cli.main(["record", "pendulum"])
+    capsys.readouterr()
+    latest = max((tmp_path / "runs" / "pendulum").iterdir()).relative_to(tmp_path)
+    assert cli.main(["view", "pendulum", "--save", "out.rrd"]) == 0
+    assert cli.main(["report", str(latest / "record")]) == 0
+    assert seen == [(latest, Path("out.rrd"))]
+    assert capsys.readouterr().out == f"wrote out.rrd\nwrote {latest}/report.html\n"
+
+
+def test_info_of_installation_pipeline_and_run(calls, capsys, tmp_path):
+    assert cli.main(["info"]) == 0
+    assert "pendulum" in capsys.readouterr().out
+    assert cli.main(["info", "pendulum"]) == 0
+    assert "--gate.limit" in capsys.readouterr().out
+    cli.main(["record", "pendulum"])
+    capsys.readouterr()
+    (folder,) = (tmp_path / "runs" / "pendulum").iterdir()
+    assert cli.main(["info", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "finished" in out
+    assert "result.txt" in out
+
+
+@pytest.mark.parametrize("cut", [0, 60])
+def test_info_of_a_log_whole_or_cut(capsys, tmp_path, cut):
+    from sim2real.graph.episode import StepRecord
+    from sim2real.log import McapRecorder
+
+    path = tmp_path / "session.mcap"
+    log = McapRecorder(path, {"pipeline": "pendulum"}, {"parameters.json": b"{}"}, {"sensor": {"th": 0.0}}, [])
+    log.start(time.time_ns(), time.monotonic_ns())
+    for k in range(4):
+        slot = 20_000 * k
+        log.step(StepRecord("sensor", k, slot, slot, slot, -1, slot + 1000, 0), {"th": 0.1 * k})
+    log.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - cut])
+    assert cli.main(["info", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "/sensor/output         4" in out
+    assert "pipeline  pendulum" in out
+    assert "attachments  parameters.json 2 B" in out
+
+
+def test_info_of_something_else_is_an_error(capsys, tmp_path):
+    path = tmp_path / "notes.mcap"
+    path.write_text("no log at all, though its name says so")
+    assert cli.main(["info", str(path)]) == errors.ERROR
+    assert str(path) in capsys.readouterr().err
+
+
+SLEEPER = """
+import sys, time
+from pathlib import Path
+from types import ModuleType
+from sim2real import cli
+from sim2real.stages import runs
+
+def run(pipeline, config, root, run_dir):
+    with runs.open_stage(root, pipeline.name, "record", config) as stage:
+        try:
+            print("started", flush=True)
+            time.sleep(30)
+        finally:
+            print("torque off", flush=True)
+            time.sleep(0.3)
+            print("log closed", flush=True)
+
+module = ModuleType("sim2real.stages.record")
+module.run = run
+sys.modules[module.__name__] = module
+sys.exit(cli.main(["record", "pendulum"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)], ids=["INT", "TERM", "HUP"]
+)
+def test_signals_unwind_once_and_give_their_code(tmp_path, number, code):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLEEPER],
+        cwd=tmp_path,
+        env=QUICK,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "started\n"
+    process.send_signal(number)
+    assert process.stdout.readline() == "torque off\n"
+    process.send_signal(number)  # the second one must not break off the clean-up
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert out == "log closed\n"
+    assert "still cleaning up" in err
+    (manifest,) = tmp_path.glob("runs/pendulum/*/record/manifest.json")
+    manifest = json.loads(manifest.read_text())
+    assert (manifest["status"], manifest["exit_code"]) == ("interrupted", code)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import sim2real; sim2real.__version__; dir(sim2real)",
+        "from sim2real import cli; cli.main(['--help'])",
+        "from sim2real import cli; cli.main(['record', 'pendulum', '--help'])",
+        "from sim2real import cli; cli.main(['info'])",
+    ],
+)
+def test_nothing_heavy_is_imported_for_help(code):
+    heavy = "sorted({'jax', 'mujoco', 'numpy', 'matplotlib', 'flax', 'onnx', 'rerun'} & set(sys.modules))"
+    command = [sys.executable, "-c", f"{code}; import sys; print({heavy})"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_public_names_are_listed_where_they_come_from():
+    import sim2real
+
+    assert set(sim2real.__all__) == set(sim2real._HOME_OF)
+    assert sim2real.Sim2RealError is errors.Sim2RealError
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        _ = sim2real.Nothing
+
+
+def test_signal_handlers_are_given_back():
+    before = signal.getsignal(signal.SIGTERM)
+    assert cli.main(["--version"]) == 0
+    assert signal.getsignal(signal.SIGTERM) is before
