@@ -12,7 +12,6 @@ from sim2real.graph.delays import DelayDistribution, TrainableDist
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Channel
-
 from sim2real.stages.config import GateLimits
 
 from . import hardware, parameters
@@ -25,11 +24,10 @@ COMMAND = ("actuator", "action")
 JOINTS = {
     "sensor": {"hinge": {"position": "th", "velocity": "thdot"}},
 }
-_FEATURES = [("cos(th)", "1"), ("sin(th)", "1"), ("thdot / 10", "rad/s")]
 OBSERVATION = [
-    *_FEATURES,
-    *[(f"{name}[-{k + 1}]", unit) for k in range(HISTORY) for name, unit in _FEATURES],
-    *[(f"voltage[-{k + 1}]", "V") for k in range(HISTORY)],
+    ("cos(th), sin(th), thdot / 10", ("1", "1", "rad/s"), 1),
+    ("past cos(th), sin(th), thdot / 10", ("1", "1", "rad/s"), HISTORY),
+    ("past voltage", ("V",), HISTORY),
 ]
 ACTION = [("voltage", "V")]
 WORLD_HZ = 100.0
@@ -144,19 +142,33 @@ def training(
     return nodes, SwingUp(agent, values, spread, DELAY_SPREAD_S if delays else 0.0)
 
 
+def simulation_params(values: Mapping[str, float], policy: Any) -> dict[str, Any]:
+    """Return node parameters of the loop in simulation, hanging at rest, with a policy."""
+    return {**parameters.node_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
+
+
 def nominal() -> dict[str, float]:
     """Return the data sheet's values, without delays."""
     return {p.name: p.nominal for p in parameters.table(0.06, 1 / WORLD_HZ) if p.kind == "dynamics"}
 
 
 def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return the share of the last half in which the pendulum was upright, and when it first was [s]."""
+    """Return how well the pendulum was swung up and held.
+
+    ``success`` is the share of the second half in which it was upright, ``first_upright_s`` when it first came up [s];
+    the deviations are of the second half.
+    """
     good = np.asarray(upright(states["th"], states["thdot"]))
     last = t_s >= t_s[-1] - (t_s[-1] - t_s[0]) / 2
     up = np.flatnonzero(np.cos(states["th"]) > 0.95)
+    off = np.arctan2(np.sin(states["th"]), np.cos(states["th"]))[last]
+    half = len(states["command"]) // 2
     return {
         "success": float(good[last].mean()),
         "first_upright_s": float(t_s[up[0]] - t_s[0]) if up.size else float("nan"),
+        "angle_rms_rad": float(np.sqrt(np.mean(off**2))),
+        "speed_rms_rad_s": float(np.sqrt(np.mean(states["thdot"][last] ** 2))),
+        "command_rms_v": float(np.sqrt(np.mean(states["command"][half:] ** 2))),
     }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,8 @@ class IdentifyConfig:
             raise UsageError(f"held_out must lie in [0.05, 0.8], got {self.held_out}")
         if not (0.1 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 60.0):
             raise UsageError(
-                f"settle_s must lie in [0.1, 10] s and horizon_s in [0.2, 60] s, got {self.settle_s} and {self.horizon_s}"
+                "settle_s must lie in [0.1, 10] s and horizon_s in [0.2, 60] s, "
+                f"got {self.settle_s} and {self.horizon_s}"
             )
         if self.population < 4 or self.generations < 1:
             raise UsageError(
@@ -118,6 +120,17 @@ class TrainConfig:
     """Copies differ in their parameters by this many standard errors of the identification, and at least by 2 %."""
     seed: int = 0
     """Seed of training."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """The learning algorithm."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything is compiled."""
+        if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
+            raise UsageError(
+                f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
+            )
+        if not 0.0 <= self.randomise <= 10.0:
+            raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
 
 
 @dataclass(frozen=True)
@@ -140,3 +153,10 @@ class DeployConfig:
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     gate: GateLimits = field(default_factory=GateLimits)
     """Limits on every command."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        if self.episodes < 1:
+            raise UsageError(f"episodes must be at least 1, got {self.episodes}")
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")

@@ -23,7 +23,7 @@ from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.manifest import sha256
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.record import LOG, TRUTH
+from sim2real.stages.record import TRUTH
 from sim2real.stages.robot import Robot
 from sim2real.stages.runs import StageFolder, newest, open_stage
 from sim2real.stages.truth import true_values
@@ -159,7 +159,7 @@ def _predictions(
                 "held_out": held_out[at[0]],
                 "into": ts[at],
             }
-            for i, (field, _) in enumerate(fields):
+            for field, _ in fields:
                 columns[f"{field}_measured"] = problem.measured(field)[at]
         for i, (field, sigma) in enumerate(fields):
             columns[f"{field}_{name}"] = columns[f"{field}_measured"] + residuals[..., i][at] * sigma

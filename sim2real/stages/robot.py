@@ -33,7 +33,7 @@ class Robot(Protocol):
         SUPERVISOR: Name of the node that the policy acts for.
         COMMAND: Node and field of the command that reaches the motors.
         JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
-        OBSERVATION: Names of the policy's observation entries, with units, in order.
+        OBSERVATION: Terms of the policy's observation in order: name, units of its entries, steps of history.
         ACTION: Names of the actions, with units, in order.
     """
 
@@ -41,7 +41,7 @@ class Robot(Protocol):
     SUPERVISOR: str
     COMMAND: tuple[str, str]
     JOINTS: Mapping[str, Any]
-    OBSERVATION: list[tuple[str, str]]
+    OBSERVATION: list[tuple[str, tuple[str, ...], int]]
     ACTION: list[tuple[str, str]]
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
@@ -68,6 +68,10 @@ class Robot(Protocol):
         delays: bool,
     ) -> tuple[dict[str, BaseNode], Task]:
         """Return the graph in simulation and the task, for parameters that vary by ``spread`` (a share of each)."""
+        ...
+
+    def simulation_params(self, values: Mapping[str, float], policy: Any) -> dict[str, Any]:
+        """Return node parameters of the graph in simulation that starts at rest and runs a policy."""
         ...
 
     def nominal(self) -> dict[str, float]:

@@ -76,6 +76,7 @@ def run_episode(
     try:
         _drive(graph, state, duration_s, label)
     except BaseException as error:
+        session.rig.stop_quietly()
         status, code = f"{type(error).__name__}: {error}", _exit_code(error)
         recorder.write_event("stop", status)
         raise
@@ -83,7 +84,6 @@ def run_episode(
         try:
             graph.stop()
         finally:
-            session.rig.stop_quietly()
             summary = {**_summary(graph, session), "monotonic_ns": origin.monotonic_ns}
             recorder.close(status, code, summary)
     late = _late_nodes(summary["timing"])

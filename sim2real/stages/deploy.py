@@ -1,0 +1,182 @@
+"""Run the policy on the robot, behind the safety gate, and compare with the simulation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import TICKS_PER_S
+from sim2real.graph.schedule import draw
+from sim2real.hardware.truth import read_truth
+from sim2real.log.reader import read_log
+from sim2real.policy.bundle import load_bundle, read_weights
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.config import DeployConfig
+from sim2real.stages.console import note, table
+from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.record import TRUTH
+from sim2real.stages.robot import Robot, Session
+from sim2real.stages.runs import StageFolder, finished, newest, open_stage
+from sim2real.stages.session import run_episode, timing_rows
+from sim2real.stages.train import computation_delays, load_parameters
+from sim2real.train.networks import Policy
+
+_SIMULATIONS = 32
+
+
+def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
+    """Deploy the policy and write logs, scores and the gap to simulation.
+
+    Args:
+        pipeline: The robot.
+        config: The stage's configuration.
+        root: Folder of all runs.
+        run_dir: Run folder to add to; None takes the one of the bundle.
+    """
+    robot = cast(Robot, pipeline.load())
+    bundle, run_dir = _find_bundle(pipeline, config, root, run_dir)
+    policy = _load_policy(robot, bundle)
+    with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir) as stage:
+        logs = [stage.output(f"log_{i}", f"episode_{i}.mcap") for i in range(config.episodes)]
+        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session:
+            if session.embedded is not None:
+                stage.output("truth", TRUTH)
+            timing = [_deploy(pipeline, robot, session, policy, log, config) for log in logs]
+        print(table(*timing_rows(timing[-1])))
+        real = [
+            _true_states(stage.folder / TRUTH, s, read_log(log), robot) for log, s in zip(logs, timing, strict=True)
+        ]
+        simulated = _simulate(pipeline, robot, policy, stage.run_dir, read_log(logs[0]), config.duration_s)
+        result = _compare(robot, real, simulated)
+        stage.output("result", "result.json").write_text(json.dumps({**result, "timing": timing}, indent=1))
+        np.savez_compressed(stage.output("simulation", "simulation.npz"), **_first_episodes(simulated, len(logs)))
+        from sim2real.view.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
+
+        stage.output("page", deploy_page(stage.folder).name)
+        headers = ["quantity", "robot", "simulation", "gap"]
+        print(table([[g["quantity"], g["real"], g["simulation"], g["gap"]] for g in result["gap"]], headers))
+        stage.summary(
+            {
+                **{
+                    f"success, deployment {i}": round(e["real"]["success"], 3) for i, e in enumerate(result["episodes"])
+                },
+                "lost replies": timing[-1]["lost_replies"],
+                "command timeouts": timing[-1]["command_timeouts"],
+            }
+        )
+    return stage.result
+
+
+def _deploy(
+    pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, log: Path, config: DeployConfig
+) -> dict[str, Any]:
+    note(f"waiting for the robot to come to rest, then {config.duration_s:g} s on {config.port}")
+    session.rig.wait_until_still(config.settle_s)
+    nodes, params = robot.deployment_nodes(session, policy)
+    return run_episode(
+        pipeline, robot, session, nodes, params, log, config.duration_s, config, config.strict_timing, "deploy"
+    )
+
+
+def _find_bundle(
+    pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None
+) -> tuple[Path, Path | None]:
+    if config.bundle is not None:
+        return Path(config.bundle), run_dir
+    trained = newest(root, pipeline.name, "train", run_dir)
+    return trained.output("bundle"), run_dir or trained.run_dir
+
+
+def _load_policy(robot: Robot, bundle: Path) -> Policy:
+    contract = load_bundle(bundle).contract
+    expected = [(name, tuple(units), history) for name, units, history in robot.OBSERVATION]
+    found = [(t.name, tuple(t.units), t.history) for t in contract.observation]
+    if found != expected or contract.rate_hz != robot.RATE_HZ:
+        raise UsageError(
+            f"the policy in {bundle} sees {found} at {contract.rate_hz:g} Hz, "
+            f"this robot shows {expected} at {robot.RATE_HZ:g} Hz",
+            hint="train a policy for this pipeline",
+        )
+    return Policy.from_weights(read_weights(bundle))
+
+
+def _true_states(
+    truth: Path, summary: Mapping[str, Any], episode: Episode, robot: Robot
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
+    command = episode.outputs[robot.COMMAND[0]][robot.COMMAND[1]].reshape(len(episode.steps[robot.COMMAND[0]]), -1)[
+        :, 0
+    ]
+    if truth.is_file():
+        t_ns, states = read_truth(truth).states()
+        t_s = (t_ns - summary["monotonic_ns"]) / 1e9
+        inside = (t_s >= 0) & (t_s <= episode.duration_s)
+        return t_s[inside], {**{n: s[inside] for n, s in states.items()}, "command": command}
+    steps = episode.steps["sensor"]
+    t_s = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) / TICKS_PER_S
+    return t_s, {**episode.outputs["sensor"], "command": command}
+
+
+def _simulate(
+    pipeline: Pipeline, robot: Robot, policy: Policy, run_dir: Path, episode: Episode, duration_s: float
+) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
+    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
+
+    None when the run holds no identified parameters to simulate with.
+    """
+    identified = finished(run_dir, "identify")
+    if identified is None:
+        return None
+    document = load_parameters(identified.output("parameters"), pipeline)
+    values = {p["name"]: float(p["estimate"]) for p in document["parameters"] if p["kind"] != "derived"}
+    nodes, _ = robot.training(values, {}, computation_delays(episode), True)
+    graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, duration_s, _SIMULATIONS, 0))
+    params = robot.simulation_params(values, policy)
+    recorded = ("world", robot.COMMAND[0])
+
+    def one(eps: jax.Array) -> Any:
+        return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
+
+    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS)))
+    world, command = records["world"], records[robot.COMMAND[0]]
+    rate = nodes["world"].rate
+    runs = []
+    for e in range(_SIMULATIONS):
+        ran = command.seq[e] >= 0
+        sent = getattr(command.output, robot.COMMAND[1])[e][ran].reshape(int(ran.sum()), -1)[:, 0]
+        states = {f: np.asarray(getattr(world.output, f)[e]) for f in world.output.__dataclass_fields__}
+        runs.append(((world.seq[e] + 1) / rate, {**states, "command": sent}))
+    return runs
+
+
+def _compare(robot: Robot, real: list[Any], simulated: list[Any] | None) -> dict[str, Any]:
+    """Return the scores of every deployment, and the gap table: means over deployments and over simulations."""
+    on_robot = [robot.score(t, s) for t, s in real]
+    in_simulation = [robot.score(t, s) for t, s in simulated or []]
+    episodes = [
+        {"real": score, "simulation": in_simulation[i] if i < len(in_simulation) else None}
+        for i, score in enumerate(on_robot)
+    ]
+    gap = []
+    for quantity in on_robot[0]:
+        r = float(np.nanmean([s[quantity] for s in on_robot]))
+        if not in_simulation:
+            gap.append({"quantity": quantity, "real": r, "simulation": None, "gap": None})
+            continue
+        s = float(np.nanmean([s[quantity] for s in in_simulation]))
+        gap.append({"quantity": quantity, "real": r, "simulation": s, "gap": r - s})
+    return {"episodes": episodes, "gap": gap}
+
+
+def _first_episodes(simulated: list[Any] | None, count: int) -> dict[str, np.ndarray]:
+    columns: dict[str, np.ndarray] = {}
+    for i, (t, states) in enumerate((simulated or [])[:count]):
+        columns |= {f"t_{i}": t, **{f"{name}_{i}": values for name, values in states.items()}}
+    return columns
