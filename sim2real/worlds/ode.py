@@ -51,9 +51,8 @@ class OdeWorld(BaseWorld):
         del params
         return state
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Integrate over one tick."""
-        params, command = step_state.params, self.command(step_state)
+    def integrate(self, params: Any, state: Any, command: Any) -> Any:
+        """Return the state one tick later, under a command that is held."""
         h = 1.0 / (self.rate * self.substeps)
 
         def substep(x: Any, _: None) -> tuple[Any, None]:
@@ -65,8 +64,16 @@ class OdeWorld(BaseWorld):
             move = jax.tree_util.tree_map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
             return self.limit(params, _axpy(x, move, h)), None
 
-        start = jax.tree_util.tree_map(jnp.asarray, step_state.state)
-        state, _ = jax.lax.scan(substep, start, length=self.substeps)
+        # A loop costs a GPU a kernel launch a substep. On a CPU the unrolled pendulum took 5 times as long to compile
+        # and 6 times as long to run as the loop (2 cores, jax 0.10.2, five substeps).
+        unroll = 1 if jax.default_backend() == "cpu" else self.substeps
+        start = jax.tree_util.tree_map(jnp.asarray, state)
+        return jax.lax.scan(substep, start, length=self.substeps, unroll=unroll)[0]
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Integrate over one tick."""
+        params = step_state.params
+        state = self.integrate(params, step_state.state, self.command(step_state))
         new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
         return new, self.output(params, state)
 

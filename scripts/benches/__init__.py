@@ -1,0 +1,1 @@
+"""One module a bench; ``scripts/bench.py`` runs them."""

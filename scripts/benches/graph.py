@@ -1,0 +1,327 @@
+"""The compiled graph against the same robot written by hand, and against bare physics, in one run.
+
+The robot is the seed's pendulum: sensor, agent, actuator and world, a policy that draws random actions and keeps four
+past observations and actions, two Runge-Kutta substeps of 10 ms, 4 s, delays as in the seed's notebook.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.delays import StaticDist
+from sim2real.graph.node import BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.graph.timeline import Timeline
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+
+MODEL = load_pipeline("pendulum").load("model")
+DURATION_S = 4.0
+EPISODES = 32
+
+
+class _Normal:
+    """Stands for ``distrax.Normal``, which the GPU machine of the bench lacks: the fields that the graph reads."""
+
+    def __init__(self, loc: float, scale: float) -> None:
+        self.loc, self.scale = loc, scale
+
+    def sample(self, seed: Any, sample_shape: tuple[int, ...]) -> Any:
+        return self.loc + self.scale * jax.random.normal(seed, sample_shape)
+
+
+_Normal.__name__ = "Normal"
+
+
+class RandomAgent(MODEL.Agent):
+    """The seed's agent without a policy: random actions, but observations and histories are kept."""
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Draw an action."""
+        rng, key = jax.random.split(step_state.rng)
+        action = jax.random.uniform(key, (1,), minval=-2.0, maxval=2.0)
+        return self.act(step_state.replace(rng=rng), action)
+
+
+class CostWorld(MODEL.PendulumWorld):
+    """The seed's world: it adds up the cost of the task beside the physics."""
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Start at the parameters' state, at no cost."""
+        return super().init_state(rng, graph_state), jnp.float32(0.0)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the initial angle and velocity."""
+        return self.init_state(rng, graph_state)[0]
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Integrate, and add the cost."""
+        x, cost = step_state.state
+        moved, output = super().step(step_state.replace(state=x))
+        u = self.command(step_state)
+        return moved.replace(state=(moved.state, cost + task_cost(moved.state, u))), output
+
+
+class Sensor(MODEL.SimSensor):
+    """The sensor of a world whose state holds the cost as well."""
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the initial angle and velocity."""
+        del rng
+        return graph_state.state["world"][0] if graph_state else MODEL.Measurement(th=jnp.pi, thdot=0.0)
+
+
+def task_cost(x: Any, u: Any) -> Any:
+    """Return the seed's cost of a state under a voltage."""
+    th = x.th - 2 * jnp.pi * jnp.floor((x.th + jnp.pi) / (2 * jnp.pi))
+    return th**2 + 0.1 * (x.thdot / (1 + 10 * jnp.abs(th))) ** 2 + 0.01 * u**2
+
+
+def nodes(agent_hz: float = 50.0, world_hz: float = 50.0, substep_s: float = 0.01) -> dict[str, BaseNode]:
+    """Return the seed's graph with the delays of its notebook."""
+    dist = lambda loc, scale: StaticDist(_Normal(loc, scale))  # noqa: E731
+    sensor = Sensor("sensor", agent_hz, delay_dist=dist(0.0075, 0.003))
+    agent = RandomAgent("agent", agent_hz, delay_dist=dist(0.01, 0.003))
+    actuator = MODEL.SimActuator("actuator", agent_hz, delay_dist=dist(0.0075, 0.003))
+    world = CostWorld("world", world_hz, substep_s=substep_s)
+    agent.connect(sensor, blocking=True, window=3, delay_dist=dist(0.002, 0.002))
+    actuator.connect(agent, blocking=True, delay_dist=dist(0.002, 0.002))
+    world.connect(actuator, skip=True, delay_dist=dist(0.01, 0.002))
+    sensor.connect(world, delay_dist=dist(0.01, 0.002))
+    return {n.name: n for n in (sensor, agent, actuator, world)}
+
+
+def timelines(graph_nodes: dict[str, BaseNode], hiccup: bool = False) -> Timeline:
+    """Draw the bench's timelines; with ``hiccup`` the agent takes 50 ms longer about every 500 steps."""
+    if hiccup:
+        agent = graph_nodes["agent"]
+        agent.delay_dist = _WithHiccups(agent.delay_dist)
+    return draw(graph_nodes, DURATION_S, EPISODES, 0)
+
+
+class _WithHiccups(StaticDist):
+    def __init__(self, base: Any) -> None:
+        super().__init__(base.dist)
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        return super().sample(rng, shape) + np.where(rng.random(shape) < 1 / 500, 0.05, 0.0)
+
+
+def params() -> Any:
+    """Return the seed's parameters, with its Coulomb friction by sign."""
+    return MODEL.nominal_params().replace(smooth_rad_s=0.0, max_speed=40.0)
+
+
+def graph_program(graph: CompiledGraph) -> Callable[[Any], Any]:
+    """Return the rollout of one copy, on a random timeline."""
+
+    def run(key: Any) -> Any:
+        k_init, k_eps, k_th = jax.random.split(key, 3)
+        start = jnp.stack([jax.random.uniform(k_th, (), minval=-3.14, maxval=3.14), jnp.float32(0.0)])
+        eps = jax.random.randint(k_eps, (), 0, graph.episodes)
+        gs, _ = graph.rollout(graph.init(k_init, {"world": params().replace(start=start)}, eps=eps))
+        return gs.state["world"][1] + gs.state["agent"].observations.sum() + gs.state["agent"].actions.sum()
+
+    return run
+
+
+def hand_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any], Any]:
+    """Return the same robot without a graph: shift registers, one step of delay each way.
+
+    Args:
+        rows: How often the pattern of ticks is repeated.
+        ticks: World ticks after each policy step of the pattern.
+        world: For its physics.
+    """
+    p = params()
+    shift = lambda ring, new: jnp.concatenate([new[None], ring[:-1]])  # noqa: E731
+
+    def run(key: Any) -> Any:
+        def policy_step(carry: Any, count: int) -> Any:
+            x, cost, rng, commands, sensed, observations, actions = carry
+            rng, k = jax.random.split(rng)
+            action = jax.random.uniform(k, (1,), minval=-2.0, maxval=2.0)
+            seen = jnp.stack([jnp.cos(sensed[0, 0]), jnp.sin(sensed[0, 0]), sensed[0, 1] / 10.0])
+            commands, observations, actions = (
+                shift(commands, action),
+                shift(observations, seen),
+                shift(actions, action),
+            )
+            for _ in range(count):
+                x, cost = tick(world, p, x, cost, commands[1, 0])
+            sensed = shift(sensed, jnp.stack([x.th, x.thdot]))
+            return x, cost, rng, commands, sensed, observations, actions
+
+        def row(carry: Any, _: None) -> tuple[Any, None]:
+            for count in ticks:
+                carry = policy_step(carry, count)
+            return carry, None
+
+        th = jax.random.uniform(key, (), minval=-3.14, maxval=3.14)
+        x = MODEL.Measurement(th=th, thdot=jnp.float32(0.0))
+        zeros = jnp.zeros
+        carry = (x, jnp.float32(0.0), key, zeros((2, 1)), zeros((3, 2)), zeros((4, 3)), zeros((4, 1)))
+        carry, _ = jax.lax.scan(row, carry, length=rows)
+        return carry[1] + carry[5].sum() + carry[6].sum()
+
+    return run
+
+
+def bare_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any], Any]:
+    """Return the physics alone, under a constant voltage."""
+    p = params()
+
+    def run(key: Any) -> Any:
+        def row(carry: Any, _: None) -> tuple[Any, None]:
+            for _ in range(sum(ticks)):
+                carry = tick(world, p, *carry, jnp.float32(0.5))
+            return carry, None
+
+        th = jax.random.uniform(key, (), minval=-3.14, maxval=3.14)
+        x = MODEL.Measurement(th=th, thdot=jnp.float32(0.0))
+        return jax.lax.scan(row, (x, jnp.float32(0.0)), length=rows)[0][1]
+
+    return run
+
+
+def tick(world: Any, p: Any, x: Any, cost: Any, u: Any) -> tuple[Any, Any]:
+    """Integrate one tick of the world under a voltage, and add the cost."""
+    x = world.integrate(p, x, u)
+    return x, cost + task_cost(x, u)
+
+
+def compare(programs: dict[str, Callable[[Any], Any]], copies: int, repeats: int) -> tuple[dict, dict]:
+    """Time programs in turn; return median seconds of a call, and seconds to compile."""
+    keys = jax.random.split(jax.random.key(0), copies)
+    compiled, compile_s, times = {}, {}, {}
+    for name, program in programs.items():
+        begin = time.perf_counter()
+        compiled[name] = jax.jit(jax.vmap(program)).lower(keys).compile()
+        compile_s[name] = time.perf_counter() - begin
+        jax.block_until_ready(compiled[name](keys))
+        times[name] = []
+    for _ in range(repeats):
+        for name, program in compiled.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(program(keys))
+            times[name].append(time.perf_counter() - begin)
+    return {n: statistics.median(t) for n, t in times.items()}, compile_s
+
+
+def bytes_per_copy(graph: CompiledGraph) -> int:
+    """Return what a copy carries from row to row, parameters left out as copies may share them."""
+    gs = jax.eval_shape(lambda: graph.init(jax.random.key(0), {"world": params()})).replace(params={})
+    return int(
+        sum(np.prod(x.shape) * (8 if x.dtype.name.startswith("key") else x.dtype.itemsize) for x in jax.tree.leaves(gs))
+    )
+
+
+def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repeats: int, hiccup: bool) -> list[dict]:
+    """Measure one kind of timelines at one number of copies."""
+    graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, hiccup))
+    world = graph_nodes["world"]
+    total = graph.rows * graph.wiring.ticks
+    pattern_rows = total // sum(ticks)
+    programs = {
+        "bare": bare_program(pattern_rows, ticks, world),
+        "hand": hand_program(pattern_rows, ticks, world),
+        "graph": graph_program(graph),
+    }
+    seconds, compile_s = compare(programs, copies, repeats)
+    # The programs may differ by a tick or two in length: compared per tick.
+    per_tick = {n: s / (total if n == "graph" else pattern_rows * sum(ticks)) for n, s in seconds.items()}
+    policy_steps = float(graph.timeline.vertices["agent"].count.mean())
+    report = graph.report()
+    print(name, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
+    over = {b: per_tick["graph"] / per_tick[b] for b in ("hand", "bare")}
+    rate = copies * policy_steps / seconds["graph"]
+    hand_rate = copies * pattern_rows * len(ticks) / seconds["hand"]
+    goal = "<= 1.2" if name.count("/") == 1 else "<= 1.15 times the plain timelines"
+    return [
+        {
+            "name": f"{name}/{copies}/over_hand",
+            "value": round(over["hand"], 3),
+            "unit": "1",
+            "yardstick": "hand-written",
+            "goal": goal,
+        },
+        {
+            "name": f"{name}/{copies}/over_bare",
+            "value": round(over["bare"], 3),
+            "unit": "1",
+            "yardstick": "physics alone",
+        },
+        {
+            "name": f"{name}/{copies}/agent_steps_per_s",
+            "value": round(rate),
+            "unit": "1/s",
+            "yardstick": f"{hand_rate:.3g} by hand",
+        },
+        {
+            "name": f"{name}/{copies}/compile_s",
+            "value": round(compile_s["graph"], 2),
+            "unit": "s",
+            "yardstick": f"{compile_s['hand']:.2f} by hand",
+            "goal": "< 5",
+        },
+    ]
+
+
+def building() -> list[dict[str, Any]]:
+    """Measure how long timelines take to draw and to wire."""
+    found = []
+    for episodes in (1_000, 10_000):
+        graph_nodes = nodes()
+        draw(graph_nodes, DURATION_S, 10, 0)
+        begin = time.perf_counter()
+        drawn = draw(graph_nodes, DURATION_S, episodes, 0)
+        middle = time.perf_counter()
+        from sim2real.runtime.wiring import wire
+
+        wire(graph_nodes, "agent", drawn)
+        end = time.perf_counter()
+        goals = ("< 1", "< 2") if episodes == 1_000 else ("linear", "linear")
+        for what, seconds, goal in (("draw", middle - begin, goals[0]), ("wire", end - middle, goals[1])):
+            found.append(
+                {
+                    "name": f"graph/build/{episodes}_episodes_{what}_s",
+                    "value": round(seconds, 3),
+                    "unit": "s",
+                    "goal": goal,
+                }
+            )
+    return found
+
+
+def main(arguments: list[str]) -> dict[str, Any]:
+    """Measure on the device that JAX finds."""
+    parser = argparse.ArgumentParser(prog="bench.py graph")
+    parser.add_argument("--copies", type=int, nargs="+", help="default: 1024 on the CPU, 20000 and 100000 on a GPU")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
+    options = parser.parse_args(arguments)
+    device = options.name or jax.default_backend()
+    copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
+    rows: list[dict[str, Any]] = []
+    for count in copies:
+        rows += case(f"graph/{device}", nodes(), (1,), count, options.repeats, False)
+        rows += case(f"graph/{device}/hiccups", nodes(), (1,), count, options.repeats, True)
+        rows += case(
+            f"graph/{device}/30_over_100_hz", nodes(30.0, 100.0, 0.005), (3, 3, 4), count, options.repeats, False
+        )
+    graph_nodes = nodes()
+    graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
+    rows.append({"name": "graph/bytes_per_copy", "value": bytes_per_copy(graph), "unit": "B", "goal": "< 2000"})
+    rows += building()
+    return {"rows": rows, "device": str(jax.devices()[0]), "jax": jax.__version__, "file": Path(__file__).name}

@@ -1,0 +1,194 @@
+"""The policy bundle: one folder with weights, an ONNX graph and the contract."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.policy.contract import PolicyContract
+from sim2real.policy.onnx_graph import build_onnx
+from sim2real.policy.runner import BACKENDS, OBSERVATION_CLIP, NumpyBackend, OnnxBackend, PolicyRunner, layers_of
+
+FORMAT_VERSION = 1
+WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
+PARITY = 1e-5
+"""Largest difference between numpy and ONNX that an export may have, as a share of the action range."""
+
+
+def save_bundle(
+    folder: str | Path, weights: Mapping[str, np.ndarray], contract: PolicyContract, samples: np.ndarray | None = None
+) -> Path:
+    """Write a bundle; ``policy.json`` comes last, so that a folder with one is complete.
+
+    Args:
+        folder: Where to; made if it is not there. A bundle that is there already is replaced.
+        weights: As ``Policy.to_weights`` returns them.
+        contract: What the policy expects and promises.
+        samples: Shape ``(n, O)``: observations, logged ones if there are any, on which numpy and ONNX are compared
+            where onnxruntime is installed. Without any, drawn from the normaliser.
+
+    Returns:
+        The folder.
+
+    Raises:
+        Sim2RealError: Weights and contract do not fit together, or numpy and ONNX disagree.
+    """
+    weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
+    _check_fit(weights, contract)
+    graph = build_onnx(weights, contract)
+    if importlib.util.find_spec("onnxruntime") is not None:
+        _check_parity(weights, graph, contract, samples)
+    files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
+    about = {
+        "format_version": FORMAT_VERSION,
+        **contract.to_dict(),
+        "normaliser": {
+            "mean": weights["mean"].tolist(),
+            "std": weights["std"].tolist(),
+            "clip": OBSERVATION_CLIP,
+        },
+        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        "versions": {"python": platform.python_version()}
+        | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
+    }
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONTRACT).unlink(missing_ok=True)
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    (folder / CONTRACT).write_text(json.dumps(about, indent=2) + "\n")
+    return folder
+
+
+def load_bundle(folder: str | Path, backend: str = "numpy") -> PolicyRunner:
+    """Open a bundle.
+
+    Args:
+        folder: What ``save_bundle`` wrote.
+        backend: ``"numpy"``, or ``"onnx"`` where onnxruntime is installed.
+
+    Raises:
+        UsageError: There is no such backend.
+        Sim2RealError: A file is missing, damaged or of a format that this version does not know.
+    """
+    if backend not in BACKENDS:
+        raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
+    folder = Path(folder)
+    about = _read_about(folder)
+    contract = PolicyContract.from_dict(about)
+    weights = read_weights(folder)
+    _check_fit(weights, contract)
+    if backend == "numpy":
+        return PolicyRunner(contract, NumpyBackend(weights))
+    return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, about)))
+
+
+def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
+    """Return the weights in a bundle, as ``Policy.from_weights`` takes them.
+
+    Raises:
+        Sim2RealError: A file is missing, damaged or of a format that this version does not know.
+    """
+    folder = Path(folder)
+    content = _read_file(folder, WEIGHTS, _read_about(folder))
+    try:
+        return safetensors.numpy.load(content)
+    except SafetensorError as error:
+        raise Sim2RealError(f"{folder / WEIGHTS} is no safetensors file: {error}") from error
+
+
+def _read_about(folder: Path) -> dict[str, Any]:
+    """Return what ``policy.json`` says, once its format version is known to be ours."""
+    path = folder / CONTRACT
+    try:
+        about = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise Sim2RealError(
+            f"{folder} holds no {CONTRACT}: it is no policy bundle, or its export did not finish",
+            hint="make one with: sim2real train",
+        ) from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise Sim2RealError(f"{path} is no JSON: {error}", hint="copy or export the bundle again") from error
+    version = about.get("format_version") if isinstance(about, dict) else None
+    if version != FORMAT_VERSION:
+        raise Sim2RealError(
+            f"{path} has format version {version!r}, this sim2real reads {FORMAT_VERSION}",
+            hint="export the policy again, or install the sim2real that wrote it (see 'versions' in the file)",
+        )
+    return about
+
+
+def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
+    """Return the bytes of a file, once they are those that were written."""
+    try:
+        content = (folder / name).read_bytes()
+    except FileNotFoundError as error:
+        raise Sim2RealError(f"{folder} lacks {name}", hint="copy or export the whole bundle again") from error
+    expected = about.get("files", {}).get(name)
+    if hashlib.sha256(content).hexdigest() != expected:
+        raise Sim2RealError(
+            f"{folder / name} is not what was exported: its sha256 differs from the one in {CONTRACT}",
+            hint="copy or export the whole bundle again",
+        )
+    return content
+
+
+def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> None:
+    """Raise unless the weights are finite, chain up and match the contract's sizes and bounds."""
+    layers = layers_of(weights)
+    size, actions = contract.observation_size, len(contract.action)
+    expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
+    width = size
+    for i, (kernel, _) in enumerate(layers):
+        out = actions if i == len(layers) - 1 else kernel.shape[-1]
+        expected |= {f"layers.{i}.kernel": (width, out), f"layers.{i}.bias": (out,)}
+        width = out
+    for name, shape in expected.items():
+        if weights[name].shape != shape:
+            raise Sim2RealError(
+                f"the policy's {name} has shape {weights[name].shape}, the contract asks for {shape}",
+                hint=f"the contract has {size} observations and {actions} actions: describe the ones that were trained",
+            )
+        if not np.isfinite(weights[name]).all():
+            raise Sim2RealError(f"the policy's {name} holds values that are not finite", hint="train the policy again")
+    for side in ("low", "high"):
+        promised = np.array([getattr(term, side) for term in contract.action], np.float32)
+        if not np.array_equal(promised, weights[side]):
+            raise Sim2RealError(f"the policy's {side} bounds are {weights[side]}, the contract's are {promised}")
+
+
+def _check_parity(
+    weights: Mapping[str, np.ndarray], graph: bytes, contract: PolicyContract, samples: np.ndarray | None
+) -> None:
+    """Raise unless numpy and ONNX give the same actions on the samples."""
+    if samples is None:
+        noise = np.random.default_rng(0).normal(size=(64, contract.observation_size))
+        samples = weights["mean"] + 2.0 * weights["std"] * noise
+    by_numpy = PolicyRunner(contract, NumpyBackend(weights))
+    by_onnx = PolicyRunner(contract, OnnxBackend(graph))
+    difference = np.array([by_numpy.act(sample) - by_onnx.act(sample) for sample in samples])
+    worst = np.abs(difference / (weights["high"] - weights["low"])).max(initial=0.0)
+    if worst > PARITY:
+        raise Sim2RealError(
+            f"numpy and ONNX disagree by {worst:.2e} of the action range, {PARITY:.0e} is allowed",
+            hint="a normaliser with tiny standard deviations or huge weights loses float32's precision",
+        )
+
+
+def _version(name: str) -> str | None:
+    """Return the version of a distribution, or None where it runs uninstalled from its sources."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None

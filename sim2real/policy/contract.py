@@ -1,0 +1,142 @@
+"""What a policy expects to see and promises to send."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from sim2real.errors import Sim2RealError, UsageError
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationTerm:
+    """A part of the observation vector.
+
+    Attributes:
+        name: What it is, e.g. ``"past_actions"``.
+        units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` has none.
+        history: How many steps of it the vector holds, newest step first.
+    """
+
+    name: str
+    units: tuple[str, ...]
+    history: int = 1
+
+    def __post_init__(self) -> None:
+        """Check that the term has entries."""
+        if isinstance(self.units, str) or not self.units or self.history < 1:
+            raise UsageError(
+                f"observation term {self.name!r} needs at least one unit and one step of history, "
+                f"got units={self.units!r} and history={self.history!r}",
+                hint="units is a tuple with one unit per entry, e.g. ('rad/s',)",
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of entries of one step."""
+        return len(self.units)
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionTerm:
+    """One entry of the action vector: its name, unit and bounds [unit]."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        """Check the bounds."""
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise UsageError(
+                f"action {self.name!r} needs finite bounds with low < high, got {self.low} and {self.high}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyContract:
+    """What a robot must give a policy and may expect of it.
+
+    Attributes:
+        observation: The terms of the observation vector in their order.
+        action: The entries of the action vector in their order.
+        rate_hz: Policy steps per second.
+        delays_s: Name -> expected delay that the policy was trained with [s], e.g. ``{"sensor -> agent": 0.012}``.
+        limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
+        hashes: Name -> sha256 of what it was made from, e.g. of the log and the identified parameters.
+    """
+
+    observation: tuple[ObservationTerm, ...]
+    action: tuple[ActionTerm, ...]
+    rate_hz: float
+    delays_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that there is something to see, something to do, and a rate."""
+        if not self.observation or not self.action:
+            raise UsageError("a policy needs at least one observation term and one action")
+        for kind, terms in (("observation term", self.observation), ("action", self.action)):
+            names = [term.name for term in terms]
+            double = sorted({name for name in names if names.count(name) > 1})
+            if double:
+                raise UsageError(f"{kind} {', '.join(double)} appears more than once")
+        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise UsageError(f"rate_hz must be above 0, got {self.rate_hz}")
+        for name, delay in self.delays_s.items():
+            if not (math.isfinite(delay) and delay >= 0):
+                raise UsageError(f"delay {name!r} must be finite and at least 0 s, got {delay}")
+
+    @property
+    def observation_size(self) -> int:
+        """Number of entries of the observation vector."""
+        return sum(term.size * term.history for term in self.observation)
+
+    @property
+    def observation_names(self) -> list[str]:
+        """One name per entry, e.g. ``past_actions[1][0]``: the action before the newest of these."""
+        return [
+            f"{term.name}[{step}][{i}]"
+            for term in self.observation
+            for step in range(term.history)
+            for i in range(term.size)
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contract as plain data for JSON."""
+        data = dataclasses.asdict(self)
+        data["observation"] = [dataclasses.asdict(term) | {"size": term.size} for term in self.observation]
+        data["delays_s"], data["limits"], data["hashes"] = dict(self.delays_s), dict(self.limits), dict(self.hashes)
+        return data
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PolicyContract:
+        """Return the contract that ``to_dict`` was called on.
+
+        Raises:
+            Sim2RealError: A part is missing or of the wrong kind.
+        """
+        try:
+            return cls(
+                observation=tuple(
+                    ObservationTerm(term["name"], tuple(term["units"]), int(term["history"]))
+                    for term in data["observation"]
+                ),
+                action=tuple(
+                    ActionTerm(term["name"], term["unit"], float(term["low"]), float(term["high"]))
+                    for term in data["action"]
+                ),
+                rate_hz=float(data["rate_hz"]),
+                delays_s={name: float(delay) for name, delay in data["delays_s"].items()},
+                limits=dict(data["limits"]),
+                hashes=dict(data["hashes"]),
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise Sim2RealError(
+                f"the policy's contract is incomplete: {type(error).__name__} {error}",
+                hint="export the policy again: sim2real train",
+            ) from error

@@ -1,0 +1,1 @@
+"""Policies from graphs: the environment that PPO trains on, PPO, the policy."""

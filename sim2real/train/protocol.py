@@ -1,0 +1,116 @@
+"""What PPO trains on: one copy of an environment, as pure functions.
+
+One row is one call of ``step``. A policy step happens in the rows that are marked ``valid``; in the others the action
+is ignored and the observation is that of the policy step still to come::
+
+    row          0        1        2        3
+    valid        yes      no       yes      yes
+    observation  o0  ->   o1  ->   o1  ->   o3       o1: what the policy sees in row 2
+    reward       r0       r1       r2       r3       r1 is added to r0, without a discount
+    terminated   no       no       no       yes      row 3's observation is the final one; reset before the next row
+
+An episode ends in a row with ``terminated`` (nothing follows: its value is 0) or ``truncated`` (it was cut: what would
+have followed is worth the value of the observation returned in that row). Both at once counts as terminated.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from sim2real.errors import UsageError
+
+
+class Step(NamedTuple):
+    """The outcome of one row.
+
+    Attributes:
+        state: The environment's next state, a pytree of arrays with the structure that ``reset`` returned.
+        observation: Shape ``(O,)``: what the next policy step sees; after the last row what it would have seen.
+        reward: Shape ``()``: reward of this row.
+        terminated: Shape ``()``, bool: the episode ended by itself.
+        truncated: Shape ``()``, bool: the episode was cut.
+        valid: Shape ``()``, bool: a policy step happened in this row.
+        metrics: Name -> shape ``()``: values of the whole episode, read only in the row that ends it.
+    """
+
+    state: Any
+    observation: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    valid: jax.Array
+    metrics: dict[str, jax.Array]
+
+
+class Environment(Protocol):
+    """One copy of an environment; ``reset`` and ``step`` are pure and PPO vmaps them."""
+
+    @property
+    def observation_size(self) -> int:
+        """Number of entries O of an observation."""
+        ...
+
+    @property
+    def action_low(self) -> np.ndarray:
+        """Shape ``(A,)``: lower bounds of the action [the action's units]."""
+        ...
+
+    @property
+    def action_high(self) -> np.ndarray:
+        """Shape ``(A,)``: upper bounds of the action [the action's units]."""
+        ...
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        """Return the state at the start of an episode and the first observation, shape ``(O,)``."""
+        ...
+
+    def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
+        """Advance by one row under ``action``, shape ``(A,)``, within the bounds."""
+        ...
+
+
+def check_environment(env: Environment) -> None:
+    """Check shapes and types of everything that ``env`` returns; traces it, compiles and runs nothing.
+
+    Raises:
+        UsageError: Naming the part that differs from the protocol.
+    """
+    size, low, high = env.observation_size, np.asarray(env.action_low), np.asarray(env.action_high)
+    if low.ndim != 1 or low.shape != high.shape or not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise UsageError(
+            f"action bounds must be two finite vectors with low < high, got low={low} and high={high}",
+            hint="leave out actions that cannot move, and give every other one its physical limits",
+        )
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    start, observation = jax.eval_shape(env.reset, key)
+    step = jax.eval_shape(env.step, start, jax.ShapeDtypeStruct(low.shape, np.float32), key)
+    for name, leaf in (("reset's", observation), ("step's", step.observation)):
+        if leaf.shape != (size,):
+            raise UsageError(f"{name} observation has shape {leaf.shape}, observation_size promises ({size},)")
+    scalars = {"reward": step.reward, **{f"metrics[{name!r}]": leaf for name, leaf in step.metrics.items()}}
+    flags = {"terminated": step.terminated, "truncated": step.truncated, "valid": step.valid}
+    for name, leaf in (scalars | flags).items():
+        if leaf.shape != () or (name in flags and leaf.dtype != np.bool_):
+            kind = "a bool" if name in flags else "a number"
+            raise UsageError(f"step's {name} must be {kind} of shape (), got {leaf.dtype} of shape {leaf.shape}")
+    _check_state(start, step.state)
+
+
+def _check_state(start: Any, after: Any) -> None:
+    """Compare the states that ``reset`` and ``step`` return, leaf by leaf."""
+    if jax.tree.structure(start) != jax.tree.structure(after):
+        raise UsageError(
+            f"reset and step return states of different structure: {jax.tree.structure(start)} and "
+            f"{jax.tree.structure(after)}",
+            hint="a row may change the values in a state, not its parts",
+        )
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(start), jax.tree.leaves(after), strict=True):
+        if (a.shape, a.dtype) != (b.shape, b.dtype):
+            raise UsageError(
+                f"state{jax.tree_util.keystr(path)} is {a.dtype} of shape {a.shape} after reset and "
+                f"{b.dtype} of shape {b.shape} after step",
+                hint="give it the same type in both, e.g. jnp.float32(0) in place of 0",
+            )

@@ -1,0 +1,129 @@
+"""Playing an environment: rows to learn from, and evaluation episodes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.train.config import PPOConfig
+from sim2real.train.networks import Policy
+from sim2real.train.protocol import Environment
+
+
+class Copies(NamedTuple):
+    """N copies of an environment between two rows.
+
+    Attributes:
+        state: The environment's state; leaves of shape ``(N, ...)``.
+        observation: Shape ``(N, O)``.
+    """
+
+    state: Any
+    observation: jax.Array
+
+
+class Rows(NamedTuple):
+    """What T rows of N copies leave behind; see ``protocol.Step``.
+
+    Attributes:
+        observation: Shape ``(T, N, O)``: what the policy saw.
+        u: Shape ``(T, N, A)``: what it drew, before the action bounds.
+        reward: Shape ``(T, N)``, scaled.
+        terminated: Shape ``(T, N)``.
+        truncated: Shape ``(T, N)``.
+        valid: Shape ``(T, N)``.
+        following: Shape ``(T, N, O)``: the observation after the row, before any reset.
+    """
+
+    observation: jax.Array
+    u: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    valid: jax.Array
+    following: jax.Array
+
+
+def select(mask: jax.Array, new: Any, old: Any) -> Any:
+    """Return ``new`` where ``mask``, shape ``(N,)``, is true, else ``old``; leaves of shape ``(N, ...)``."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(pick, new, old)
+
+
+def collect(
+    env: Environment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
+) -> tuple[Copies, Rows]:
+    """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
+
+    Resets may cost more than rows, so one fresh start per copy is drawn for the whole rollout; before the first update
+    every copy takes it. First episodes are cut after staggered numbers of rows: copies that all reach the end of their
+    episodes in the same update would show the networks one phase of the task at a time.
+
+    Args:
+        env: One copy; vmapped here.
+        config: Numbers of copies and rows.
+        policy: Held for the whole rollout.
+        copies: Where the last rollout stopped; ignored if ``update`` is 0.
+        update: Shape ``()``, int32: updates so far.
+        key: Source of starts, noise and the environment's own randomness.
+    """
+    count, rows = config.num_envs, config.rollout_steps
+    key_reset, key_noise, key_step = jax.random.split(key, 3)
+    fresh = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, count)))
+    copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
+    noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
+    spread = jnp.exp(policy.log_std)
+    cut = 1 + jnp.arange(count) * config.eval_steps // count
+
+    def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
+        noise, keys, number = x
+        u = jax.vmap(lambda observation, z: policy.get_mean(observation) + spread * z)(now.observation, noise)
+        step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
+        truncated = step.truncated | (number == cut)
+        following = Copies(step.state, step.observation)
+        out = Rows(
+            observation=now.observation,
+            u=u,
+            reward=config.reward_scale * step.reward,
+            terminated=step.terminated,
+            truncated=truncated,
+            valid=step.valid,
+            following=step.observation,
+        )
+        return select(step.terminated | truncated, fresh, following), out
+
+    numbers = update * rows + jnp.arange(1, rows + 1)
+    return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
+
+
+def evaluate(env: Environment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+    """Play one episode per copy without noise and average over those that ended.
+
+    Returns:
+        ``return`` (sum of the unscaled rewards, unless the environment reports its own), the environment's metrics, and
+        ``finished``: the share of the episodes that ended within ``eval_steps`` rows. Each of shape ``()``.
+    """
+    key_reset, key_step = jax.random.split(key)
+    copies = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs)))
+    names = jax.eval_shape(lambda key: env.step(env.reset(key)[0], policy.low, key).metrics, key)
+    zeros = jnp.zeros(config.eval_envs)
+    start = (copies, jnp.ones(config.eval_envs, bool), zeros, {name: zeros for name in names})
+
+    def row(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        copies, running, total, metrics = carry
+        keys = jax.random.split(key, config.eval_envs)
+        step = jax.vmap(env.step)(copies.state, jax.vmap(policy.get_action)(copies.observation), keys)
+        ends = running & (step.terminated | step.truncated)
+        total = total + jnp.where(running, step.reward, 0.0)
+        metrics = {name: jnp.where(ends, value, metrics[name]) for name, value in step.metrics.items()}
+        return (Copies(step.state, step.observation), running & ~ends, total, metrics), None
+
+    (_, running, total, metrics), _ = jax.lax.scan(row, start, jax.random.split(key_step, config.eval_steps))
+    share = jnp.mean(jnp.where(running, 0.0, 1.0))
+    mean = {name: jnp.mean(jnp.where(running, 0.0, v)) / share for name, v in ({"return": total} | metrics).items()}
+    return mean | {"finished": share}

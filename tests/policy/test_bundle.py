@@ -1,0 +1,152 @@
+"""A policy that leaves one machine and arrives on another."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.policy import load_bundle, read_weights, save_bundle
+
+
+@pytest.fixture
+def bundle(tmp_path, weights, contract, observations):
+    return save_bundle(tmp_path / "bundle", weights, contract, observations)
+
+
+@pytest.fixture(params=["numpy", "onnx"])
+def runner(request, bundle):
+    if request.param == "onnx":
+        pytest.importorskip("onnxruntime")
+    return load_bundle(bundle, request.param)
+
+
+def test_actions_equal_the_jax_policy(runner, weights, observations):
+    import jax
+
+    from sim2real.train.networks import Policy
+
+    reference = np.asarray(jax.vmap(Policy.from_weights(weights).get_action)(observations))
+    found = np.stack([runner.act(observation) for observation in observations])
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, reference, atol=2e-6)
+    assert len(np.unique(found[:, 0])) > 100, "most actions are at their bounds: this tests too little"
+
+
+def test_actions_stay_within_the_contract(runner):
+    rng = np.random.default_rng(2)
+    actions = np.stack([runner.act(1e6 * rng.normal(size=5)) for _ in range(100)])
+    for i, term in enumerate(runner.contract.action):
+        assert actions[:, i].min() >= np.float32(term.low)
+        assert actions[:, i].max() <= np.float32(term.high)
+
+
+def test_contract_and_weights_survive(bundle, contract, weights):
+    assert load_bundle(bundle).contract == contract
+    again = read_weights(bundle)
+    assert again.keys() == weights.keys()
+    assert all(np.array_equal(again[name], weights[name]) for name in weights)
+
+
+def test_json_says_what_the_policy_was_made_for(bundle, weights):
+    about = json.loads((bundle / "policy.json").read_text())
+    assert about["format_version"] == 1
+    assert about["rate_hz"] == 50.0
+    assert about["delays_s"] == {"sensor -> agent": 0.012}
+    assert about["observation"][1] == {"name": "past_actions", "units": ["V"], "history": 2, "size": 1}
+    assert about["action"][1] == {"name": "brake", "unit": "1", "low": 0.0, "high": 0.1}
+    np.testing.assert_allclose(about["normaliser"]["std"], weights["std"])
+    assert set(about["hashes"]) == {"log", "parameters"}
+    assert about["files"]["policy.onnx"] == hashlib.sha256((bundle / "policy.onnx").read_bytes()).hexdigest()
+    assert about["versions"]["numpy"] == np.__version__
+
+
+def test_onnx_carries_the_contract(bundle, contract):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(bundle / "policy.onnx")
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    assert properties["action_names"] == "voltage,brake"
+    assert properties["observation_names"].split(",") == contract.observation_names
+    assert [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == [1, 5]
+
+
+def test_wrong_observations_are_refused(runner):
+    with pytest.raises(Sim2RealError, match=r"shape \(4,\), the policy expects \(5,\): pendulum 1x3[\s\S]*hint: "):
+        runner.act(np.zeros(4))
+    with pytest.raises(SafetyStop, match=r"observation pendulum\[0\]\[2\], past_actions\[1\]\[0\] is not finite"):
+        runner.act(np.array([0.0, 0.0, np.nan, 0.0, np.inf]))
+
+
+def test_missing_files_are_named(bundle, tmp_path):
+    with pytest.raises(Sim2RealError, match=r"holds no policy\.json[\s\S]*hint: "):
+        load_bundle(tmp_path / "nowhere")
+    (bundle / "policy.safetensors").unlink()
+    with pytest.raises(Sim2RealError, match=r"lacks policy\.safetensors"):
+        load_bundle(bundle)
+
+
+@pytest.mark.parametrize(("name", "backend"), [("policy.safetensors", "numpy"), ("policy.onnx", "onnx")])
+def test_damaged_files_are_refused(bundle, name, backend):
+    content = bytearray((bundle / name).read_bytes())
+    content[-3] ^= 1
+    (bundle / name).write_bytes(bytes(content))
+    with pytest.raises(Sim2RealError, match=rf"{name} is not what was exported[\s\S]*hint: "):
+        load_bundle(bundle, backend)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda about: about | {"format_version": 99}, "has format version 99, this sim2real reads 1"),
+        (
+            lambda about: {k: v for k, v in about.items() if k != "rate_hz"},
+            "contract is incomplete: KeyError 'rate_hz'",
+        ),
+        (
+            lambda about: about | {"observation": about["observation"][:1]},
+            r"mean has shape \(5,\), the contract asks for",
+        ),
+        (lambda about: [about], "has format version None"),
+    ],
+)
+def test_a_contract_that_does_not_fit_is_refused(bundle, change, message):
+    path = bundle / "policy.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with pytest.raises(Sim2RealError, match=message):
+        load_bundle(bundle)
+
+
+def test_a_truncated_json_is_refused(bundle):
+    path = bundle / "policy.json"
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(Sim2RealError, match=r"policy\.json is no JSON"):
+        load_bundle(bundle)
+
+
+def test_weights_must_fit_the_contract(tmp_path, weights, contract):
+    with pytest.raises(Sim2RealError, match=r"layers\.1\.kernel has shape \(3, 64\), the contract asks for \(64, 64\)"):
+        save_bundle(tmp_path / "a", weights | {"layers.1.kernel": np.zeros((3, 64))}, contract)
+    with pytest.raises(Sim2RealError, match="high bounds are"):
+        save_bundle(tmp_path / "a", weights | {"high": np.array([2.0, 0.2])}, contract)
+    with pytest.raises(Sim2RealError, match="std holds values that are not finite"):
+        save_bundle(tmp_path / "a", weights | {"std": np.full(5, np.nan)}, contract)
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_unknown_backend_is_refused(bundle):
+    with pytest.raises(UsageError, match="no policy backend 'torch'; available: numpy, onnx"):
+        load_bundle(bundle, "torch")
+
+
+def test_running_a_bundle_imports_neither_jax_nor_onnx(bundle):
+    code = f"""
+import sys, numpy
+from sim2real.policy import load_bundle
+load_bundle({str(bundle)!r}).act(numpy.zeros(5))
+print(sorted({{"jax", "flax", "onnx", "onnxruntime", "torch"}} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,164 @@
+"""Training on problems whose answer is known."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from environments import Bandit, Constant, Pendulum
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.train.config import PPOConfig
+from sim2real.train.ppo import train
+from sim2real.train.protocol import Step, check_environment
+
+SMALL = PPOConfig(
+    num_envs=64, minibatches=4, rollout_steps=16, total_steps=80_000, hidden=(32,), evaluations=4, eval_steps=20,
+    eval_envs=64, gamma=0.9, reward_scale=0.5,
+)  # fmt: skip
+TINY = dataclasses.replace(SMALL, total_steps=1, hidden=(4,), evaluations=1, epochs=1, minibatches=1)
+
+
+@pytest.fixture(scope="module")
+def bandit():
+    reports = []
+    config = dataclasses.replace(SMALL, num_seeds=2, rollout_steps=8, reward_scale=1.0)
+    return train(Bandit(), config, jax.random.key(0), reports.append), reports, config
+
+
+def test_bandit_finds_the_best_action(bandit):
+    result, _, _ = bandit
+    observations = jax.random.uniform(jax.random.key(5), (200, 2), minval=-1.0)
+    found = jax.vmap(result.best.get_action)(observations)
+    wanted = jax.vmap(Bandit().best)(observations)
+    assert result.history["success"][-1].min() > 0.95
+    assert (np.abs(found - wanted) < np.array([[0.3, 0.75]])).mean() > 0.95
+
+
+def test_progress_comes_after_every_evaluation(bandit):
+    result, reports, config = bandit
+    assert [report.evaluation for report in reports] == [1, 2, 3, 4]
+    assert [report.env_steps for report in reports] == result.env_steps.tolist()
+    assert result.env_steps[-1] >= config.total_steps
+    assert (np.diff(result.elapsed_s) > 0).all()
+    for name in ("return", "success", "finished", "policy_loss", "value_loss", "entropy", "kl", "reward"):
+        assert result.history[name].shape == (4, 2)
+    assert result.history["return"][-1].mean() > result.history["return"][0].mean()
+
+
+def test_the_best_policy_is_one_that_was_evaluated(bandit):
+    result, _, _ = bandit
+    assert result.best.log_std.shape == (2,)
+    assert result.policies.log_std.shape == (2, 2)
+    success, returns = result.history["success"], result.history["return"]
+    best = returns[:, result.best_seed][success[:, result.best_seed] == success.max()]
+    assert best.max() == returns[success == success.max()].max()
+
+
+def test_a_seed_does_not_depend_on_its_neighbours(bandit):
+    result, _, config = bandit
+    alone = train(Bandit(), dataclasses.replace(config, num_seeds=1), jax.random.key(0))
+    for name in ("return", "value_loss", "entropy"):
+        np.testing.assert_allclose(alone.history[name][:, 0], result.history[name][:, 0], rtol=2e-2, atol=1e-3)
+    assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
+
+
+def blind_value(length, window, gamma):
+    """Return the value of an episode of ``length`` rewards of 1 to a network that cannot tell its rows apart.
+
+    The mean over the rows of a rollout, up to ``window`` from its end, where the sum goes on with the value itself.
+    """
+    cells = [(left, to_end) for to_end in range(1, window + 1) for left in range(1, length + 1)]
+    rewards = np.mean([sum(gamma**i for i in range(min(cell))) for cell in cells])
+    return rewards / (1.0 - np.mean([gamma**to_end * (left > to_end) for left, to_end in cells]))
+
+
+@pytest.mark.parametrize(
+    ("env", "value"),
+    [
+        pytest.param(Constant(ends="truncated"), 10.0, id="truncation goes on for ever"),
+        pytest.param(Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step"),
+        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination"),
+    ],
+)
+def test_value_of_a_constant_reward(env, value):
+    result = train(env, dataclasses.replace(SMALL, gae_lambda=1.0), jax.random.key(0))
+    assert result.history["value"][-1, 0] == pytest.approx(value, rel=0.05)
+    assert result.history["return"][-1, 0] == pytest.approx(8.0)
+    assert result.history["policy_steps"][-1, 0] == 8.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("observation", r"entries \[0\] of the observation are not finite \(seed 0"),
+        ("reward", "the reward is not finite"),
+    ],
+)
+def test_what_is_no_number_is_named(wrong, message):
+    with pytest.raises(Sim2RealError, match=rf"{message}[\s\S]*hint: "):
+        train(Constant(nan_at=3, wrong=wrong), TINY, jax.random.key(0))
+
+
+def test_a_loss_that_is_no_number_is_named():
+    with pytest.raises(Sim2RealError, match=r"the training's .*loss.* is not finite[\s\S]*hint: lower learning_rate"):
+        train(Constant(), dataclasses.replace(TINY, learning_rate=1e38, epochs=4), jax.random.key(0))
+
+
+def test_episodes_longer_than_an_evaluation_are_an_error():
+    with pytest.raises(UsageError, match=r"no evaluation episode ended within eval_steps=20 rows[\s\S]*hint: raise"):
+        train(Constant(length=50), TINY, jax.random.key(0))
+
+
+class Broken(Constant):
+    def __init__(self, low=-1.0, **changes):
+        super().__init__()
+        self.action_low, self.changes = np.array([low], np.float32), changes
+
+    def step(self, state, action, key):
+        return super().step(state, action, key)._replace(**self.changes)
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Broken(low=np.nan), "action bounds must be two finite vectors"),
+        (Broken(low=1.0), "low < high"),
+        (Broken(observation=np.zeros(3, np.float32)), r"step's observation has shape \(3,\).*promises \(1,\)"),
+        (Broken(reward=np.zeros(1, np.float32)), r"step's reward must be a number of shape \(\)"),
+        (Broken(terminated=np.float32(0)), r"step's terminated must be a bool"),
+        (Broken(metrics={"x": np.zeros(2)}), r"step's metrics\['x'\] must be a number"),
+        (Broken(state={"row": np.int32(0)}), "states of different structure"),
+        (Broken(state={"row": np.float32(0), "acted": np.float32(0)}), r"state\['row'\] is int32 .* float32"),
+    ],
+)
+def test_a_broken_environment_is_refused_before_compiling(env, message):
+    with pytest.raises(UsageError, match=message):
+        check_environment(env)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be an integer of at least 1"),
+        ({"minibatches": 7}, r"minibatches=7 does not divide num_envs=64[\s\S]*hint: .*1, 2, 4"),
+        ({"learning_rate": -1.0}, "learning_rate must be above 0"),
+        ({"learning_rate": float("nan")}, "learning_rate must be finite"),
+        ({"gamma": 1.5}, r"gamma must lie in \[0, 1\]"),
+        ({"entropy_coef": -0.1}, "entropy_coef must be at least 0"),
+        ({"hidden": (0,)}, "hidden must hold integers"),
+    ],
+)
+def test_impossible_settings_are_refused(change, message):
+    with pytest.raises(UsageError, match=message):
+        dataclasses.replace(SMALL, **change)
+
+
+def test_step_is_public():
+    assert Step._fields == ("state", "observation", "reward", "terminated", "truncated", "valid", "metrics")
+
+
+def test_pendulum_with_delays_swings_up():
+    config = PPOConfig(total_steps=500_000, evaluations=5)
+    result = train(Pendulum(), config, jax.random.key(0))
+    assert result.history["success"].max() > 0.7
