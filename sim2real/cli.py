@@ -75,7 +75,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Sim2RealError as error:
             if os.environ.get(DEBUG):
                 traceback.print_exc()
-            print("\n".join([f"error: {error}", *getattr(error, "__notes__", [])]), file=sys.stderr)
+            # The notes name nodes and what failed on the way out; the hint stays last.
+            message, *hint = str(error).split("\n\nhint: ", 1)
+            print("\n".join([f"error: {message}", *_notes(error)]), file=sys.stderr)
+            if hint:
+                print(f"\nhint: {hint[0]}", file=sys.stderr)
             return error.exit_code
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
@@ -86,7 +90,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             if os.environ.get(DEBUG):
                 traceback.print_exc()
             reason = " ".join(str(error).split()) or "no message"
-            print(f"error: {type(error).__name__}: {reason} (traceback in {_save_traceback()})", file=sys.stderr)
+            text = f"error: {type(error).__name__}: {reason} (traceback in {_save_traceback()})"
+            print("\n".join([text, *_notes(error)]), file=sys.stderr)
             return ERROR
     return OK
 
@@ -288,6 +293,11 @@ def _summary(config: Any) -> str:
 
 def _epilog(*examples: str) -> str:
     return "\n".join(["examples", *(f"  {example}" for example in examples), "", EXIT_CODES])
+
+
+def _notes(error: BaseException) -> list[str]:
+    """Return an exception's notes, one line each."""
+    return [f"  {' '.join(note.split())}" for note in getattr(error, "__notes__", [])]
 
 
 def _save_traceback() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,10 +29,10 @@ UPRIGHT_RAD = 0.0
 
 EMBEDDED = EmulatorConfig(
     baud_rate=BAUD_RATE,
-    sensing_latency_s=0.012,
-    sensing_jitter_s=0.002,
-    actuation_latency_s=0.018,
-    actuation_jitter_s=0.003,
+    sensing_latency_s=0.020,
+    sensing_jitter_s=0.003,
+    actuation_latency_s=0.025,
+    actuation_jitter_s=0.004,
     reply_loss=0.002,
 )
 """Latencies of the embedded robot; the stages never read them, but ``--reveal`` compares with them."""
@@ -45,14 +46,17 @@ class Session:
         limits: The safety gate's limits [V].
         truth_path: Where the embedded robot writes what really happened.
         seed: Of the embedded robot's jitter and losses.
+        emulator: How the embedded robot behaves; its own seed does not count.
     """
 
-    def __init__(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> None:
+    def __init__(
+        self, port: str, limits: GateLimits, truth_path: Path, seed: int, emulator: EmulatorConfig = EMBEDDED
+    ) -> None:
         self._stack = ExitStack()
         self.embedded: EmbeddedRobot | None = None
         with ExitStack() as opening:
             if port == "embedded":
-                config = EmulatorConfig(**{**EMBEDDED.__dict__, "seed": seed})
+                config = replace(emulator, seed=seed)
                 plant = f"{Path(__file__).with_name('plant.py')}:PendulumPlant"
                 self.embedded = opening.enter_context(EmbeddedRobot(plant, config, truth_path=truth_path))
                 port = self.embedded.port

@@ -59,7 +59,7 @@ class PendulumParams(Base):
     c: Any
     max_speed: Any
     start: Any
-    smooth_rad_s: float = struct.field(pytree_node=False, default=0.05)
+    smooth_rad_s: float = struct.field(pytree_node=False, default=0.02)
 
 
 def nominal_params() -> PendulumParams:
@@ -164,8 +164,7 @@ class DelayedWorld(PendulumWorld):
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the actuation delay, where the actuator's parameters set one."""
-        delays = _delay("actuator", "actuator", graph_state)
-        return delays
+        return _delay("actuator", "actuator", graph_state)
 
 
 def _delay(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:

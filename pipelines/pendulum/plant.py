@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco  # pyright: ignore[reportAttributeAccessIssue]
+from mujoco import MjData, MjModel, mj_forward, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
 SUPPLY_V = 5.0
 """Voltage of the motor at full PWM [V]."""
@@ -60,18 +60,18 @@ class PendulumPlant:
             mass=_MASS,
             inertia=self._J - _MASS * _LENGTH**2,
         )
-        self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(self.model)
+        self.model = MjModel.from_xml_string(text)
+        self.data = MjData(self.model)
         self.data.qpos[0] = math.pi
         self._voltage: float | None = None  # None: the driver is off and the winding open
-        mujoco.mj_forward(self.model, self.data)
+        mj_forward(self.model, self.data)
 
     def advance(self, t_s: float) -> None:
         """Integrate up to ``t_s`` [s]."""
         data, step_s = self.data, self.model.opt.timestep
         for _ in range(round((t_s - data.time) / step_s)):
             data.ctrl[0] = 0.0 if self._voltage is None else self._torque_nm(self._voltage)
-            mujoco.mj_step(self.model, data)
+            mj_step(self.model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         """Set the voltage: ``goal`` is its share of the supply; with torque off the winding is open."""

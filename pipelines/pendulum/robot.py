@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from sim2real.errors import SafetyStop
 from sim2real.graph.delays import DelayDistribution, TrainableDist
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
@@ -31,6 +33,7 @@ OBSERVATION = [
 ]
 ACTION = [("voltage", "V")]
 WORLD_HZ = 100.0
+_PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 DELAY_SPREAD_S = 0.002
 """By how much delays vary between episodes of training, either way [s]."""
 EXPECTED_DELAY_S = {"sensor": 0.002, "agent": 0.002, "actuator": 0.002}
@@ -102,6 +105,30 @@ def recording_nodes(session: hardware.Session, signal: np.ndarray) -> dict[str, 
     """Return the graph on hardware that plays a signal, one voltage a step ``(N,)`` [V]."""
     agent = hardware.Excitation("agent", RATE_HZ, signal, delay=EXPECTED_DELAY_S["agent"])
     return _on_hardware(session, agent)
+
+
+def prepare(session: hardware.Session, settle_s: float) -> None:
+    """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
+
+    Raises:
+        SafetyStop: It does not hang after five pushes, or what the gate stopped.
+        HardwareLost: It does not come to rest within ``settle_s`` [s].
+    """
+    rig = session.rig
+    for _ in range(_PUSHES):
+        angle = rig.wait_until_still(settle_s).position_rad[0] - hardware.UPRIGHT_RAD
+        if np.cos(angle) < -0.95:
+            return
+        rig.start()
+        try:
+            for _ in range(round(_PUSH_S * RATE_HZ)):
+                rig.command(np.array([_PUSH_V]), 0.0, time.monotonic())
+                time.sleep(1 / RATE_HZ)
+        finally:
+            rig.stop()
+    raise SafetyStop(
+        f"the pendulum does not hang down after {_PUSHES} pushes of {_PUSH_V} V", hint="free it, or check its encoder"
+    )
 
 
 def deployment_nodes(session: hardware.Session, policy: Any) -> tuple[dict[str, BaseNode], dict[str, Any]]:

@@ -29,7 +29,7 @@ class SwingUp:
     Args:
         agent: The agent's node of the graph.
         values: Parameters to train on, by name.
-        spread: Standard deviation of each value between episodes, as a share of it; values that are not named are fixed.
+        spread: Standard deviation of each value between episodes, as a share of it; values not named are fixed.
         delay_spread_s: Delays vary by this much either way [s].
     """
 

@@ -172,7 +172,9 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any
         x = MODEL.Measurement(th=th, thdot=jnp.float32(0.0))
         zeros = jnp.zeros
         carry = (x, jnp.float32(0.0), key, zeros((2, 1)), zeros((3, 2)), zeros((4, 3)), zeros((4, 1)))
-        carry, _ = jax.lax.scan(row, carry, length=rows)
+        # As the graph does, and only for patterns of one policy step: longer ones are unrolled already.
+        unroll = 1 if jax.default_backend() == "cpu" or len(ticks) > 1 else 2
+        carry, _ = jax.lax.scan(row, carry, length=rows, unroll=unroll)
         return carry[1] + carry[5].sum() + carry[6].sum()
 
     return run

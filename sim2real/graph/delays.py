@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from statistics import NormalDist
 from typing import Any
 
 import jax
@@ -72,15 +73,31 @@ class StaticDist(DelayDistribution):
         return np.maximum(raw, 0.0)
 
     def quantile(self, q: float) -> float:
-        """Return a quantile of the clipped distribution [s]: exact for constants and Normal, else from 1e5 samples."""
+        """Return a quantile of the clipped distribution [s]; 1e5 samples decide unless it is (a mixture of) Normal."""
+        if not 0.0 < q < 1.0:
+            raise UsageError(f"a quantile lies between 0 and 1, got {q}")
         if self._constant is not None:
             return self._constant
         if type(self.dist).__name__ == "Normal":
-            from statistics import NormalDist
-
             return max(0.0, NormalDist(float(self.dist.loc), float(self.dist.scale)).inv_cdf(q))
+        components = getattr(self.dist, "components_distribution", None)
+        if components is not None and type(components).__name__ == "Normal":
+            weights = np.ravel(self.dist.mixture_distribution.probs)
+            return _quantile_of_mixture(q, weights, np.ravel(components.loc), np.ravel(components.scale))
         samples = self.sample(np.random.default_rng(0), (100_000,))
         return float(np.quantile(samples, q))
+
+
+def _quantile_of_mixture(q: float, weights: np.ndarray, loc: np.ndarray, scale: np.ndarray) -> float:
+    """Return a quantile of a mixture of Normal distributions, clipped at 0, by bisection of its distribution."""
+    parts = [NormalDist(float(m), max(float(s), 1e-12)) for m, s in zip(loc, scale, strict=True)]
+    low = min(p.inv_cdf(q) for p in parts)
+    high = max(p.inv_cdf(q) for p in parts)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = sum(float(w) * p.cdf(middle) for w, p in zip(weights, parts, strict=True)) / float(weights.sum())
+        low, high = (middle, high) if below < q else (low, middle)
+    return max(0.0, high)
 
 
 class EmpiricalDist(DelayDistribution):
@@ -114,6 +131,8 @@ class EmpiricalDist(DelayDistribution):
         return float(np.quantile(self.samples, q))
 
 
+HALF_TICK_S = 0.5e-6
+"""Half a tick of the schedule [s]."""
 _INTERPOLATIONS = ("zoh", "linear", "linear_real_only", "zoh_mean")
 
 
@@ -175,14 +194,23 @@ class TrainableDist(Base, DelayDistribution):
         """Return ``ceil(rate_out * (max - min))``, what the reader's window grows by."""
         return math.ceil(round(rate_out * (self.max - self.min), 9))
 
-    def apply(self, inputs: InputState, age_s: Any, window: int, period_s: float) -> InputState:
+    def apply(
+        self, inputs: InputState, age_s: Any, window: int, period_s: float, ts_s: Any = 0.0, skip: bool = False
+    ) -> InputState:
         """Pick or interpolate the messages that a step reads at this delay.
+
+        ``zoh`` picks the last ``window`` messages that have arrived. ``linear`` takes the newest of them, and all those
+        before, as far back as they arrived, from the line through all messages that were sent; a message that has not
+        arrived yet is the upper end of that line. There, the default output in an empty slot arrived at time 0; with
+        ``linear_real_only`` infinitely long ago, so that the first message holds until it arrives.
 
         Args:
             inputs: The widened window, leaves ``(W, ...)``.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
             window: The window that the user asked for.
             period_s: The reader's period [s]; used by ``zoh_mean`` alone.
+            ts_s: The step's start [s from the episode's start]; used by ``linear`` alone.
+            skip: Whether a message that arrives exactly at the start is left to the next step.
 
         Returns:
             The window of ``window`` messages.
@@ -191,13 +219,13 @@ class TrainableDist(Base, DelayDistribution):
         if self.interp == "zoh_mean":
             return _mean_over_period(inputs, late, window, period_s)
         width = inputs.seq.shape[0]
-        last = jnp.maximum(jnp.sum(late >= 0) - 1, window - 1)
+        # Times are whole ticks, and float32 is finer than half a tick: so a tie is a tie.
+        arrived = late > HALF_TICK_S if skip else late > -HALF_TICK_S
+        last = jnp.maximum(jnp.sum(arrived) - 1, window - 1)
         if self.interp == "zoh":
             start = last - window + 1
             return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, window), inputs)
-        if self.interp == "linear_real_only":
-            # An empty slot is as old as can be: between it and the first message the first message's value holds.
-            late = jnp.where(inputs.seq < 0, 1e9, late)
+        late = jnp.where(inputs.seq < 0, ts_s if self.interp == "linear" else 1e9, late)
         steps = jnp.arange(window - 1, -1, -1)
         newest = jnp.take(late, last)
         query = -(jnp.take(late, jnp.clip(last - steps, 0, width - 1)) - newest)
@@ -221,19 +249,21 @@ def _interpolate(inputs: InputState, knots: Any, query: Any) -> InputState:
 
 
 def _mean_over_period(inputs: InputState, late: Any, window: int, period_s: float) -> InputState:
-    """Average the held message over the reader's period: exact to first order, differentiable in the delay."""
+    """Average the held message over the reader's period: exact to first order, differentiable in the delay.
+
+    What cannot be averaged (whole numbers, seq, times) is that of the message that holds when the period begins.
+    """
     arrival = jnp.clip(-late, 0.0, period_s)  # of each message, within the tick; FIFO, so non-decreasing
     until = jnp.concatenate([arrival[1:], jnp.full(1, period_s, arrival.dtype)])
     weight = (until - arrival) / period_s
     # What held before the oldest message in the window is not known: the oldest stands for it.
     weight = weight.at[0].add(arrival[0] / period_s)
+    first = jnp.maximum(jnp.sum(late > -HALF_TICK_S) - window, 0)
+    held = jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
 
-    def one(leaf: Any) -> Any:
+    def one(leaf: Any, now: Any) -> Any:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
-            return leaf[-window:]
-        mean = jnp.tensordot(weight.astype(leaf.dtype), leaf, axes=1)
-        return leaf[-window:].at[-1].set(mean)
+            return now
+        return now.at[-1].set(jnp.tensordot(weight.astype(leaf.dtype), leaf, axes=1))
 
-    data = jax.tree_util.tree_map(one, inputs.data)
-    tail = inputs[-window:]
-    return tail.replace(data=data)  # pyright: ignore[reportAttributeAccessIssue]
+    return held.replace(data=jax.tree_util.tree_map(one, inputs.data, held.data))

@@ -68,6 +68,8 @@ class Connection:
             )
         if self.averaged and not isinstance(input_node, BaseWorld):
             raise UsageError(f"{where}: interp='zoh_mean' is for inputs of a world", hint="use 'zoh' or 'linear'")
+        if self.averaged and window > 1:
+            raise UsageError(f"{where}: interp='zoh_mean' makes one message of all, it has no window of {window}")
 
     @property
     def trainable(self) -> bool:

@@ -12,14 +12,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, Jitter, Scheduling, phase_ticks, to_ticks
-from sim2real.graph.timeline import Edge, Timeline, Vertex, search_rows
+from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
 
 
 def slot(node: BaseNode, k: np.ndarray | int, phase: int | None = None) -> np.ndarray:
     """Return when step ``k`` is scheduled [ticks] (rule 2): ``floor(k * 1e6 / rate + 0.5) + phase``."""
     offset = phase_ticks(node) if phase is None else phase
-    return np.floor(np.asarray(k) * (TICKS_PER_S / node.rate) + 0.5).astype(np.int64) + offset
+    # Multiplied before it is divided: then a half stays a half, and is rounded up.
+    return np.floor(np.asarray(k) * TICKS_PER_S / node.rate + 0.5).astype(np.int64) + offset
 
 
 def waits_for_schedule(node: BaseNode) -> bool:
@@ -157,6 +159,33 @@ def derive(
     return Timeline(vertices, edges)
 
 
+def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
+    """Apply the rules to the delays that a record shows: what comes out must be the record's own timeline.
+
+    A start that a step moved itself is taken as given. Whether the record keeps the rules is then one comparison:
+    ``rederive(episode, nodes)`` against ``Timeline.from_episode(episode, nodes)``.
+
+    Args:
+        episode: A record of all of ``nodes``.
+        nodes: The nodes that ran, by name.
+
+    Raises:
+        UsageError: When the record lacks one of them.
+    """
+    recorded = Timeline.from_episode(episode, nodes)
+    missing = [n for n in nodes if n not in recorded.vertices]
+    if missing:
+        raise UsageError(f"the record lacks {', '.join(missing)}. Available: {', '.join(recorded.vertices)}")
+    delays = {n: v.end - episode.steps[n].start[None] for n, v in recorded.vertices.items()}
+    transfers = {k: e.received - recorded.vertices[e.sender].end for k, e in recorded.edges.items()}
+    derived = derive(nodes, delays, transfers, int(NEVER))
+    moved = {n: episode.steps[n].ts_overwrite[None] for n in nodes}
+    vertices = {
+        n: Vertex(np.where(moved[n] >= 0, moved[n], v.start), v.end, v.count) for n, v in derived.vertices.items()
+    }
+    return Timeline(vertices, derived.edges)
+
+
 def consumer(connection: Connection, received: np.ndarray, reader: Vertex, sender: Vertex) -> np.ndarray:
     """Return which step consumes each message, shape ``(E, M)`` (rule 6); -1 where none does."""
     count = received.shape[1]
@@ -262,13 +291,15 @@ class _BlockingRun:
         self.vertex.start[:, k], self.vertex.end[:, k] = begin, self.previous
 
     def _last_arrival(self, connection: Connection, upto: int) -> np.ndarray:
-        """Return when the last message of this step's group arrives; 0 where the group is empty."""
+        """Return when the last message of this step's group arrives: 0 without one, never if nobody sends it."""
         key = (self.node.name, connection.name)
         ends = self.vertices[connection.output_node.name].end
         if key not in self.received:
             self.received[key] = np.zeros_like(ends)
         arrivals = self.received[key]
-        first, upto = self.done[connection.name], min(upto, ends.shape[1])
+        first = self.done[connection.name]
+        if upto > max(first, ends.shape[1]):  # a recorded sender that stops before its reader
+            return np.full(len(arrivals), NEVER)
         for m in range(first, upto):
             arrivals[:, m] = ends[:, m] + self.transfers[key][:, m]
             if m:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from zipfile import BadZipFile
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.episode import Episode
+from sim2real.graph.episode import Episode, Messages
 from sim2real.graph.node import BaseNode
 
-_FORMAT = 1
-_NEVER = np.int64(2**60)
+_FORMAT = 2
+NEVER = np.int64(2**60)
+"""When a step starts, or a message arrives, that there is none of [ticks]."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class Timeline:
                 continue
             sender = nodes[name].inputs[input_name].output_node.name
             if sender in vertices:
-                edges[name, input_name] = Edge(m.received[None], m.seq_in[None], sender)
+                edges[name, input_name] = _edge(m, len(episode.steps[sender]), len(episode.steps[name]), sender)
         return Timeline(vertices, edges)
 
     @staticmethod
@@ -113,15 +116,15 @@ class Timeline:
                 raise UsageError("only timelines of the same nodes and connections can be stacked")
         vertices = {
             n: Vertex(
-                _pad([t.vertices[n].start for t in timelines], _NEVER),
-                _pad([t.vertices[n].end for t in timelines], _NEVER),
+                _pad([t.vertices[n].start for t in timelines], NEVER),
+                _pad([t.vertices[n].end for t in timelines], NEVER),
                 np.concatenate([t.vertices[n].count for t in timelines]),
             )
             for n in first.vertices
         }
         edges = {
             k: Edge(
-                _pad([t.edges[k].received for t in timelines], _NEVER),
+                _pad([t.edges[k].received for t in timelines], NEVER),
                 _pad([t.edges[k].seq_in for t in timelines], np.int64(-1)),
                 first.edges[k].sender,
             )
@@ -131,12 +134,12 @@ class Timeline:
 
     def save(self, path: Path) -> None:
         """Write the timeline to an ``.npz`` file."""
-        arrays: dict[str, np.ndarray] = {"format": np.array(_FORMAT)}
-        for n, v in self.vertices.items():
-            arrays |= {f"vertex|{n}|start": v.start, f"vertex|{n}|end": v.end, f"vertex|{n}|count": v.count}
-        for (n, i), e in self.edges.items():
-            arrays |= {f"edge|{n}|{i}|received": e.received, f"edge|{n}|{i}|seq_in": e.seq_in}
-            arrays[f"edge|{n}|{i}|sender"] = np.array(e.sender)
+        names = {"vertices": list(self.vertices), "edges": [[*key, e.sender] for key, e in self.edges.items()]}
+        arrays = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
+        for n, v in enumerate(self.vertices.values()):
+            arrays |= {f"vertex_{n}_start": v.start, f"vertex_{n}_end": v.end, f"vertex_{n}_count": v.count}
+        for n, e in enumerate(self.edges.values()):
+            arrays |= {f"edge_{n}_received": e.received, f"edge_{n}_seq_in": e.seq_in}
         np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
@@ -146,25 +149,27 @@ class Timeline:
         Raises:
             Sim2RealError: When the file is missing or holds no timeline of this format.
         """
+        hint = "pass a file made by Timeline.save"
         try:
             with np.load(path, allow_pickle=False) as data:
                 arrays = dict(data)
-        except (OSError, ValueError) as error:
-            raise Sim2RealError(f"{path} is no timeline: {error}", hint="pass a file made by Timeline.save") from None
-        if int(arrays.pop("format", np.array(-1))) != _FORMAT:
-            raise Sim2RealError(f"{path} is no timeline of format {_FORMAT}", hint="pass a file made by Timeline.save")
-        vertices: dict[str, dict[str, np.ndarray]] = {}
-        edges: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-        for key, array in arrays.items():
-            kind, name, *rest = key.split("|")
-            if kind == "vertex":
-                vertices.setdefault(name, {})[rest[0]] = array
-            else:
-                edges.setdefault((name, rest[0]), {})[rest[1]] = array
-        return Timeline(
-            {n: Vertex(**v) for n, v in vertices.items()},
-            {k: Edge(e["received"], e["seq_in"], str(e["sender"])) for k, e in edges.items()},
-        )
+            if int(arrays["format"]) != _FORMAT:
+                raise Sim2RealError(f"{path} is a timeline of format {arrays['format']}, not {_FORMAT}", hint=hint)
+            names = json.loads(str(arrays["names"]))
+            return Timeline(
+                {
+                    name: Vertex(*(arrays[f"vertex_{n}_{field}"] for field in ("start", "end", "count")))
+                    for n, name in enumerate(names["vertices"])
+                },
+                {
+                    (node, name): Edge(arrays[f"edge_{n}_received"], arrays[f"edge_{n}_seq_in"], sender)
+                    for n, (node, name, sender) in enumerate(names["edges"])
+                },
+            )
+        except Sim2RealError:
+            raise
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            raise Sim2RealError(f"{path} is no timeline: {type(error).__name__}: {error}", hint=hint) from None
 
     def cut(
         self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None
@@ -204,9 +209,22 @@ class Timeline:
         for (n, i), e in self.edges.items():
             take = slice(firsts[e.sender], last[e.sender])
             seq_in = e.seq_in[:, take]
-            inside = (seq_in >= firsts[n]) & (seq_in < last[n])
-            edges[n, i] = Edge(e.received[:, take] - begin, np.where(inside, seq_in - firsts[n], -1), e.sender)
+            # What an earlier step consumed stands in the window of the first step of the segment.
+            inside = (seq_in >= 0) & (seq_in < last[n])
+            seq_in = np.where(inside, np.maximum(seq_in - firsts[n], 0), -1)
+            edges[n, i] = Edge(e.received[:, take] - begin, seq_in, e.sender)
         return Timeline(vertices, edges)
+
+
+def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
+    """Return an edge with one message for each of the sender's steps; a damaged record may lack some."""
+    received, seq_in = np.full(sent, NEVER), np.full(sent, -1, np.int64)
+    known = messages.seq_out < sent
+    received[messages.seq_out[known]] = messages.received[known]
+    seq_in[messages.seq_out[known]] = messages.seq_in[known]
+    # In order, always: what comes behind a message that is lost, or that no recorded step consumed, counts as lost too.
+    lost = np.logical_or.accumulate((seq_in < 0) | (seq_in >= steps))
+    return Edge(received[None], np.where(lost, -1, seq_in)[None], sender)
 
 
 def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "right"] = "left") -> np.ndarray:
@@ -214,20 +232,20 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
 
     Args:
         rows: Shape ``(E, N)``, int64, not decreasing along the last axis.
-        values: Shape ``(E, M)``, int64.
+        values: Shape ``(E, M)``, int64; all times around ``NEVER`` count as equal.
         side: As in ``np.searchsorted``.
 
     Returns:
         Shape ``(E, M)``: where each value belongs in its row.
     """
     low = min(int(rows.min(initial=0)), int(values.min(initial=0)))
-    # What is never reached stands at 2**60: cut down to just above everything that is, so that the sum fits 64 bits.
-    real = [a[a < _NEVER // 2] for a in (rows, values)]
+    # What never happens stands at NEVER: cut down to just above everything that does, so that the sum fits 64 bits.
+    real = [a[a < NEVER // 2] for a in (rows, values)]
     high = max(int(a.max(initial=0)) for a in real) + 2
     lift = (np.arange(len(rows), dtype=np.int64) * (high - low + 1))[:, None]
     flat = np.searchsorted(
         (np.minimum(rows, high) + lift).ravel(),
-        (np.minimum(values, high - (side == "right")) + lift).ravel(),
+        (np.minimum(values, high) + lift).ravel(),
         side=side,
     )
     return flat.reshape(values.shape) - np.arange(len(rows))[:, None] * rows.shape[1]

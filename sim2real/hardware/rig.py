@@ -48,7 +48,6 @@ class ServoRig:
         except BaseException:
             self.bus.close()
             raise
-        self._watchdog = threading.Thread(target=self._watch, name="sim2real:watchdog", daemon=True)
 
     def __enter__(self) -> Self:
         """Return the rig, with torque off."""
@@ -60,11 +59,12 @@ class ServoRig:
 
     def start(self) -> None:
         """Switch the torque on, with zero voltage, and start watching the age of commands."""
+        self._done.set()
+        self._done = threading.Event()  # a watcher that has not noticed yet that it is over must not go on
         self.gate.reset()
+        self._commanded_s = self._speed_rad_s = self._failure = None
         self.bus.torque(True)
-        self._done.clear()
-        self._watchdog = threading.Thread(target=self._watch, name="sim2real:watchdog", daemon=True)
-        self._watchdog.start()
+        threading.Thread(target=self._watch, args=(self._done,), name="sim2real:watchdog", daemon=True).start()
 
     def stop(self) -> None:
         """Switch the torque off; the rig can be started again."""
@@ -138,19 +138,23 @@ class ServoRig:
         if self._failure is not None:
             raise self._failure
 
-    def _watch(self) -> None:
-        """Send zero when the last command is too old; the loop that should have sent one may hang."""
+    def _watch(self, done: threading.Event) -> None:
+        """Send zero while no command has come yet, and when the last one is too old: its loop may hang."""
         timeout_s = self.gate.config.command_timeout_s
-        self._commanded_s = time.monotonic()
-        while not self._done.wait(timeout_s / 4):
+        period_s = min(timeout_s, self.bus.config.watchdog_s or timeout_s) / 5
+        while not done.is_set():
             with self._lock:
-                late = self._commanded_s is not None and time.monotonic() - self._commanded_s > timeout_s
-                if not late:
-                    continue
-                try:
-                    self._send(np.zeros(len(self._ids)))
-                except Sim2RealError as error:
-                    self._failure = error
+                if done.is_set():
                     return
-                self.timeouts += 1
-                self._commanded_s = time.monotonic()
+                waiting = self._commanded_s is None  # the graph starts up: keeps the servos' own watchdog quiet
+                late = not waiting and time.monotonic() - (self._commanded_s or 0.0) > timeout_s
+                if waiting or late:
+                    try:
+                        self._send(np.zeros(len(self._ids)))
+                    except Sim2RealError as error:
+                        self._failure = error
+                        return
+                if late:
+                    self.timeouts += 1
+                    self._commanded_s = time.monotonic()
+            done.wait(period_s)

@@ -82,15 +82,22 @@ class ParameterTable:
         """Return the table with other bounds for some parameters.
 
         Raises:
-            UsageError: When a name is unknown, or bounds of a dynamics parameter exclude its nominal value.
+            UsageError: When a name is unknown, bounds of a dynamics parameter exclude its nominal value, or those of a
+                delay go beyond the table's, for which the model's windows are made.
         """
         changed = {p.name: p for p in self.parameters}
         for name, (low, high) in bounds.items():
-            p = replace(self[name], low=float(low), high=float(high))
+            own = self[name]
+            p = replace(own, low=float(low), high=float(high))
             if p.kind == "dynamics" and not p.low <= p.nominal <= p.high:
                 raise UsageError(
                     f"the bounds [{low:g}, {high:g}] {p.unit} of {name!r} exclude its nominal value {p.nominal:.4g}",
                     hint="widen the bounds, or correct the nominal value in the pipeline",
+                )
+            if p.kind == "delay" and not own.low <= p.low < p.high <= own.high:
+                raise UsageError(
+                    f"the bounds [{low:g}, {high:g}] s of {name!r} go beyond [{own.low:g}, {own.high:g}] s",
+                    hint="narrow them, or allow longer delays with --max-delay-s",
                 )
             changed[name] = p
         return ParameterTable(tuple(changed.values()))
@@ -113,9 +120,23 @@ class ParameterTable:
         }
         return self.encode(first)
 
-    def slope(self, z: np.ndarray) -> np.ndarray:
-        """Return d value / d z of each parameter at ``z``, shape ``(P,)``."""
+    def scale(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return each parameter on its own scale, linear or logarithmic, and d scale / d z; both ``(P,)``."""
         share = 1.0 / (1.0 + np.exp(-np.asarray(z, np.float64)))
-        x = self._low + (self._high - self._low) * share
-        inner = (self._high - self._low) * share * (1 - share)
-        return np.where(self._log, np.exp(np.where(self._log, x, 0.0)) * inner, inner)
+        span = self._high - self._low
+        return self._low + span * share, span * share * (1 - share)
+
+    def unscale(self, x: np.ndarray) -> np.ndarray:
+        """Return values for points on the parameters' scales, kept within the bounds, ``(P,)``."""
+        inside = np.clip(x, self._low, self._high)
+        return np.where(self._log, np.exp(np.where(self._log, inside, 0.0)), inside)
+
+    @property
+    def span(self) -> np.ndarray:
+        """Width of the bounds on the parameters' scales, ``(P,)``."""
+        return self._high - self._low
+
+    @property
+    def logarithmic(self) -> np.ndarray:
+        """Which parameters have a logarithmic scale, ``(P,)``, bool."""
+        return self._log

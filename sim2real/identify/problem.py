@@ -75,7 +75,8 @@ class Problem:
         train: Shape ``(E,)``, bool: the segments that the loss is made of; default: all.
 
     Raises:
-        UsageError: When the log lacks a node or a field, or a segment holds no measurement.
+        Sim2RealError: When the log lacks a node or a field, or holds values that are no numbers.
+        UsageError: When a segment holds too few measurements.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Problem:
         self.table = model.parameters
         self.channels = model.channels
         nodes = model.nodes(max_delay_s)
-        _check_log(episode, nodes, model)
+        _check_log(episode, model)
         recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
         begins = [to_ticks(b) for b in begins_s]
         # Commands sent before a segment still act in it, up to the largest delay.
@@ -245,27 +246,30 @@ class Problem:
         return jnp.linalg.solve(J @ J.T + jnp.eye(n), -J @ r - shift)
 
 
-def _check_log(episode: Episode, nodes: Mapping[str, BaseNode], model: IdentifiableModel) -> None:
+def _check_log(episode: Episode, model: IdentifiableModel) -> None:
+    """Raise unless the log holds the sensor's channels and the commands, as numbers."""
     for name in (model.sensor, *model.given):
         if name not in episode.steps or not len(episode.steps[name]):
             raise Sim2RealError(
                 f"the log has no steps of node {name!r}. Available: {', '.join(episode.steps) or 'none'}",
                 hint="identify from a log that this pipeline's record stage wrote",
             )
-    for field in (f for c in model.channels for f in (c.position, c.velocity)):
-        data = episode.outputs[model.sensor].get(field)
+    wanted = [(model.sensor, f) for c in model.channels for f in (c.position, c.velocity)]
+    wanted += [(node, f) for node, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    for node, field in wanted:
+        data = episode.outputs[node].get(field)
         if data is None:
             raise Sim2RealError(
-                f"node {model.sensor!r} has no field {field!r} in this log. "
-                f"Available: {', '.join(episode.outputs[model.sensor])}"
+                f"node {node!r} has no field {field!r} in this log. Available: {', '.join(episode.outputs[node])}",
+                hint="identify from a log that this pipeline's record stage wrote",
             )
-        if not np.isfinite(data).all():
+        finite = np.isfinite(data.reshape(len(data), -1)).all(axis=1)
+        if not finite.all():
             raise Sim2RealError(
-                f"field {field!r} of node {model.sensor!r} holds values that are no numbers, the first at step "
-                f"{int(np.argmin(np.isfinite(data)))}",
-                hint="record again: a sensor that reports NaN cannot be identified from",
+                f"field {field!r} of node {node!r} holds values that are no numbers, the first in step "
+                f"{int(np.argmin(finite))}",
+                hint="record again: a NaN cannot be identified from",
             )
-    del nodes
 
 
 def _slices(rows: np.ndarray, firsts: np.ndarray, segments: Timeline, name: str) -> np.ndarray:

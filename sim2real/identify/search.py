@@ -46,7 +46,8 @@ def cma_es(
         losses: ``candidates (N, P), mean of their distribution (P,) -> (N,)``, traceable.
         start: Shape ``(P,)``: mean of the first generation.
         population: Candidates a generation.
-        generations: At most; the search ends early once ten of them have improved the loss by less than 0.01 %.
+        generations: At most, above ten rounded up to tens; the search ends early once ten of them have improved the
+            loss by less than 0.01 %.
         seed: Seed of the candidates.
         std: Standard deviation of the first generation, in ``z``.
         on_generations: Called with the number of generations done since the last call and the best loss.
@@ -82,10 +83,12 @@ def cma_es(
             on_generations(batch, float(best[-1]))
         if len(history) > 1 and history[-2][-1] - best[-1] < 1e-4 * abs(best[-1]):
             break
-    losses = np.concatenate(history)
-    if losses[-1] >= 1e9:
+    best_so_far = np.concatenate(history)
+    if best_so_far[-1] >= 1e9:
         raise Sim2RealError(
             "no candidate could be simulated: every loss is infinite or no number",
             hint="check the bounds: they may admit only unstable models",
         )
-    return SearchResult(np.asarray(state.best_solution), float(losses[-1]), losses, population * losses.size)
+    return SearchResult(
+        np.asarray(state.best_solution), float(best_so_far[-1]), best_so_far, population * best_so_far.size
+    )

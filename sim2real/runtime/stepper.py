@@ -155,6 +155,7 @@ def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Any]) -> S
         dist = wide.delay_dist
         if isinstance(dist, TrainableDist):
             bare = InputState(wide.seq, wide.ts_sent, wide.ts_recv, wide.data)
-            served = dist.apply(bare, age, node.inputs[name].window, 1.0 / node.rate)
+            c = node.inputs[name]
+            served = dist.apply(bare, age, c.window, 1.0 / node.rate, step_state.ts, c.skip)
             inputs[name] = served.replace(delay_dist=dist)  # pyright: ignore[reportAttributeAccessIssue]
     return step_state.replace(inputs=inputs)  # pyright: ignore[reportAttributeAccessIssue]

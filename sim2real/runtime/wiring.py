@@ -122,14 +122,12 @@ class _Wirer:
             ticks, boundary = 1, self._rows_of_supervisor()
             rows = int(self.timeline.vertices[self.supervisor].count.min())
         else:
-            ticks = self._ticks_per_row(lowest, highest)
-            boundary = self._boundaries(lowest, highest, ticks)
+            ticks, boundary = self._cheapest(lowest, highest)
             rows = int(self.timeline.vertices[self.world].count.min()) // ticks
         if rows < 1:
             raise UsageError("these timelines are shorter than one row", hint="draw longer timelines")
         rounds = self._rounds(boundary)
-        used = {(int(r), i, n) for i, n in enumerate(self.others) for r in np.unique(rounds[n][self._valid(n)])}
-        slots = sorted(used)
+        slots = self._slots(rounds)
         self.place = {n: (boundary[n] * 64 + rounds[n]) * len(self.nodes) + i for i, n in enumerate(self.others)}
         self.rows, self.ticks = rows, ticks
         tables = tuple(self._slot_table(n, boundary[n], rounds[n], r, i) for r, i, n in slots)
@@ -188,13 +186,31 @@ class _Wirer:
         for key in sorted(live, key=lambda k: order.index(k[0])):
             yield key, self.edges[key], self.newest[key]
 
-    def _ticks_per_row(self, lowest: dict[str, np.ndarray], highest: dict[str, np.ndarray]) -> int:
+    def _slots(self, rounds: dict[str, np.ndarray]) -> list[tuple[int, int, str]]:
+        """Return (turn, place among the nodes, node) of every slot of a boundary, in the order in which they run."""
+        return sorted((int(r), i, n) for i, n in enumerate(self.others) for r in np.unique(rounds[n][self._valid(n)]))
+
+    def _cheapest(
+        self, lowest: dict[str, np.ndarray], highest: dict[str, np.ndarray]
+    ) -> tuple[int, dict[str, np.ndarray]]:
+        """Return the ticks of a row and each step's row: of those that fit every slack, with the fewest slots a tick.
+
+        The largest that fits is not always the best: three steps in ten ticks fit rows of four ticks with two slots
+        each, and rows of three with one.
+        """
         world = self.nodes[self.world or ""]
         most = max(1, int(np.ceil(world.rate / self.nodes[self.supervisor].rate)))
-        for n in range(most, 1, -1):
-            if all((-(-lowest[o] // n) * n <= highest[o])[self._valid(o)].all() for o in self.others):
-                return n
-        return 1
+        best: tuple[float, int, dict[str, np.ndarray]] | None = None
+        for n in range(most, 0, -1):
+            if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self._valid(o)].all() for o in self.others):
+                continue
+            boundary = self._boundaries(lowest, highest, n)
+            cost = len(self._slots(self._rounds(boundary))) / n
+            if best is None or cost < best[0]:
+                best = (cost, n, boundary)
+        if best is None:
+            raise UsageError("no step of these timelines can be placed between the world's ticks")
+        return best[1], best[2]
 
     def _boundaries(
         self, lowest: dict[str, np.ndarray], highest: dict[str, np.ndarray], n: int

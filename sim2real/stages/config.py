@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import UseAppendAction
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
@@ -23,6 +25,14 @@ class GateLimits:
     """Joint speed above which the robot is stopped [rad/s]."""
     servo_watchdog_s: float = 0.1
     """The servo stops by itself when it has heard nothing for this long [s]; steps of 20 ms."""
+
+    def __post_init__(self) -> None:
+        """Check that each limit keeps something out and lets something through."""
+        for name in ("limit", "slew_per_s", "command_timeout_s", "max_speed_rad_s"):
+            if not getattr(self, name) > 0.0:
+                raise UsageError(f"gate.{name} must be above 0, got {getattr(self, name)}")
+        if not 0.02 <= self.servo_watchdog_s <= 2.54:
+            raise UsageError(f"gate.servo_watchdog_s must lie in [0.02, 2.54] s, got {self.servo_watchdog_s}")
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,7 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
+        _check_seed(self.seed)
         if not 1.0 <= self.duration_s <= 3600.0:
             raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.low_hz < self.high_hz:
@@ -79,8 +90,8 @@ class IdentifyConfig:
     """Generations of CMA-ES at most."""
     max_delay_s: float = 0.06
     """Upper bound of each identified delay [s]."""
-    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Bounds of single parameters instead of the pipeline's: --bounds NAME LOW HIGH."""
+    bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
+    """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
     seed: int = 0
     """Seed of the search."""
     reveal: bool = True
@@ -88,6 +99,7 @@ class IdentifyConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before the log is read."""
+        _check_seed(self.seed)
         if not 0.05 <= self.held_out <= 0.8:
             raise UsageError(f"held_out must lie in [0.05, 0.8], got {self.held_out}")
         if not (0.1 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 60.0):
@@ -125,6 +137,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything is compiled."""
+        _check_seed(self.seed)
         if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
             raise UsageError(
                 f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
@@ -156,7 +169,15 @@ class DeployConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
+        _check_seed(self.seed)
         if self.episodes < 1:
             raise UsageError(f"episodes must be at least 1, got {self.episodes}")
         if not 1.0 <= self.duration_s <= 3600.0:
             raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
+        if not 0.0 < self.settle_s <= 600.0:
+            raise UsageError(f"settle_s must lie in (0, 600] s, got {self.settle_s}")
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"seed must lie in [0, 2**31), got {seed}")

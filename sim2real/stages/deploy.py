@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -10,13 +11,14 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.schedule import draw
 from sim2real.hardware.truth import read_truth
 from sim2real.log.reader import read_log
 from sim2real.policy.bundle import load_bundle, read_weights
+from sim2real.runtime.clock import realtime
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
@@ -24,7 +26,7 @@ from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
 from sim2real.stages.robot import Robot, Session
 from sim2real.stages.runs import StageFolder, finished, newest, open_stage
-from sim2real.stages.session import run_episode, timing_rows
+from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 from sim2real.stages.train import computation_delays, load_parameters
 from sim2real.train.networks import Policy
 
@@ -45,7 +47,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     policy = _load_policy(robot, bundle)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir) as stage:
         logs = [stage.output(f"log_{i}", f"episode_{i}.mcap") for i in range(config.episodes)]
-        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session:
+        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
             timing = [_deploy(pipeline, robot, session, policy, log, config) for log in logs]
@@ -56,7 +58,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         simulated = _simulate(pipeline, robot, policy, stage.run_dir, read_log(logs[0]), config.duration_s)
         result = _compare(robot, real, simulated)
         stage.output("result", "result.json").write_text(json.dumps({**result, "timing": timing}, indent=1))
-        np.savez_compressed(stage.output("simulation", "simulation.npz"), **_first_episodes(simulated, len(logs)))
+        columns: dict[str, Any] = _first_episodes(simulated, len(logs))
+        np.savez_compressed(stage.output("simulation", "simulation.npz"), **columns)
         from sim2real.view.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
 
         stage.output("page", deploy_page(stage.folder).name)
@@ -71,6 +74,9 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
                 "command timeouts": timing[-1]["command_timeouts"],
             }
         )
+        if config.strict_timing:
+            for summary in timing:
+                check_deadlines(summary)
     return stage.result
 
 
@@ -78,11 +84,9 @@ def _deploy(
     pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, log: Path, config: DeployConfig
 ) -> dict[str, Any]:
     note(f"waiting for the robot to come to rest, then {config.duration_s:g} s on {config.port}")
-    session.rig.wait_until_still(config.settle_s)
+    robot.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy)
-    return run_episode(
-        pipeline, robot, session, nodes, params, log, config.duration_s, config, config.strict_timing, "deploy"
-    )
+    return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy")
 
 
 def _find_bundle(
@@ -99,9 +103,15 @@ def _load_policy(robot: Robot, bundle: Path) -> Policy:
     expected = [(name, tuple(units), history) for name, units, history in robot.OBSERVATION]
     found = [(t.name, tuple(t.units), t.history) for t in contract.observation]
     if found != expected or contract.rate_hz != robot.RATE_HZ:
-        raise UsageError(
+        raise Sim2RealError(
             f"the policy in {bundle} sees {found} at {contract.rate_hz:g} Hz, "
             f"this robot shows {expected} at {robot.RATE_HZ:g} Hz",
+            hint="train a policy for this pipeline",
+        )
+    sends = [(a.name, a.unit) for a in contract.action]
+    if sends != robot.ACTION:
+        raise Sim2RealError(
+            f"the policy in {bundle} sends {sends}, this robot takes {robot.ACTION}",
             hint="train a policy for this pipeline",
         )
     return Policy.from_weights(read_weights(bundle))
@@ -157,22 +167,30 @@ def _simulate(
 
 
 def _compare(robot: Robot, real: list[Any], simulated: list[Any] | None) -> dict[str, Any]:
-    """Return the scores of every deployment, and the gap table: means over deployments and over simulations."""
-    on_robot = [robot.score(t, s) for t, s in real]
-    in_simulation = [robot.score(t, s) for t, s in simulated or []]
+    """Return the scores of every deployment, and the gap table: means over deployments and over simulations.
+
+    None stands for a score that there is not, such as when a goal was reached that never was.
+    """
+    on_robot = [_scores(robot, t, s) for t, s in real]
+    in_simulation = [_scores(robot, t, s) for t, s in simulated or []]
     episodes = [
         {"real": score, "simulation": in_simulation[i] if i < len(in_simulation) else None}
         for i, score in enumerate(on_robot)
     ]
     gap = []
     for quantity in on_robot[0]:
-        r = float(np.nanmean([s[quantity] for s in on_robot]))
-        if not in_simulation:
-            gap.append({"quantity": quantity, "real": r, "simulation": None, "gap": None})
-            continue
-        s = float(np.nanmean([s[quantity] for s in in_simulation]))
-        gap.append({"quantity": quantity, "real": r, "simulation": s, "gap": r - s})
+        r, s = (_mean([score[quantity] for score in scores]) for scores in (on_robot, in_simulation))
+        gap.append({"quantity": quantity, "real": r, "simulation": s, "gap": None if r is None or s is None else r - s})
     return {"episodes": episodes, "gap": gap}
+
+
+def _scores(robot: Robot, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in robot.score(t_s, states).items()}
+
+
+def _mean(values: list[float | None]) -> float | None:
+    there = [v for v in values if v is not None]
+    return float(np.mean(there)) if there else None
 
 
 def _first_episodes(simulated: list[Any] | None, count: int) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import json
 import time
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,10 +18,10 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.problem import Problem
 from sim2real.identify.search import SearchResult, cma_es
-from sim2real.identify.uncertainty import Uncertainty, uncertainty
+from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.console import note, progress, table
+from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.manifest import sha256
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
@@ -51,11 +52,12 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         problem = _problem(model, episode, config)
         begin = time.monotonic()
         found = _search(problem, config)
+        found = replace(found, z=centred(problem.table, found.z))
         spread = uncertainty(problem, found.z)
         seconds = time.monotonic() - begin
         values = _floats(problem.table.decode(jnp.asarray(found.z)))
         truth = true_values(path.with_name(TRUTH), episode) if config.reveal else {}
-        samples = _predictions(problem, episode, {"identified": values, "nominal": _nominal(problem)}, config)
+        samples: dict[str, Any] = _predictions(problem, {"identified": values, "nominal": _nominal(problem)}, config)
         errors = _errors(problem, samples, config)
         document = _document(pipeline, path, problem, found, spread, values, truth, errors, seconds)
         stage.output("parameters", "parameters.json").write_text(json.dumps(document, indent=1))
@@ -67,9 +69,13 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         last = [e for e in errors if e["held_out"] and e["horizon_s"] == config.horizon_s]
         stage.summary(
             {
-                "log": str(path),
+                "log": shown(path),
                 "round trip delay": f"{1e3 * document['parameters'][-1]['estimate']:.1f} ms",
-                **{f"{e['model']}, {config.horizon_s:g} s ahead": f"{e['rmse']:.4f} (held out)" for e in last},
+                **{
+                    f"{e['model']}, {config.horizon_s:g} s ahead": f"{e['rmse']:.4f} (held out)"
+                    for e in last
+                    if e["rmse"]
+                },
                 "search": f"{found.evaluations} candidates in {seconds:.0f} s",
             }
         )
@@ -94,8 +100,12 @@ def load_log(path: Path, pipeline: Pipeline) -> Episode:
         warnings.simplefilter("always", TruncatedLogWarning)
         episode = read_log(path)
     for warning in caught:
-        note(f"warning: {warning.message}")
+        note(f"warning: {warning.message}; what is there is used")
     owner = episode.metadata.get("pipeline")
+    if owner is None:
+        raise Sim2RealError(
+            f"{path} does not say which pipeline it is of: its metadata is damaged", hint="record again"
+        )
     if owner != pipeline.name:
         raise Sim2RealError(
             f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
@@ -140,7 +150,7 @@ def _nominal(problem: Problem) -> dict[str, float]:
 
 
 def _predictions(
-    problem: Problem, episode: Episode, models: Mapping[str, Mapping[str, float]], config: IdentifyConfig
+    problem: Problem, models: Mapping[str, Mapping[str, float]], config: IdentifyConfig
 ) -> dict[str, np.ndarray]:
     """Return all samples of all segments as columns: time, segment, held_out, and per field measured and predicted."""
     held_out = ~np.isin(np.arange(problem.segments), problem.train)
@@ -163,7 +173,6 @@ def _predictions(
                 columns[f"{field}_measured"] = problem.measured(field)[at]
         for i, (field, sigma) in enumerate(fields):
             columns[f"{field}_{name}"] = columns[f"{field}_measured"] + residuals[..., i][at] * sigma
-    del episode
     return columns
 
 
@@ -181,7 +190,8 @@ def _errors(problem: Problem, samples: Mapping[str, np.ndarray], config: Identif
                 for field in (channel.position, channel.velocity):
                     measured = samples[f"{field}_measured"]
                     predicted = _held(samples, field, ahead) if model == "hold" else samples[f"{field}_{model}"]
-                    rmse[field] = float(np.sqrt(np.mean((predicted - measured)[pick] ** 2)))
+                    squares = (predicted - measured)[pick] ** 2
+                    rmse[field] = float(np.sqrt(np.mean(squares))) if squares.size else None
                 rows.append(
                     {
                         "model": model,
@@ -237,7 +247,7 @@ def _document(
     return {
         "format": 1,
         "pipeline": pipeline.name,
-        "log": {"path": str(log), "sha256": sha256(log)},
+        "log": {"path": str(log.resolve()), "sha256": sha256(log)},
         "parameters": rows,
         "covariance": {"names": list(problem.table.names), "matrix": spread.covariance.tolist()},
         "correlation": {"names": list(problem.table.names), "matrix": spread.correlation.tolist()},
@@ -252,7 +262,7 @@ def _document(
 def _round_trip(
     problem: Problem, spread: Uncertainty, values: Mapping[str, float], truth: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Return the row of the sum of all delays: what a log of a closed bus tells even where it cannot tell them apart."""
+    """Return the row of the sum of all delays: what a log tells even where it cannot tell them apart."""
     delays = [i for i, p in enumerate(problem.table) if p.kind == "delay"]
     names = [problem.table.names[i] for i in delays]
     error = float(np.sqrt(spread.covariance[np.ix_(delays, delays)].sum()))

@@ -72,12 +72,14 @@ def load_pipeline(name: str) -> Pipeline:
             f"group '{ENTRY_POINT_GROUP}'",
         )
     source = found[name]
-    if not isinstance(source, Path):
-        pipeline = source.load()
-    else:
-        pipeline = getattr(_import_folder(source), "PIPELINE", None)
+    pipeline = getattr(_import_folder(source), "PIPELINE", None) if isinstance(source, Path) else source.load()
     if not isinstance(pipeline, Pipeline):
         raise UsageError(f"pipeline {name!r} ({source}) defines no PIPELINE of type sim2real.stages.pipeline.Pipeline")
+    if pipeline.name != name:
+        raise UsageError(
+            f"pipeline {name!r} ({source}) calls itself {pipeline.name!r}",
+            hint="its folder, or its entry point, and the name in PIPELINE must be the same",
+        )
     return pipeline
 
 
@@ -94,14 +96,21 @@ def _import_folder(folder: Path) -> ModuleType:
         sys.modules[parent] = ModuleType(parent)
         sys.modules[parent].__path__ = []
     name = f"{parent}.{folder.name}"
+    path = folder / "__init__.py"
     if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(
-        name, folder / "__init__.py", submodule_search_locations=[str(folder)]
-    )
+        if sys.modules[name].__file__ == str(path):
+            return sys.modules[name]
+        # Another folder of this name, from another working directory.
+        for stale in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+            del sys.modules[stale]
+    spec = importlib.util.spec_from_file_location(name, path, submodule_search_locations=[str(folder)])
     if spec is None or spec.loader is None:
         raise UsageError(f"{folder} is no Python package")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
     return module

@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 from typing import cast
 
+from sim2real.runtime.clock import realtime
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import Robot
 from sim2real.stages.runs import StageFolder, open_stage
-from sim2real.stages.session import run_episode, timing_rows
+from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 
 LOG = "session.mcap"
 TRUTH = "truth.bin"
@@ -32,13 +33,11 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
     with open_stage(root, pipeline.name, "record", config, run_dir=run_dir) as stage:
         log = stage.output("log", LOG)
         note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
-        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session:
+        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
             nodes = robot.recording_nodes(session, signal)
-            summary = run_episode(
-                pipeline, robot, session, nodes, {}, log, config.duration_s, config, config.strict_timing, "record"
-            )
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
+            summary = run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
         stage.output("timing", "timing.json").write_text(json.dumps(summary, indent=1))
         print(table(*timing_rows(summary)))
         stage.summary(
@@ -49,4 +48,6 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
                 "commands clamped": summary["gate"]["clamped"],
             }
         )
+        if config.strict_timing:
+            check_deadlines(summary)
     return stage.result

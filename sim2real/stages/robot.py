@@ -48,6 +48,10 @@ class Robot(Protocol):
         """Open the robot, with torque off."""
         ...
 
+    def prepare(self, session: Session, settle_s: float) -> None:
+        """Bring the robot to rest where the task starts, within ``settle_s`` [s] a try; torque is off afterwards."""
+        ...
+
     def recording_nodes(self, session: Session, signal: np.ndarray) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays a signal, one command a step ``(N,)``."""
         ...

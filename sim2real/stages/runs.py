@@ -177,6 +177,8 @@ def new_run(root: Path, pipeline: str) -> Path:
             folder.mkdir(parents=True)
         except FileExistsError:
             time.sleep(0.001)  # two runs started in the same millisecond
+        except OSError as error:
+            raise _not_writable(folder, error) from error
         else:
             return folder
 
@@ -260,13 +262,22 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
 def _stage_folder(run_dir: Path, stage: str) -> Path:
     """Make a stage's folder; an earlier attempt is moved aside, under the next free number."""
     folder = run_dir / stage
-    if folder.exists():
-        number = 1
-        while (run_dir / f"{stage}.{number}").exists():
-            number += 1
-        folder.rename(run_dir / f"{stage}.{number}")
-    folder.mkdir(parents=True)
+    try:
+        if folder.exists():
+            number = 1
+            while (run_dir / f"{stage}.{number}").exists():
+                number += 1
+            folder.rename(run_dir / f"{stage}.{number}")
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise _not_writable(folder, error) from error
     return folder
+
+
+def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
+    return Sim2RealError(
+        f"cannot write the run folder {folder}: {error.strerror}", hint="name a folder of your own with --runs DIR"
+    )
 
 
 def _failure(error: BaseException) -> tuple[str, int]:
@@ -296,6 +307,6 @@ def _close(
     manifest |= {"status": status, "exit_code": code, "summary": stage._summary}
     manifest["duration_s"] = round(time.monotonic() - start, 3)
     if error is not None:
-        manifest["error"] = f"{type(error).__name__}: {error}"
+        manifest["error"] = "\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
     write_manifest(stage.folder, manifest)
     stage._result = StageFolder(stage.folder, read_manifest(stage.folder) or manifest)

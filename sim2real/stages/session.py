@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
-from sim2real.errors import ERROR, OK, DeadlineExceeded, Sim2RealError
+from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
 from sim2real.graph.base import GraphState
-from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
+from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.log.writer import McapRecorder
 from sim2real.runtime.asynchronous import AsyncGraph
@@ -27,21 +30,36 @@ _POLL_S = 0.25
 _INTERRUPTED = 130
 
 
-class _Origin:
-    """A recorder that passes everything on, and keeps when the episode started."""
+class Watch:
+    """A recorder that passes everything on, keeps when the episode started, and stops the graph on a NaN.
+
+    Args:
+        recorder: Where everything goes.
+    """
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
         self.monotonic_ns = 0
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """Keep when the episode starts."""
         self.monotonic_ns = monotonic_ns
         self._recorder.start(epoch_ns, monotonic_ns)
 
     def step(self, record: StepRecord, output: Any) -> None:
+        """Pass a step on.
+
+        Raises:
+            SafetyStop: Its output holds a NaN; the log holds the step all the same.
+        """
         self._recorder.step(record, output)
+        for name, leaf in named_leaves(output).items():
+            values = np.asarray(leaf)
+            if values.dtype.kind == "f" and np.isnan(values).any():
+                raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
 
     def message(self, record: MessageRecord) -> None:
+        """Pass the fate of a message on."""
         self._recorder.message(record)
 
 
@@ -54,45 +72,68 @@ def run_episode(
     log: Path,
     duration_s: float,
     config: Any,
-    strict: bool,
     label: str,
 ) -> dict[str, Any]:
     """Run the graph for a while and log it; whatever happens, the motors end without torque and the log readable.
+
+    Args:
+        pipeline: The robot's pipeline.
+        robot: Its parts.
+        session: The open robot.
+        nodes: The graph.
+        params: Parameters of its nodes.
+        log: The log to write.
+        duration_s: How long to run [s].
+        config: The stage's configuration, for the log's metadata.
+        label: What the progress bar says.
 
     Returns:
         The summary that also stands in the log's ``session_end``: timing by node, losses, the gate's counts.
 
     Raises:
-        DeadlineExceeded: With ``strict``, when too many steps were late; the log is complete then.
         Sim2RealError: What stopped the robot.
     """
     graph = AsyncGraph(nodes, nodes[robot.SUPERVISOR])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
     recorder = _recorder(pipeline, robot, graph, state, log, config)
-    origin = _Origin(recorder)
-    graph.recorder = origin
-    status, code = "finished", OK
+    watch = Watch(recorder)
+    graph.recorder = watch
     try:
         _drive(graph, state, duration_s, label)
+        graph.stop()
     except BaseException as error:
         session.rig.stop_quietly()
-        status, code = f"{type(error).__name__}: {error}", _exit_code(error)
-        recorder.write_event("stop", status)
-        raise
-    finally:
-        try:
+        status = f"{type(error).__name__}: {error}"
+        # What else goes wrong on the way out must not take the place of the reason.
+        with _noted(error):
             graph.stop()
-        finally:
-            summary = {**_summary(graph, session), "monotonic_ns": origin.monotonic_ns}
-            recorder.close(status, code, summary)
-    late = _late_nodes(summary["timing"])
-    if strict and late:
+        with _noted(error):
+            recorder.write_event("stop", status)
+        with _noted(error):
+            recorder.close(status, _exit_code(error), _summary(graph, session, watch))
+        raise
+    summary = _summary(graph, session, watch)
+    recorder.close("finished", OK, summary)
+    return summary
+
+
+def check_deadlines(summary: Mapping[str, Any]) -> None:
+    """Judge an episode for ``--strict-timing``, once everything about it is written.
+
+    Raises:
+        DeadlineExceeded: When more than ``LATE_SHARE`` of a node's steps were late.
+    """
+    late = [
+        f"{name} {node['overruns']} of {node['steps']}"
+        for name, node in summary["timing"].items()
+        if node["overruns"] > LATE_SHARE * node["steps"]
+    ]
+    if late:
         raise DeadlineExceeded(
             f"more than {LATE_SHARE:.0%} of the steps missed their deadline: {', '.join(late)}",
             hint="close what else runs on this machine, or lower the rate; the log is complete",
         )
-    return summary
 
 
 def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
@@ -100,8 +141,8 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
     headers = ["node", "steps", "period p50", "p99", "max [ms]", "late p50", "p99", "max [ms]", "overruns"]
     rows = []
     for name, node in summary["timing"].items():
-        times = [1e3 * q for kind in ("period_s", "lateness_s") for q in node[kind]]
-        rows.append([name, node["steps"], *[round(t, 2) for t in times], node["overruns"]])
+        times = [q if q is None else round(1e3 * q, 2) for kind in ("period_s", "lateness_s") for q in node[kind]]
+        rows.append([name, node["steps"], *times, node["overruns"]])
     return rows, headers
 
 
@@ -143,13 +184,19 @@ def _recorder(
     return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, robot.JOINTS)
 
 
-def _summary(graph: AsyncGraph, session: Session) -> dict[str, Any]:
+def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
     rig = session.rig
     timing = {
-        n: {"steps": s.steps, "period_s": list(s.period_s), "lateness_s": list(s.lateness_s), "overruns": s.overruns}
+        n: {
+            "steps": s.steps,
+            "period_s": _numbers(s.period_s),
+            "lateness_s": _numbers(s.lateness_s),
+            "overruns": s.overruns,
+        }
         for n, s in graph.statistics().items()
     }
     return {
+        "monotonic_ns": watch.monotonic_ns,
         "timing": timing,
         "transactions": rig.bus.transactions,
         "lost_replies": rig.bus.lost_replies,
@@ -159,12 +206,19 @@ def _summary(graph: AsyncGraph, session: Session) -> dict[str, Any]:
     }
 
 
-def _late_nodes(timing: Mapping[str, Any]) -> list[str]:
-    return [
-        f"{name} {node['overruns']} of {node['steps']}"
-        for name, node in timing.items()
-        if node["overruns"] > LATE_SHARE * node["steps"]
-    ]
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    """Return the values for JSON, which knows no NaN: a node that never stepped has no times."""
+    return [v if math.isfinite(v) else None for v in values]
+
+
+@contextmanager
+def _noted(error: BaseException) -> Iterator[None]:
+    """Make what fails in the block a note of the error that is on its way out."""
+    try:
+        yield
+    except Exception as other:
+        if other is not error:
+            error.add_note(f"then: {type(other).__name__}: {other}")
 
 
 def _exit_code(error: BaseException) -> int:

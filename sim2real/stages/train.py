@@ -32,7 +32,8 @@ from sim2real.train.ppo import Progress, TrainResult, train
 
 _LONGEST_GAP = 1.25
 """Timelines with a longer pause between policy steps than this many medians are drawn again."""
-_LEAST_SPREAD = 0.02
+_SPREAD = (0.02, 0.5)
+"""Smallest and largest share by which copies differ in a parameter: a log may have told nothing about one."""
 
 
 def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -86,19 +87,24 @@ def load_parameters(path: Path, pipeline: Pipeline) -> dict[str, Any]:
     Raises:
         Sim2RealError: When it is missing, damaged or of another pipeline.
     """
+    hint = f"make them with `sim2real identify {pipeline.name}`"
     try:
         document = json.loads(path.read_text())
-        rows, owner = document["parameters"], document["pipeline"]
-        for row in rows:
-            float(row["estimate"]), float(row["standard_error"])
-        float(len(document["log"]["path"]))
+        owner, log = document["pipeline"], document["log"]["path"]
+        rows = {row["name"]: row for row in document["parameters"]}
+        numbers = {n: [float(row[key]) for key in ("estimate", "standard_error")] for n, row in rows.items()}
+        kinds = {row["kind"] for row in rows.values()}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise Sim2RealError(
-            f"{path} holds no identified parameters: {type(error).__name__}: {error}",
-            hint=f"make them with `sim2real identify {pipeline.name}`",
-        ) from None
+        reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        raise Sim2RealError(f"{path} holds no identified parameters: {reason}", hint=hint) from None
     if owner != pipeline.name:
-        raise Sim2RealError(f"{path} holds parameters of pipeline {owner!r}, not of {pipeline.name!r}")
+        raise Sim2RealError(f"{path} holds parameters of pipeline {owner!r}, not of {pipeline.name!r}", hint=hint)
+    robot = cast(Robot, pipeline.load())
+    expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
+    lacking = [n for n in expected if n not in rows or not np.isfinite(numbers[n]).all()]
+    if lacking or not isinstance(log, str) or not kinds <= {"dynamics", "delay", "derived"}:
+        what = f"no finite estimate of {', '.join(lacking)}" if lacking else "a kind or a log that is none"
+        raise Sim2RealError(f"{path} is damaged: it holds {what}", hint=hint)
     return document
 
 
@@ -111,7 +117,7 @@ def model_values(
     rows = [p for p in identified["parameters"] if p["kind"] != "derived"]
     values = {p["name"]: float(p["estimate"]) for p in rows}
     spread = {
-        p["name"]: max(_LEAST_SPREAD, config.randomise * float(p["standard_error"]) / abs(float(p["estimate"])))
+        p["name"]: float(np.clip(config.randomise * p["standard_error"] / (abs(p["estimate"]) or 1e-9), *_SPREAD))
         for p in rows
         if p["kind"] == "dynamics"
     }

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from sim2real.graph.episode import Episode
 from sim2real.hardware.truth import Kind, Truth, read_truth
+from sim2real.stages.console import note
 
 _NEAR_NS = 3_000_000
 
@@ -24,31 +26,44 @@ def true_values(path: Path, episode: Episode) -> dict[str, float]:
     """
     if not path.is_file():
         return {}
-    truth = read_truth(path)
-    values = {name: float(v) for name, v in truth.parameters.items()}
+    try:
+        truth = read_truth(path)
+        values = {name: float(v) for name, v in truth.parameters.items()}
+    except (ValueError, KeyError) as error:  # nothing depends on it but a column of a table
+        note(f"warning: {path} is damaged, so nothing is compared with the truth: {error}")
+        return {}
     origin_ns = (episode.metadata["log"].get("session_end") or {}).get("monotonic_ns")
     if origin_ns is None:  # a session that crashed never wrote when it started
         return values
     sensing, actuation = sensing_delay_s(truth, episode, origin_ns), actuation_delay_s(truth, episode, origin_ns)
-    return {**values, "sensor_delay": sensing, "actuator_delay": actuation, "round_trip_delay": sensing + actuation}
+    delays = {"sensor_delay": sensing, "actuator_delay": actuation, "round_trip_delay": sensing + actuation}
+    return {**values, **{name: delay for name, delay in delays.items() if math.isfinite(delay)}}
 
 
 def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
-    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]."""
+    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any."""
     steps = episode.steps["sensor"]
     stamp = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) * 1000 + origin_ns
     samples = truth.of(Kind.SAMPLE)
+    if not len(samples):
+        return float("nan")
     nearest = np.clip(np.searchsorted(samples["t_host_ns"], stamp), 0, len(samples) - 1)
     matched = np.abs(samples["t_host_ns"][nearest] - stamp) < _NEAR_NS
-    return float(np.mean((stamp - samples["t_ns"][nearest])[matched]) * 1e-9)
+    return _mean_s((stamp - samples["t_ns"][nearest])[matched])
 
 
 def actuation_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
-    """Return the mean time from the end of the actuator's step to the command's effect on the motor [s]."""
+    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any."""
     steps = episode.steps["actuator"]
     start, end = steps.start * 1000 + origin_ns, steps.end * 1000 + origin_ns
     effects = truth.of(Kind.EFFECT)
     effects = effects[effects["t_host_ns"] > 0]
+    if not len(effects):
+        return float("nan")
     nearest = np.clip(np.searchsorted(effects["t_host_ns"], start), 0, len(effects) - 1)
     matched = (effects["t_host_ns"][nearest] >= start) & (effects["t_host_ns"][nearest] <= end)
-    return float(np.mean((effects["t_ns"][nearest] - end)[matched]) * 1e-9)
+    return _mean_s((effects["t_ns"][nearest] - end)[matched])
+
+
+def _mean_s(durations_ns: np.ndarray) -> float:
+    return float(durations_ns.mean() * 1e-9) if durations_ns.size else float("nan")

@@ -1,0 +1,213 @@
+"""Nodes that give any wrong message away, and random graphs of them."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.delays import EmpiricalDist
+from sim2real.graph.node import BaseNode, BaseWorld, Jitter, Scheduling
+
+_PRIME, _OFFSET, _MASK = 16777619, 12345, 2**32 - 1
+
+
+@struct.dataclass
+class Value(Base):
+    """A message with one number."""
+
+    x: Any
+
+
+def mix(a: int, b: int) -> int:
+    """Mix two 32-bit integers; the order of the mixed values matters."""
+    return ((a ^ (b & _MASK)) * _PRIME + _OFFSET) & _MASK
+
+
+def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) -> tuple[int, int]:
+    """Return state and output after a step of a hash node.
+
+    Args:
+        state: The state before.
+        seq: Which step it is.
+        windows: For each input, in the order of their names: seq and value of each message, oldest first.
+    """
+    acc = mix(state, seq)
+    for seqs, values in windows:
+        for s, x in zip(seqs, values, strict=True):
+            acc = mix(mix(acc, s), x)
+    return acc, mix(acc, 7)
+
+
+class HashInPython(BaseNode):
+    """Its state depends on everything that it was given: every slot of every window, in order."""
+
+    jittable = False
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return a number made of the node's name."""
+        del rng, graph_state
+        return jnp.uint32(zlib.crc32(self.name.encode()))
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
+        """Return a random number: readers must all get the same one."""
+        del graph_state
+        return Value(x=jax.random.bits(rng, (), jnp.uint32))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Mix everything into the state."""
+        windows = [
+            ([int(s) for s in np.asarray(w.seq)], [int(x) for x in np.asarray(w.data.x)])
+            for _, w in sorted(step_state.inputs.items())
+        ]
+        acc, out = hash_step(int(step_state.state), int(step_state.seq), windows)
+        return _replace(step_state, state=np.uint32(acc)), Value(x=np.uint32(out))
+
+
+class HashInJax(HashInPython):
+    """The same in JAX."""
+
+    jittable = True
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Mix everything into the state."""
+
+        def mixed(a: Any, b: Any) -> Any:
+            return (a ^ jnp.asarray(b).astype(jnp.uint32)) * jnp.uint32(_PRIME) + jnp.uint32(_OFFSET)
+
+        acc = mixed(jnp.asarray(step_state.state), step_state.seq)
+        for name in sorted(step_state.inputs):
+            window = step_state.inputs[name]
+            for i in range(window.seq.shape[0]):
+                acc = mixed(mixed(acc, window.seq[i]), window.data.x[i])
+        return _replace(step_state, state=acc), Value(x=mixed(acc, jnp.uint32(7)))
+
+
+class HashWorldInPython(HashInPython, BaseWorld):
+    """A hash node on a world's grid."""
+
+
+class HashWorldInJax(HashInJax, BaseWorld):
+    """A hash node on a world's grid, in JAX."""
+
+
+class Contraction(BaseNode):
+    """Moves halfway to the mean of what it sees: float messages whose rounding errors die out."""
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return a random number."""
+        del graph_state
+        return jax.random.normal(rng)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
+        """Return a random number."""
+        del graph_state
+        return Value(x=jax.random.normal(rng))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Move, under a push that differs from step to step."""
+        seen = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
+        target = sum(seen) / max(len(seen), 1)
+        state = 0.5 * step_state.state + 0.4 * target + jnp.sin(1.3 * step_state.seq)
+        return _replace(step_state, state=state), Value(x=jnp.tanh(state))
+
+
+class ContractingWorld(Contraction, BaseWorld):
+    """A contraction on a world's grid."""
+
+
+class MakeNode(Protocol):
+    """Makes a node, or a world, of a random graph."""
+
+    def __call__(self, name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+        """Return the node; ``options`` are those of ``BaseNode``, none for a world."""
+        ...
+
+
+def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+    """Return a hash node or world in plain Python."""
+    return HashWorldInPython(name, rate) if world else HashInPython(name, rate, **options)
+
+
+def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+    """Return a hash node or world in JAX."""
+    return HashWorldInJax(name, rate) if world else HashInJax(name, rate, **options)
+
+
+def contracting_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+    """Return a contracting node or world."""
+    return ContractingWorld(name, rate) if world else Contraction(name, rate, **options)
+
+
+def random_graph(seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node) -> Any:
+    """Return nodes by name with random rates, delays and connections; the first is a fine supervisor.
+
+    Delays are multiples of 0.1 ms and often as expected, so ties happen; some exceed a period by far, so steps
+    overrun and messages come in bursts. Every kind of option occurs; loops run through skipped connections.
+
+    Args:
+        seed: Of everything that is random.
+        size: Nodes that are no worlds, 1 to 6; default: random.
+        worlds: Worlds, 0 to 2; default: random.
+        make: Makes the nodes.
+    """
+    rng = np.random.default_rng(seed)
+    size = int(rng.integers(2, 5)) if size is None else size
+    worlds = int(rng.choice([0, 1, 1, 2])) if worlds is None else worlds
+    nodes = []
+    for i in range(size):
+        rate = float(rng.choice([20, 30, 40, 50, 64, 100]))
+        scheduling = [Scheduling.FREQUENCY, Scheduling.PHASE][int(rng.integers(2))]
+        nodes.append(make(f"n{i}", rate, False, scheduling=scheduling, **_delays(rng, rate, at_least=1e-4)))
+    nodes += [make(f"world{i}", float(rng.choice([50, 100, 125])), True) for i in range(worlds)]
+    for i, reader in enumerate(nodes):
+        for j, sender in enumerate(nodes):
+            if i != j and rng.random() < 0.55:
+                connect_at_random(rng, reader, sender, skip=j > i)
+        if any(c.blocking for c in reader.inputs.values()):
+            reader.advance = bool(rng.random() < 0.4)
+    return {n.name: n for n in nodes}
+
+
+def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNode, skip: bool) -> None:
+    """Connect two nodes with random options, now and then twice.
+
+    Args:
+        rng: Source of the options.
+        reader: A world's inputs never block: its tick waits for nobody.
+        sender: Any node.
+        skip: Whether the connection must be skipped; otherwise it sometimes is.
+    """
+    for name in (None, f"{sender.name} again")[: 2 if rng.random() < 0.15 else 1]:
+        reader.connect(
+            sender,
+            blocking=not isinstance(reader, BaseWorld) and bool(rng.random() < 0.4),
+            window=int(rng.integers(1, 4)),
+            skip=skip or bool(rng.random() < 0.2),
+            jitter=[Jitter.LATEST, Jitter.BUFFER][int(rng.random() < 0.3)],
+            name=name,
+            **_delays(rng, sender.rate, at_least=0.0),
+        )
+
+
+def _delays(rng: np.random.Generator, rate: float, at_least: float) -> dict[str, Any]:
+    """Return delays [s]: as expected, or jittery, or with hiccups of several periods."""
+    kind = rng.random()
+    scale = float(rng.uniform(0.05, 0.4)) / rate
+    if kind < 0.35:
+        fixed = max(at_least, round(scale, 4))
+        return {"delay_dist": fixed}
+    samples = rng.exponential(scale, 200)
+    if kind > 0.8:
+        samples[rng.random(200) < 0.05] += float(rng.uniform(1.0, 4.0)) / rate
+    samples = np.maximum(samples.round(4), at_least)
+    return {"delay_dist": EmpiricalDist(samples, block=int(rng.integers(1, 4))), "delay": round(scale, 4)}
+
+
+def _replace(step_state: StepState, /, **fields: Any) -> StepState:
+    return step_state.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,159 @@
+"""The timing rules by the letter: Python integers, one message at a time. Slow, and independent of schedule.py."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from fractions import Fraction
+from functools import cached_property
+
+from sim2real.graph.node import BaseNode, Connection, Jitter, Scheduling
+from sim2real.graph.testing.nodes import hash_step, mix
+from sim2real.graph.timeline import Timeline
+
+
+class Reference:
+    """One episode of a graph, worked out from nothing but its delays.
+
+    Args:
+        nodes: The nodes by name.
+        timeline: Where the delays are taken from: computation, communication, and how many steps there are.
+        episode: Which of its episodes.
+
+    Attributes:
+        starts: Node -> start of each step [ticks].
+        ends: Node -> end of each step [ticks].
+        seq_in: (node, input) -> which step consumes each message; -1 if none does.
+    """
+
+    def __init__(self, nodes: Mapping[str, BaseNode], timeline: Timeline, episode: int = 0) -> None:
+        self.nodes = nodes
+        self.count = {n: int(timeline.vertices[n].count[episode]) for n in nodes}
+        vertices = {n: timeline.vertices[n] for n in nodes}
+        self.busy = {n: [int(d) for d in (v.end - v.start)[episode]] for n, v in vertices.items()}
+        self.travel = {
+            (n, i): [int(d) for d in (e.received - vertices[e.sender].end)[episode]]
+            for (n, i), e in timeline.edges.items()
+        }
+        self.starts: dict[str, list[int]] = {n: [] for n in nodes}
+        self.ends: dict[str, list[int]] = {n: [] for n in nodes}
+        self._received: dict[tuple[str, str], list[int]] = {key: [] for key in self.travel}
+        self._drift = dict.fromkeys(nodes, 0)
+        while any([self._advance(n) for n in nodes]):
+            pass
+        self.seq_in = {(n, i): self._consumers(c) for n, node in nodes.items() for i, c in node.inputs.items()}
+
+    def phase(self, node: BaseNode) -> int:
+        """Rule 1 [ticks]."""
+        return max([0, *(self.arrival(c) for c in node.inputs.values() if not c.skip)])
+
+    def arrival(self, c: Connection) -> int:
+        """Rule 1, of a connection [ticks]."""
+        return self.phase(c.output_node) + round(c.output_node.delay * 1e6) + round(c.delay * 1e6)
+
+    def slot(self, node: BaseNode, k: int) -> int:
+        """Rule 2 [ticks]."""
+        return math.floor(Fraction(k * 1_000_000) / Fraction(node.rate) + Fraction(1, 2)) + self._phases[node.name]
+
+    def group(self, c: Connection, k: int) -> list[int]:
+        """Rule 6, blocking: the messages that step ``k`` waits for."""
+        out, high = [], self.slot(c.input_node, k)
+        low = self.slot(c.input_node, k - 1) if k else None
+        for i in range(len(self.busy[c.output_node.name])):
+            s = self.slot(c.output_node, i)
+            if s > high:
+                break
+            after = low is None or (s >= low if c.skip else s > low)
+            if after and not (c.skip and s == high):
+                out.append(i)
+        return out
+
+    def received(self, c: Connection, i: int) -> int:
+        """Rule 5 [ticks]."""
+        key = c.input_node.name, c.name
+        known = self._received[key]
+        while len(known) <= i:
+            m = len(known)
+            direct = self.ends[c.output_node.name][m] + self.travel[key][m]
+            known.append(max([direct, *known[-1:]]))
+        return known[i]
+
+    def window(self, node: str, name: str, k: int, width: int) -> list[int]:
+        """Rule 7: the messages that step ``k`` sees on an input, oldest first; -1 in empty slots."""
+        seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k][-width:]
+        return [-1] * (width - len(seen)) + seen
+
+    def hashes(self, states: Mapping[str, int], outputs: Mapping[str, int]) -> dict[str, list[int]]:
+        """Return the state of each hash node after each of its steps.
+
+        Args:
+            states: Initial states by node.
+            outputs: Default outputs by node.
+        """
+        made: dict[str, list[int]] = {n: [] for n in self.nodes}
+        order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
+        while order:  # of steps at one time, those first that need none of the others
+            waiting = []
+            for t, k, n in order:
+                windows = []
+                for i, c in sorted(self.nodes[n].inputs.items()):
+                    seqs, sender = self.window(n, i, k, c.window), c.output_node.name
+                    if seqs[-1] >= len(made[sender]) or len(made[n]) < k:
+                        break
+                    windows.append((seqs, [mix(made[sender][m], 7) if m >= 0 else outputs[sender] for m in seqs]))
+                else:
+                    made[n].append(hash_step(made[n][-1] if k else states[n], k, windows)[0])
+                    continue
+                waiting.append((t, k, n))
+            if len(waiting) == len(order):
+                raise ValueError(f"steps wait for each other: {waiting[:4]}")
+            order = waiting
+        return made
+
+    @cached_property
+    def _phases(self) -> dict[str, int]:
+        return {n: self.phase(node) for n, node in self.nodes.items()}
+
+    def _advance(self, name: str) -> bool:
+        node, starts, ends = self.nodes[name], self.starts[name], self.ends[name]
+        k, blocked = len(starts), 0
+        if k == len(self.busy[name]):
+            return False
+        for c in node.inputs.values():
+            if c.blocking:
+                group = self.group(c, k)
+                if group and group[-1] >= len(self.ends[c.output_node.name]):
+                    return False
+                if group:
+                    blocked = max(blocked, self.received(c, group[-1]))
+        previous = ends[-1] if ends else 0
+        begin = max(previous, blocked)
+        if not (node.advance and all(c.blocking for c in node.inputs.values())):
+            begin = max(begin, self.slot(node, k) + self._drift[name])
+        if node.scheduling is Scheduling.FREQUENCY:
+            self._drift[name] += max(0, previous - self.slot(node, k) - self._drift[name])
+        starts.append(begin)
+        ends.append(begin + self.busy[name][k])
+        return True
+
+    def _consumers(self, c: Connection) -> list[int]:
+        name = c.input_node.name
+        sent = self.count[c.output_node.name]
+        out, head = [-1] * sent, 0
+        for k in range(self.count[name]):
+            group = self.group(c, k) if c.blocking else []
+            while head < sent and (head in group if c.blocking else self._takes(c, k, head)):
+                out[head] = k
+                head += 1
+        return out
+
+    def _takes(self, c: Connection, k: int, message: int) -> bool:
+        """Rule 6, non-blocking: whether step ``k`` takes this message, if it has taken those before."""
+        t, r = self.starts[c.input_node.name][k], self.received(c, message)
+        if c.averaged:
+            return r < t + round(c.input_node.delay * 1e6)
+        arrived = r < t if c.skip else r <= t
+        if c.jitter is Jitter.BUFFER:
+            nominal = self.slot(c.output_node, message) - self._phases[c.output_node.name] + self.arrival(c)
+            arrived = arrived and nominal <= t
+        return arrived

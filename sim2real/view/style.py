@@ -1,0 +1,149 @@
+"""How every figure looks, and how it becomes a string of SVG that follows the page's colours."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, cast
+
+import matplotlib as mpl
+from matplotlib.artist import Artist
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+# The page may redefine each colour, for dark mode and for print; alone, a figure shows the value that stands here.
+# The hues are those of Okabe and Ito, darkened until text in them is readable on white.
+INK, MUTED, GRID, SHADE = "#1b2430", "#5c6875", "#d9dfe6", "#eef2f6"
+BLUE, ORANGE, GREEN, PURPLE = "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
+_VARIABLES = {
+    INK: "ink", MUTED: "muted", GRID: "grid", SHADE: "shade",
+    BLUE: "blue", ORANGE: "orange", GREEN: "green", PURPLE: "purple",
+}  # fmt: skip
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
+DASHES = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+WIDTH_IN = 10.5
+
+_RC: dict[str, Any] = {
+    "svg.fonttype": "none",  # text stays text: it can be searched, read aloud and copied
+    "svg.hashsalt": "sim2real",
+    "text.parse_math": False,  # a $ in a name is a $
+    "font.family": "sans-serif",
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelsize": 8.5,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "axes.xmargin": 0.01,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 2.8,
+    "lines.linewidth": 1.3,
+    "lines.solid_capstyle": "round",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.2,
+    "hatch.linewidth": 0.6,
+}
+
+
+@dataclass(frozen=True)
+class Role:
+    """How the line of one voice looks, in every figure the same."""
+
+    color: str
+    dash: Any
+    width: float
+    order: float
+
+
+ROLES = {
+    "measured": Role(INK, DASHES[0], 1.5, 3.0),
+    "identified": Role(BLUE, DASHES[1], 1.5, 4.0),
+    "nominal": Role(ORANGE, DASHES[2], 1.4, 2.5),
+    "truth": Role(GREEN, DASHES[3], 1.3, 2.0),
+    "command": Role(PURPLE, DASHES[0], 1.0, 3.0),
+}
+"""The robot is drawn solid and dark; what a model says is dashed; what is only known in hindsight is thin."""
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Make figures and save them inside of this."""
+    with mpl.rc_context(cast(Any, _RC)):
+        yield
+
+
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """Return an empty figure that lays itself out."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasSVG(figure)
+    return figure
+
+
+def to_svg(figure: Figure, name: str, label: str) -> str:
+    """Return a figure as one ``<svg>`` element, for a page or, as it is, for a file.
+
+    Args:
+        figure: The figure; made inside of ``styled()``.
+        name: Prefix of all ids in it, so that several figures fit in one page.
+        label: What it shows, in words, for who cannot see it.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].strip()  # without XML declaration and DOCTYPE: neither belongs inside HTML
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1)
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)
+    return re.sub(r"(fill|stroke): (#[0-9a-f]{6})", _as_variable, text)
+
+
+def legend_above(figure: Figure, entries: Sequence[Artist]) -> None:
+    """Put one legend, in a row, above all panels of a figure."""
+    if entries:
+        figure.legend(handles=entries, loc="outside upper left", ncols=min(6, len(entries)), borderaxespad=0.2)
+
+
+def plain_log(axis: Axis) -> None:
+    """Number a logarithmic axis without powers: as they are not parsed, they would stand there as source."""
+    axis.set_major_locator(LogLocator(base=10, subs=(1.0,)))
+    low, high = axis.get_view_interval()
+    if high < 30 * low:
+        axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def _as_variable(match: re.Match[str]) -> str:
+    kind, color = match.groups()
+    name = _VARIABLES.get(color)
+    return f"{kind}: var(--{name}, {color})" if name else match.group(0)

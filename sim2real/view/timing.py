@@ -1,0 +1,164 @@
+"""Figures and numbers about when things happened: periods, lateness, and who waited for whom."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.view import style
+from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
+
+_PERIODS_SHOWN = 4.5
+
+
+@dataclass(frozen=True)
+class Times:
+    """What one node's steps took, each ``(N,)`` [ms]; ``period`` has one entry less.
+
+    Attributes:
+        period: From one awakening to the next.
+        lateness: From the start that the rules give to the awakening.
+        computation: From the awakening to the end.
+    """
+
+    period: np.ndarray
+    lateness: np.ndarray
+    computation: np.ndarray
+
+
+def times(steps: Steps) -> Times:
+    """Return a node's times."""
+    return Times(np.diff(steps.woken) / 1e3, (steps.woken - steps.start) / 1e3, (steps.end - steps.woken) / 1e3)
+
+
+def in_order(episode: Episode) -> list[str]:
+    """Return the nodes, senders before their readers where the graph has no loop."""
+    senders: Mapping[str, set[str]] = {
+        n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
+    }
+    order: list[str] = []
+    left = list(episode.steps)
+    while left:
+        ready = [n for n in left if not (senders.get(n, set()) & set(left) - {n})] or left
+        order.append(ready[0])
+        left.remove(ready[0])
+    return order
+
+
+def slowest_period_s(episode: Episode) -> float:
+    """Return the longest of the nodes' median periods [s]."""
+    periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
+    return max(periods, default=1e6 * episode.duration_s) / 1e6
+
+
+def histograms(episode: Episode, name: str) -> str:
+    """Draw how period, lateness and computation are distributed, a row for each node."""
+    nodes = [n for n in in_order(episode) if len(episode.steps[n]) > 1]
+    with styled():
+        figure = new_figure(0.6 + 1.35 * len(nodes))
+        grid = figure.subplots(len(nodes), 3, squeeze=False, sharex="col", sharey="row")
+        limits = []
+        for column, quantity in enumerate(("period", "lateness", "computation")):
+            values = np.concatenate([getattr(times(episode.steps[n]), quantity) for n in nodes])
+            limits.append((min(0.0, values.min()) if column else values.min(), max(values.max(), 1e-3)))
+        for node, row in zip(nodes, grid, strict=True):
+            measured = times(episode.steps[node])
+            row[0].set_ylabel(f"{node}\nsteps")
+            for axes, values, span in zip(
+                row, (measured.period, measured.lateness, measured.computation), limits, strict=True
+            ):
+                _histogram(axes, values, span)
+        for axes, title in zip(grid[0], ("Period", "Lateness of awakening", "Computation"), strict=True):
+            axes.annotate(title, (0, 1.22), xycoords="axes fraction", fontweight="bold", fontsize=9, color=INK)
+        for axes in grid[-1]:
+            axes.set_xlabel("[ms]")
+        return to_svg(figure, name, f"Histograms of period, lateness and computation of {', '.join(nodes)}")
+
+
+def schedule(episode: Episode, name: str) -> str:
+    """Draw who computed and who waited: in the middle of the episode, and around the step that woke latest."""
+    nodes = [n for n in in_order(episode) if len(episode.steps[n])]
+    length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
+    late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
+    worst = max(nodes, key=lambda n: late[n].max())
+    moment = int(episode.steps[worst].start[late[worst].argmax()])
+    middle = int(1e6 * episode.duration_s / 2)
+    with styled():
+        figure = new_figure(1.15 + 0.42 * len(nodes))
+        titles = (f"At {middle / 1e6:.1f} s", f"Around the latest awakening: {worst}, {late[worst].max() / 1e3:.1f} ms")
+        grid = figure.subplots(1, 2, sharey=True)
+        for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
+            for row, node in enumerate(nodes):
+                _bars(axes, episode.steps[node], row, begin, begin + length)
+            _arrows(axes, episode, nodes, begin, begin + length)
+            axes.set(title=title, xlabel=f"time since {begin / 1e6:.3f} s [ms]", xlim=(0, length / 1e3))
+            axes.set_yticks(range(len(nodes)), nodes)
+            axes.grid(False, axis="y")
+            axes.tick_params(axis="y", length=0)
+        grid[0].set_ylim(len(nodes) - 0.5, -0.6)
+        entries = [
+            Patch(facecolor=BLUE, label="computing"),
+            Patch(facecolor=ORANGE, label="late awakening"),
+            Patch(facecolor="none", edgecolor=MUTED, hatch="////", label="waiting for its inputs"),
+        ]
+        style.legend_above(figure, entries)
+        return to_svg(figure, name, "Excerpts of the schedule: when each node waited and computed, and its messages")
+
+
+def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float]) -> None:
+    axes.hist(values, bins=60, range=span, histtype="stepfilled", facecolor=BLUE, alpha=0.35)
+    axes.hist(values, bins=60, range=span, histtype="step", color=BLUE, lw=1.0)
+    axes.set_yscale("log")
+    axes.set_ylim(0.6, 2 * len(values))
+    style.plain_log(axes.yaxis)
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    p50, p99 = np.quantile(values, [0.5, 0.99])
+    axes.axvline(p99, color=INK, lw=0.9, ls=style.DASHES[1])
+    axes.set_title(f"p50 {p50:.2f} · p99 {p99:.2f} · max {values.max():.2f}", fontweight="normal", fontsize=8)
+
+
+def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
+    """Draw the steps of one node that overlap an interval [us]."""
+    # A step is due before the last one has ended when that one overran: it waits from there on.
+    free = np.concatenate([[0], steps.end[:-1]])
+    due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
+    near = (steps.end >= begin) & (due_at <= end)
+    due, start, woken, done = ((values[near] - begin) / 1e3 for values in (due_at, steps.start, steps.woken, steps.end))
+    kinds: tuple[tuple[np.ndarray, np.ndarray, dict[str, Any]], ...] = (
+        (due, start, {"facecolor": "none", "edgecolor": MUTED, "hatch": "////", "lw": 0.6}),
+        (start, woken, {"facecolor": ORANGE}),
+        (woken, done, {"facecolor": BLUE, "edgecolor": BLUE, "lw": 0.8}),  # the edge: a short step stays visible
+    )
+    for first, last, look in kinds:
+        wide = last > first
+        axes.broken_barh(list(zip(first[wide], (last - first)[wide], strict=True)), (row - 0.28, 0.56), **look)
+
+
+def _arrows(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: float) -> None:
+    """Draw the messages between an interval's steps, from the sender's end to the reader's start."""
+    graph = episode.metadata.get("graph", {})
+    for (node, given), messages in episode.messages.items():
+        sender = graph.get(node, {}).get("inputs", {}).get(given, {}).get("from")
+        if sender not in nodes or node not in nodes:
+            continue
+        read = (messages.sent >= begin) & (messages.received <= end) & (messages.seq_in >= 0)
+        rows = nodes.index(sender), nodes.index(node)
+        down = 1 if rows[1] > rows[0] else -1
+        first = int(episode.metadata.get("log", {}).get("first_seq", {}).get(node, 0))
+        starts = episode.steps[node].start
+        for sent, seq_in in zip(messages.sent[read], messages.seq_in[read] - first, strict=True):
+            if not 0 <= seq_in < len(starts) or starts[seq_in] > end:
+                continue
+            axes.annotate(
+                "",
+                ((starts[seq_in] - begin) / 1e3, rows[1] - 0.28 * down),
+                ((sent - begin) / 1e3, rows[0] + 0.28 * down),
+                arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
+            )

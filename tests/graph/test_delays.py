@@ -1,0 +1,207 @@
+"""Delay distributions in numpy, and trainable delays against a slow implementation of what they promise."""
+
+import distrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sim2real.errors import UsageError
+from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, InputState, Jitter, StaticDist, TrainableDist
+
+EMPTY = 1e6
+
+
+def generator():
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("dist", [0.01, 0, distrax.Deterministic(0.01), distrax.Normal(0.01, 0.0)])
+def test_constants(dist):
+    d = StaticDist(dist)
+    expected = 0 if dist == 0 else 0.01
+    np.testing.assert_allclose(d.sample(generator(), (2, 3)), expected, rtol=1e-6)
+    assert d.quantile(0.5) == pytest.approx(expected)
+    assert d.window(100.0) == 0
+
+
+def test_samples_are_clipped_at_0_and_quantiles_follow():
+    d = StaticDist(distrax.Normal(0.0, 1.0))
+    samples = d.sample(generator(), (4, 50_000))
+    assert samples.min() == 0.0
+    assert samples.mean() == pytest.approx(1 / np.sqrt(2 * np.pi), abs=0.01)
+    assert d.quantile(0.3) == 0.0
+    assert d.quantile(0.99) == pytest.approx(stats.norm.ppf(0.99))
+    assert BaseNode("n", 10, delay_dist=distrax.Normal(0.01, 0.003)).delay == pytest.approx(0.016979, abs=1e-6)
+
+
+@pytest.mark.parametrize("q", [0.001, 0.2, 0.5, 0.8, 0.99])
+def test_quantiles_of_mixtures(q):
+    weights, loc, scale = [0.7, 0.3], [0.005, 0.012], [0.002, 0.001]
+    mixture = distrax.MixtureSameFamily(
+        distrax.Categorical(probs=jnp.array(weights)), distrax.Normal(jnp.array(loc), jnp.array(scale))
+    )
+    d = StaticDist(mixture)
+    x = d.quantile(q)
+    share = sum(w * stats.norm.cdf(x, m, s) for w, m, s in zip(weights, loc, scale, strict=True))
+    assert x == 0.0 if q == 0.001 else share == pytest.approx(q, abs=1e-6)
+    samples = d.sample(generator(), (20_000,))
+    assert samples.min() >= 0
+    assert np.mean(samples <= x + 1e-9) == pytest.approx(max(q, stats.norm.cdf(0, loc[0], scale[0]) * 0.7), abs=0.02)
+
+
+def test_other_distributions_answer_from_samples():
+    d = StaticDist(distrax.Gamma(2.0, 100.0))
+    assert d.quantile(0.9) == pytest.approx(stats.gamma.ppf(0.9, 2.0, scale=0.01), rel=0.03)
+
+
+@pytest.mark.parametrize("bad", [-0.1, float("nan"), "0.1", distrax.Deterministic(-1.0)])
+def test_what_is_no_delay_is_refused(bad):
+    with pytest.raises(UsageError):
+        StaticDist(bad)
+
+
+def test_recorded_delays_come_back_in_blocks():
+    samples = np.arange(20) / 1000
+    drawn = EmpiricalDist(samples, block=4).sample(generator(), (3, 10))
+    assert drawn.shape == (3, 10)
+    for row in drawn:
+        for i in (0, 4):
+            np.testing.assert_allclose(np.diff(row[i : i + 4]), 0.001)
+    assert EmpiricalDist(samples, block=100).block == 20
+    assert EmpiricalDist(samples).quantile(0.5) == pytest.approx(0.0095)
+    for bad in ([], [-0.1], [np.nan], [[0.1]]):
+        with pytest.raises(UsageError):
+            EmpiricalDist(np.array(bad))
+
+
+def test_what_a_trainable_delay_takes():
+    for options in ((0.1, 0.1, 0.1), (0.0, 0.1, 0.2), (0.3, 0.1, 0.2), (0.1, -0.1, 0.2)):
+        with pytest.raises(UsageError):
+            TrainableDist.create(*options)
+    with pytest.raises(UsageError, match="Available: zoh, linear"):
+        TrainableDist.create(0.1, 0.0, 0.2, "cubic")
+    d = TrainableDist.create(0.05, 0.02, 0.12)
+    assert float(d.delay) == pytest.approx(0.05)
+    assert d.window(50.0) == 5  # 50 Hz for 100 ms: exactly, though 50 * (0.12 - 0.02) is a little more
+    assert float(d.with_delay(1.0).delay) == pytest.approx(0.12)
+    assert float(d.with_delay(-1.0).delay) == pytest.approx(0.02)
+    np.testing.assert_allclose(d.sample(generator(), (3,)), 0.02)
+    assert d.quantile(0.99) == pytest.approx(0.05)
+
+
+def test_where_a_trainable_delay_may_stand():
+    a, b, w = BaseNode("a", 10), BaseNode("b", 10), BaseWorld("w", 10)
+    zoh, mean = (TrainableDist.create(0.1, 0.0, 0.2, i) for i in ("zoh", "zoh_mean"))
+    for options in ({"blocking": True}, {"jitter": Jitter.BUFFER}):
+        with pytest.raises(UsageError, match="trainable delay cannot move"):
+            a.connect(b, delay_dist=zoh, **options)
+    with pytest.raises(UsageError, match="inputs of a world"):
+        a.connect(b, delay_dist=mean)
+    with pytest.raises(UsageError, match="window of 2"):
+        w.connect(b, delay_dist=mean, window=2)
+    with pytest.raises(UsageError, match="computation delay cannot be trainable"):
+        BaseNode("c", 10, delay_dist=zoh)
+
+
+# TrainableDist.apply, by the letter: over the messages that were sent, in plain Python.
+
+PERIOD = 0.02
+LOW, HIGH = 0.005, 0.045
+
+
+def received(sent, delay):
+    return [s + delay for s in sent]
+
+
+def slow_zoh(ts, sent, values, delay, window, skip):
+    """The last ``window`` messages that have arrived; None for an empty slot."""
+    there = [v for r, v in zip(received(sent, delay), values, strict=True) if (r < ts if skip else r <= ts)]
+    return ([None] * window + there)[-window:]
+
+
+def slow_linear(ts, sent, values, delay, window, default, real_only):
+    """Values on the line through all messages sent before ``ts - LOW``, as old as the arrivals that zoh would give."""
+    knots = [(-1e9 if real_only else 0.0, default)] * (window + 3)
+    knots += [(r, v) for r, v, s in zip(received(sent, delay), values, sent, strict=True) if s + LOW <= ts]
+    arrived = [r for r, _ in knots if r <= ts]
+    queries = [r + ts - arrived[-1] for r in arrived[-window:]]
+    return np.interp(queries, [r for r, _ in knots], [v for _, v in knots])
+
+
+def window_of(ts, sent, values, width, default, latest):
+    """Return the widened window at ``ts``: messages with ``sent <= latest``."""
+    m = [i for i, s in enumerate(sent) if s <= latest][-width:]
+    pad = width - len(m)
+    data = [default] * pad + [values[i] for i in m]
+    seq = [-1] * pad + m
+    age = [EMPTY] * pad + [ts - sent[i] for i in m]
+    f32 = lambda x: jnp.array(x, jnp.float32)  # noqa: E731
+    stamps = f32([0.0] * pad + [sent[i] for i in m])
+    return InputState(jnp.array(seq, jnp.int32), stamps, stamps + LOW, {"v": f32(data), "n": jnp.array(seq)}), f32(age)
+
+
+messages = st.lists(st.integers(1, 40), min_size=0, max_size=12).map(lambda gaps: np.cumsum(gaps) / 1000)
+
+
+def enough(dist, window):
+    return 14 + window  # the generated messages are burstier than any rate: keep them all
+
+
+@settings(max_examples=150)
+@given(messages, st.integers(0, 300), st.integers(5, 45), st.integers(1, 3), st.booleans())
+def test_zoh_against_the_letter(sent, ts_ms, delay_ms, window, skip):
+    ts, delay = ts_ms / 1000, delay_ms / 1000
+    values = [float(i) for i in range(len(sent))]
+    dist = TrainableDist.create(delay, LOW, HIGH, "zoh")
+    latest = ts - LOW - (1e-6 if skip else 0) + 1e-9
+    wide, age = window_of(ts, sent, values, enough(dist, window), -7.0, latest)
+    got = dist.apply(wide, age, window, PERIOD, ts, skip).data["v"]
+    to_us = lambda t: [round(x * 1e6) for x in t]  # noqa: E731 - ties are decided on ticks
+    expected = slow_zoh(round(ts * 1e6), to_us(sent), values, round(delay * 1e6), window, skip)
+    np.testing.assert_array_equal(got, [-7.0 if v is None else v for v in expected])
+
+
+@settings(max_examples=150)
+@given(messages, st.integers(1, 300), st.integers(5, 45), st.integers(1, 3), st.booleans())
+def test_linear_against_the_letter(sent, ts_ms, delay_ms, window, real_only):
+    ts, delay = ts_ms / 1000 + 3e-4, delay_ms / 1000
+    values = [float(np.sin(9.0 * i)) for i in range(len(sent))]
+    dist = TrainableDist.create(delay, LOW, HIGH, "linear_real_only" if real_only else "linear")
+    wide, age = window_of(ts, sent, values, enough(dist, window), 0.5, ts - LOW + 1e-9)
+    got = dist.apply(wide, age, window, PERIOD, ts).data["v"]
+    expected = slow_linear(ts, sent, values, delay, window, 0.5, real_only)
+    np.testing.assert_allclose(got[-len(expected) :], expected, atol=2e-4)
+
+
+@settings(max_examples=100)
+@given(messages, st.integers(0, 300), st.integers(5, 45))
+def test_zoh_mean_against_the_letter(sent, ts_ms, delay_ms):
+    ts, delay = ts_ms / 1000, delay_ms / 1000
+    values = [float(np.sin(9.0 * i)) for i in range(len(sent))]
+    dist = TrainableDist.create(delay, LOW, HIGH, "zoh_mean")
+    wide, age = window_of(ts, sent, values, 15, 0.5, ts + PERIOD - LOW)
+    got = dist.apply(wide, age, 1, PERIOD, ts)
+    fine = ts + (np.arange(20_000) + 0.5) / 20_000 * PERIOD
+    held = np.searchsorted(np.array(sent) + delay, fine, side="right") - 1
+    expected = np.where(held >= 0, np.array([*values, 0.5])[held], 0.5).mean()
+    assert float(got.data["v"][0]) == pytest.approx(expected, abs=1e-3)
+    newest = sum(round((s + delay) * 1e6) <= round(ts * 1e6) for s in sent) - 1
+    assert int(got.data["n"][0]) == int(got.seq[0]) == newest  # whole numbers: what holds when the tick begins
+
+
+@pytest.mark.parametrize("interp", ["linear", "zoh_mean", "zoh"])
+def test_gradients_against_finite_differences(interp):
+    ts, sent = 0.2, np.array([0.09, 0.111, 0.13, 0.152, 0.171, 0.188])
+    values = [0.3, -1.0, 2.0, 0.7, -0.4, 1.1]
+    latest = ts - LOW + (PERIOD if interp == "zoh_mean" else 0.0)
+    wide, age = window_of(ts, sent, values, 15, 0.5, latest)
+    start = TrainableDist.create(0.033, LOW, HIGH, interp)
+    read = jax.jit(lambda d: start.with_delay(d).apply(wide, age, 1, PERIOD, ts).data["v"][0])
+    slope = float(jax.grad(read)(0.033))
+    finite = (float(read(0.034)) - float(read(0.032))) / 0.002
+    assert slope == pytest.approx(finite, rel=2e-2, abs=1e-3)
+    assert (slope == 0.0) == (interp == "zoh")

@@ -1,0 +1,92 @@
+"""What nodes and connections refuse, and what they say about it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sim2real.graph as base
+from sim2real.errors import UsageError
+from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling
+from sim2real.graph.base import fill_window
+from sim2real.graph.tree import strong, tree_dynamic_slice, tree_take, tree_where
+
+
+@pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf"), None, "10"])
+def test_a_rate_is_a_positive_number(rate):
+    for cls in (BaseNode, BaseWorld):
+        with pytest.raises(UsageError, match="'n': rate must be a positive number"):
+            cls("n", rate)
+
+
+@pytest.mark.parametrize("options", [{"delay": -0.1}, {"delay": float("nan")}, {"delay_dist": -1}, {"delay_dist": "x"}])
+def test_delays_are_checked_and_named(options):
+    with pytest.raises(UsageError, match="node 'n'"):
+        BaseNode("n", 10, **options)
+    a, b = BaseNode("a", 10), BaseNode("b", 10)
+    with pytest.raises(UsageError, match=r"connection 'a' -> 'b' \(input 'in'\)"):
+        b.connect(a, name="in", **options)
+    assert not b.inputs
+    assert not a.outputs
+
+
+def test_a_window_holds_at_least_one():
+    with pytest.raises(UsageError, match="window must be at least 1, got 0"):
+        BaseNode("b", 1).connect(BaseNode("a", 1), window=0)
+
+
+def test_a_taken_name_is_refused_with_a_way_out():
+    a, b = BaseNode("a", 10), BaseNode("b", 10)
+    first = b.connect(a)
+    with pytest.raises(UsageError, match=r"has an input .a. already\. Inputs: a") as error:
+        b.connect(a)
+    assert "name='other'" in (error.value.hint or "")
+    second = b.connect(a, name="other", window=3, skip=True)
+    assert b.inputs == {"a": first, "other": second}
+    assert a.outputs == [first, second]
+    assert repr(second) == "Connection('a' -> 'b', name='other')"
+
+
+def test_options_may_be_given_by_value_and_unknown_ones_are_refused():
+    assert BaseNode("n", 1, scheduling="phase").scheduling is Scheduling.PHASE
+    assert BaseNode("b", 1).connect(BaseNode("a", 1), jitter="buffer").jitter is Jitter.BUFFER
+    with pytest.raises(ValueError, match="sometimes"):
+        BaseNode("n", 1, scheduling="sometimes")
+
+
+def test_a_world_is_busy_for_a_hair_less_than_its_period():
+    world = BaseWorld("w", 50, color="blue", order=2)
+    assert (world.delay, world.phase_output, world.color, world.order) == (0.999 / 50, 0.999 / 50, "blue", 2)
+
+
+def test_defaults_of_the_callbacks():
+    node = BaseNode("n", 10)
+    assert node.init_params() == node.init_state() == node.init_output() == base.Empty()
+    assert node.init_delays() == {}
+    assert node.startup(base.GraphState())
+    assert node.stop()
+    assert node.now() == 0.0
+    with pytest.raises(NotImplementedError, match=r"node .n. .BaseNode. has no step"):
+        node.step(base.StepState())
+
+
+def test_arithmetic_and_indexing_of_messages():
+    state = base.InputState(
+        seq=jnp.arange(3), ts_sent=jnp.arange(3.0), ts_recv=jnp.arange(3.0), data=jnp.arange(6.0).reshape(3, 2)
+    )
+    assert state[-1].data.tolist() == [4.0, 5.0]
+    assert state[-2:].seq.tolist() == [1, 2]
+    double = state + state
+    assert double.data.tolist() == (2 * np.arange(6.0).reshape(3, 2)).tolist()
+    assert ((state * 2.0 - state) / 2.0).ts_sent.tolist() == [0.0, 0.5, 1.0]
+    assert (-state).seq.tolist() == [0, -1, -2]
+    assert fill_window(jnp.ones(2), 3).data.shape == (3, 2)
+
+
+def test_tree_helpers():
+    tree = {"a": jnp.arange(6).reshape(2, 3), "b": np.arange(12.0).reshape(2, 3, 2)}
+    out = tree_dynamic_slice(tree, jnp.array([1, 7]))
+    assert out["a"].tolist() == [[5]]
+    assert out["b"].shape == (1, 1, 2)
+    assert tree_take(tree, 9)["a"].tolist() == [3, 4, 5]
+    assert tree_where(jnp.bool_(False), {"x": 1.0}, {"x": 2.0})["x"] == 2.0
+    assert not strong({"x": 1.0})["x"].weak_type

@@ -1,0 +1,299 @@
+"""Each timing rule on cases small enough to work out by hand, and all of them against the rules by the letter."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim2real.errors import UsageError
+from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, Timeline, TrainableDist
+from sim2real.graph.schedule import NEVER, derive, draw, eligible, quota, slot
+from sim2real.graph.testing import Reference, random_graph
+from sim2real.graph.timeline import Vertex
+
+MS = 1000
+
+
+def ms(*values):
+    return np.array([values]) * MS
+
+
+def by_name(*nodes):
+    return {n.name: n for n in nodes}
+
+
+def starts(node, *busy_ms, **others):
+    """Return the starts [ms] of a node that runs with the given computation delays [ms]."""
+    nodes = by_name(node, *others.pop("senders", []))
+    delays = {node.name: ms(*busy_ms), **{n: ms(*d) for n, d in others.pop("busy", {}).items()}}
+    transfers = {k: ms(*d) for k, d in others.pop("travel", {}).items()}
+    timeline = derive(nodes, delays, transfers, int(NEVER))
+    return (timeline.vertices[node.name].start[0] / MS).tolist(), timeline
+
+
+# Rule 1: phases
+
+
+def test_a_phase_is_the_largest_nominal_arrival():
+    a, b, c = BaseNode("a", 100, delay=0.002), BaseNode("b", 100, delay=0.005), BaseNode("c", 100, delay=0.001)
+    c.connect(a, delay=0.001)
+    c.connect(b, delay=0.004, blocking=True)
+    assert (a.phase, c.phase, c.phase_output) == (0.0, 0.009, 0.01)
+
+
+def test_a_skipped_input_does_not_count_and_a_diamond_takes_its_longer_side():
+    top, left, right, end = (BaseNode(n, 50, delay=d) for n, d in [("t", 0.001), ("l", 0.002), ("r", 0.01), ("e", 0.0)])
+    for side in (left, right):
+        side.connect(top)
+        end.connect(side)
+    top.connect(end, skip=True, delay=0.5)
+    assert end.phase == pytest.approx(0.011)
+    assert top.phase == 0.0
+
+
+def test_a_loop_is_named():
+    a, b, c = (BaseNode(n, 10) for n in "abc")
+    a.connect(b)
+    b.connect(c)
+    c.connect(a, name="other")
+    with pytest.raises(UsageError, match=r"algebraic loop: a -> c -> b -> a|b -> a -> c -> b|c -> b -> a -> c") as e:
+        _ = a.phase
+    assert "skip=True" in (e.value.hint or "")
+
+
+# Rule 2: the schedule
+
+
+def test_slots_are_rounded_one_by_one_so_that_errors_do_not_add_up():
+    node = BaseNode("a", 30)
+    assert slot(node, np.arange(4)).tolist() == [0, 33_333, 66_667, 100_000]
+    assert int(slot(node, 30 * 3600)) == 3_600_000_000
+    # Halves go up, for rates too that are no divisors of a million: 3e6 / 384 = 7812.5.
+    assert slot(BaseNode("b", 384), np.array([3, 9])).tolist() == [7813, 23438]
+
+
+# Rule 3: starts
+
+
+def test_frequency_moves_the_whole_later_schedule_and_phase_returns_to_its_grid():
+    busy = (3, 25, 3, 3, 3, 3)
+    kept, _ = starts(BaseNode("a", 100, scheduling=Scheduling.FREQUENCY), *busy)
+    back, _ = starts(BaseNode("a", 100, scheduling=Scheduling.PHASE), *busy)
+    assert kept == [0, 10, 35, 45, 55, 65]
+    assert back == [0, 10, 35, 38, 41, 50]
+
+
+def test_an_end_on_the_next_slot_is_no_overrun():
+    assert starts(BaseNode("a", 100), 10, 10, 10.001, 1)[0] == [0, 10, 20, 30.001]
+
+
+def sender_and_reader(**options):
+    sender, reader = BaseNode("s", 100), BaseNode("r", 100, scheduling=options.pop("scheduling", Scheduling.FREQUENCY))
+    reader.advance = options.pop("advance", False)
+    reader.connect(sender, blocking=True, **options)
+    return sender, reader
+
+
+def test_waiting_for_a_message_does_not_move_the_schedule():
+    sender, reader = sender_and_reader()
+    t, timeline = starts(
+        reader, 1, 1, 1, senders=[sender], busy={"s": (0, 0, 0)}, travel={("r", "s"): (0, 4, 0)}
+    )  # fmt: skip
+    assert t == [0, 14, 20]
+    assert timeline.edges["r", "s"].seq_in[0].tolist() == [0, 1, 2]
+
+
+def test_waiting_moves_it_if_the_step_then_ends_after_its_next_slot():
+    sender, reader = sender_and_reader()
+    t, _ = starts(reader, 1, 7, 1, 1, senders=[sender], busy={"s": (0,) * 4}, travel={("r", "s"): (0, 4, 0, 0)})
+    assert t == [0, 14, 21, 31]
+
+
+def test_advance_starts_as_soon_as_the_messages_are_there():
+    options = {"busy": {"s": (0,) * 3}, "travel": {("r", "s"): (1, 1, 1)}}
+    sender, reader = sender_and_reader(delay=0.004)
+    assert starts(reader, 1, 1, 1, senders=[sender], **options)[0] == [4, 14, 24]
+    sender, reader = sender_and_reader(delay=0.004, advance=True)
+    assert starts(reader, 1, 1, 1, senders=[sender], **options)[0] == [1, 11, 21]
+    free = BaseNode("free", 1)
+    reader.connect(free)
+    options["busy"]["free"] = (0,)
+    options["travel"]["r", "free"] = (0,)
+    assert starts(reader, 1, 1, 1, senders=[sender, free], **options)[0] == [4, 14, 24]
+
+
+def test_advance_needs_a_blocking_input():
+    sender, reader = BaseNode("s", 10), BaseNode("r", 10, advance=True)
+    reader.connect(sender)
+    with pytest.raises(UsageError, match="needs a blocking input"):
+        draw(by_name(sender, reader), 1.0)
+
+
+# Rule 5: arrivals are in order
+
+
+def test_a_fast_message_does_not_overtake_a_slow_one():
+    sender, reader = BaseNode("s", 100), BaseNode("r", 100)
+    reader.connect(sender)
+    _, timeline = starts(
+        reader, 0, 0, 0, 0, senders=[sender], busy={"s": (0, 0, 0, 0)}, travel={("r", "s"): (0, 25, 1, 0)}
+    )
+    edge = timeline.edges["r", "s"]
+    assert (edge.received[0] / MS).tolist() == [0, 35, 35, 35]
+    assert edge.seq_in[0].tolist() == [0, -1, -1, -1]
+
+
+# Rule 6: which messages a step consumes
+
+
+def consumed(reader_options, travel=(0, 0, 0, 0), rates=(100, 100), busy=(0,) * 4):
+    sender, reader = BaseNode("s", rates[0]), BaseNode("r", rates[1])
+    reader.connect(sender, **reader_options)
+    _, timeline = starts(reader, *busy, senders=[sender], busy={"s": (0,) * len(travel)}, travel={("r", "s"): travel})
+    return timeline.edges["r", "s"].seq_in[0].tolist()
+
+
+def test_a_message_that_arrives_at_the_start_is_read_at_once_or_with_skip_at_the_next_step():
+    assert consumed({}) == [0, 1, 2, 3]
+    assert consumed({"skip": True}) == [1, 2, 3, -1]
+    assert consumed({"skip": True}, travel=(-0.001, 0, 0, 0)) == [1, 2, 3, -1]  # 0 is not before 0
+    assert consumed({}, travel=(0.001, 0, 0, 0)) == [1, 1, 2, 3]
+
+
+def test_buffer_holds_a_message_until_its_nominal_arrival():
+    early = {"delay": 0.0, "jitter": Jitter.BUFFER}
+    assert consumed(early, travel=(0, 0, 0, 0)) == [0, 1, 2, 3]
+    # Expected after 12 ms, there after 1 ms: the reader's phase is 12 ms, so its steps are at 12, 22, ...
+    assert consumed({"delay": 0.012}, travel=(1, 1, 1, 1)) == [0, 0, 1, 2]
+    assert consumed({"delay": 0.012, "jitter": Jitter.BUFFER}, travel=(1, 1, 1, 1)) == [0, 1, 2, 3]
+    # A late message holds back those behind it, which are in time.
+    assert consumed({"delay": 0.005, "jitter": Jitter.BUFFER}, travel=(1, 17, 1, 1)) == [0, 3, 3, 3]
+
+
+def test_buffer_stays_strict_with_skip_on_the_arrival_alone():
+    assert consumed({"jitter": Jitter.BUFFER, "skip": True}, travel=(0, 0, 0, 0)) == [1, 2, 3, -1]
+
+
+def test_blocking_at_equal_rates_takes_two_messages_first_and_one_later():
+    sender, reader = BaseNode("s", 100), BaseNode("r", 100)
+    connection = reader.connect(sender, blocking=True, delay=0.01)
+    assert quota(connection, np.arange(4)).tolist() == [2, 3, 4, 5]
+    reader.inputs.clear()
+    connection = reader.connect(sender, blocking=True, delay=0.01, skip=True)
+    assert quota(connection, np.arange(4)).tolist() == [0, 1, 2, 3]  # skipped: no phase, and strict
+
+
+@pytest.mark.parametrize(
+    ("rates", "skip", "expected"),
+    [
+        ((100, 50), False, [1, 3, 5, 7]),
+        ((100, 50), True, [0, 2, 4, 6]),
+        ((50, 100), False, [1, 1, 2, 2]),
+        ((50, 100), True, [0, 1, 1, 2]),
+        ((100, 40), False, [1, 3, 6, 8]),
+    ],
+)
+def test_blocking_at_unequal_rates(rates, skip, expected):
+    sender, reader = BaseNode("s", rates[0]), BaseNode("r", rates[1])
+    connection = reader.connect(sender, blocking=True, skip=skip)
+    assert quota(connection, np.arange(4)).tolist() == expected
+
+
+rates = st.one_of(st.sampled_from([1, 3, 7, 30, 48, 60, 64, 100, 384, 1000]), st.floats(0.5, 2000))
+
+
+@settings(max_examples=300)
+@given(rates, rates, st.floats(0, 0.2), st.floats(0, 0.2), st.booleans(), st.integers(0, 5000))
+def test_quota_counts_slots(rate_out, rate_in, phase_out, delay, skip, k):
+    source, sender, reader = BaseNode("x", 1), BaseNode("s", rate_out), BaseNode("r", rate_in)
+    sender.connect(source, delay=phase_out)
+    connection = reader.connect(sender, blocking=True, skip=skip, delay=delay)
+    limit = int(slot(reader, k))
+    upper = max(0, int((limit - int(slot(sender, 0))) / 1e6 * rate_out)) + 3
+    slots = slot(sender, np.arange(max(0, upper - 12), upper))
+    assert slots[-1] > limit  # and those before the first one here are all below it
+    below = (slots < limit) if skip else (slots <= limit)
+    expected = max(0, upper - 12) + int(below.sum())
+    assert int(quota(connection, k)) == expected
+
+
+def test_a_world_that_averages_takes_what_arrives_before_its_tick_ends():
+    sender, world = BaseNode("s", 100), BaseWorld("w", 100)
+    connection = world.connect(sender, skip=True, delay_dist=TrainableDist.create(0.0, 0.0, 0.01, "zoh_mean"))
+    end = round(0.999e4)
+    assert eligible(connection, np.array([0, end - 1, end])).tolist() == [1 - end, 0, 1]
+
+
+# All of them
+
+
+def test_a_recorded_sender_that_stops_leaves_its_blocking_reader_without_a_step():
+    sender, reader = BaseNode("s", 100), BaseNode("r", 100, delay_dist=0.001)
+    reader.connect(sender, blocking=True)
+    recorded = Timeline({"s": Vertex(ms(0, 10, 20), ms(1, 11, 21), np.array([3]))}, {})
+    timeline = draw(by_name(sender, reader), 0.1, recorded=recorded)
+    assert timeline.vertices["r"].count.tolist() == [3]
+    assert (timeline.vertices["r"].start[0, :3] / MS).tolist() == [1, 11, 21]
+    assert timeline.vertices["r"].start[0, 3] >= NEVER
+    assert timeline.edges["r", "s"].seq_in[0].tolist() == [0, 1, 2]
+
+
+def test_what_is_recorded_stays_and_the_rest_is_drawn():
+    nodes = random_graph(3, size=3, worlds=1)
+    full = draw(nodes, 0.5, episodes=2, rng=1)
+    partly = full.filter(["n0", "n1"])
+    again = draw(nodes, 0.5, rng=2, recorded=partly)
+    assert set(again.edges) == set(full.edges)
+    for name in ("n0", "n1"):
+        np.testing.assert_array_equal(again.vertices[name].start, full.vertices[name].start)
+
+
+def test_too_short_a_duration_and_a_missing_sender_are_errors():
+    sender, reader = BaseNode("s", 10, delay=0.5), BaseNode("r", 10)
+    reader.connect(sender)
+    with pytest.raises(UsageError, match="'r' makes no step within"):
+        draw(by_name(sender, reader), 0.3)
+    with pytest.raises(UsageError, match="listens to 's', which is not in the graph"):
+        draw(by_name(reader), 1.0)
+
+
+def test_the_same_seed_draws_the_same_and_episodes_differ():
+    nodes = random_graph(11)
+    a, b = draw(nodes, 0.4, 3, rng=5), draw(nodes, 0.4, 3, rng=5)
+    for name, v in a.vertices.items():
+        np.testing.assert_array_equal(v.end, b.vertices[name].end)
+    assert any((v.end[0] != v.end[1]).any() for v in a.vertices.values())
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6))
+def test_the_rules_by_the_letter_give_the_same_timeline(seed):
+    nodes = random_graph(seed)
+    timeline = draw(nodes, 0.4, 2, seed)
+    for episode in range(2):
+        reference = Reference(nodes, timeline, episode)
+        for name, v in timeline.vertices.items():
+            count = v.count[episode]
+            assert v.start[episode, :count].tolist() == reference.starts[name][:count]
+            assert v.end[episode, :count].tolist() == reference.ends[name][:count]
+        for key, seq_in in reference.seq_in.items():
+            assert timeline.edges[key].seq_in[episode][: len(seq_in)].tolist() == seq_in
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6))
+def test_messages_arrive_in_order_after_they_were_sent_and_are_read_once(seed):
+    nodes = random_graph(seed)
+    timeline = draw(nodes, 0.4, 2, seed)
+    for (name, _), edge in timeline.edges.items():
+        sender, reader = timeline.vertices[edge.sender], timeline.vertices[name]
+        for e in range(2):
+            sent, got = sender.count[e], edge.seq_in[e]
+            used = np.flatnonzero(got >= 0)
+            assert (np.diff(edge.received[e]) >= 0).all()
+            assert (edge.received[e] >= sender.end[e]).all()
+            assert used.tolist() == list(range(len(used)))  # no message is left out
+            assert len(used) <= sent
+            assert (np.diff(got[used]) >= 0).all()
+            assert (got[used] < reader.count[e]).all()
+            assert (edge.received[e][used] <= reader.start[e][got[used]]).all()  # nothing from the future

@@ -1,0 +1,132 @@
+"""The stages for real: one recorded session for all tests, robots with faults, and robots that outlive their host."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from sim2real import cli
+from sim2real.hardware.truth import read_truth
+from sim2real.stages.pipeline import load_pipeline
+
+TINY = [
+    *("--identify.generations=10", "--identify.population=8", "--train.episode-s=2", "--train.timelines=4"),
+    *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
+    *("--train.ppo.evaluations=1", "--train.ppo.eval-envs=4", "--deploy.episodes=1", "--deploy.duration-s=2"),
+]
+
+FAULTY = """
+from dataclasses import replace
+from sim2real.stages.pipeline import load_pipeline
+
+pendulum = load_pipeline("pendulum")
+robot, hardware = pendulum.load(), pendulum.load("hardware")
+
+def __getattr__(name):
+    return getattr(robot, name)
+
+def nodes(session, signal, sensor=hardware.ServoSensor, agent=hardware.Excitation):
+    return robot.control_nodes(
+        sensor("sensor", 50.0, session.rig, delay=0.002),
+        agent("agent", 50.0, signal, delay=0.002),
+        hardware.ServoActuator("actuator", 50.0, session.rig, delay=0.002),
+    )
+"""
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    """Folder of the runs that all tests share."""
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="session")
+def recorded(root):
+    """The run folder of a recording of 12 s."""
+    assert cli.main(["record", "pendulum", "--duration-s", "12", "--seed", "1", "--runs", str(root)]) == 0
+    (run_dir,) = (root / "pendulum").iterdir()
+    return run_dir
+
+
+@pytest.fixture(scope="session")
+def completed(root, recorded):
+    """The same run folder after `run --resume` with tiny budgets."""
+    before = (recorded / "record" / "manifest.json").read_bytes()
+    assert cli.main(["run", "pendulum", "--resume", str(recorded), "--runs", str(root), *TINY]) == 0
+    assert (recorded / "record" / "manifest.json").read_bytes() == before
+    return recorded
+
+
+@pytest.fixture
+def log(recorded):
+    """A recorded log of the pendulum."""
+    return recorded / "record" / "session.mcap"
+
+
+@pytest.fixture
+def make_pipeline(tmp_path, monkeypatch):
+    """Write a pipeline that is the pendulum but for `body` into ./pipelines; names must differ between tests."""
+    monkeypatch.chdir(tmp_path)
+
+    def make(name, body):
+        folder = tmp_path / "pipelines" / name
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text(
+            "from sim2real.stages.pipeline import Pipeline\n"
+            f"PIPELINE = Pipeline(name={name!r}, summary='pendulum with a fault', package=__name__)\n"
+        )
+        (folder / "robot.py").write_text(FAULTY + textwrap.dedent(body))
+        return name
+
+    return make
+
+
+@pytest.fixture
+def lone_robot(tmp_path):
+    """Start an emulated pendulum that does not end with its host; returns its port, its truth file, how to stop it."""
+    hardware = load_pipeline("pendulum").load("hardware")
+    plant = Path(hardware.__file__).with_name("plant.py")
+    path = tmp_path / "truth.bin"
+    command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", f"{plant}:PendulumPlant"]
+    command += ["--truth", str(path)]
+    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(hardware.EMBEDDED).items() if v is not None]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    port = json.loads(process.stdout.readline())["port"]
+
+    def end():
+        process.terminate()
+        process.wait(5)
+        return read_truth(path)
+
+    yield port, end
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def start_cli():
+    """Start the command line as a process of its own."""
+    processes = []
+
+    def start(*arguments, cwd=None):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sim2real.cli", *map(str, arguments)],
+            cwd=cwd,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()

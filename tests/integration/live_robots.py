@@ -1,0 +1,42 @@
+"""What the tests of the stages ask of runs, logs and the emulator's truth."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.truth import Kind
+
+
+def wait_until_running(root, pattern, process, timeout_s=60.0):
+    """Wait until a log has been flushed twice, which is when the motor turns; return the log."""
+    end = time.monotonic() + timeout_s
+    sizes = set()
+    while time.monotonic() < end:
+        assert process.poll() is None, process.communicate()
+        for found in Path(root).glob(pattern):
+            sizes.add(found.stat().st_size)
+            if len(sizes) > 3:
+                return found
+        time.sleep(0.02)
+    raise TimeoutError(f"nothing was recorded in {timeout_s} s: {process.stderr.read()}")
+
+
+def manifest_of(folder):
+    return json.loads((folder / "manifest.json").read_text())
+
+
+def motor(truth):
+    """Return when commands took effect [ns], the mode and the goal of each."""
+    effects = truth.of(Kind.EFFECT)
+    return effects["t_ns"], effects["values"][:, 0], effects["values"][:, 1]
+
+
+def assert_torque_ends_off(truth):
+    """The motor turned, and the last thing it was told is to let go."""
+    _, modes, goals = motor(truth)
+    assert np.any(modes == OperatingMode.PWM)
+    assert np.any(goals != 0.0)
+    assert modes[-1] == OperatingMode.OFF

@@ -1,0 +1,214 @@
+"""Bad input: each a clear error with a hint and its exit code, and no traceback."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from sim2real import cli, errors
+from sim2real.hardware.port import WaitingPort
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.train import load_parameters
+
+
+@pytest.fixture
+def fails(capsys):
+    """Call the command line and return what it said; it must fail in the documented way."""
+
+    def call(code, *arguments, hint=True):
+        capsys.readouterr()
+        assert cli.main([str(a) for a in arguments]) == code
+        said = capsys.readouterr().err
+        assert "error: " in said
+        assert "\n\nhint: " in said or not hint
+        assert "raceback" not in said
+        return said
+
+    return call
+
+
+@pytest.mark.parametrize("stage", ["identify", "train", "deploy"])
+def test_missing_artifacts(fails, tmp_path, stage):
+    said = fails(errors.ERROR, stage, "pendulum", "--runs", tmp_path / "none")
+    assert "no finished" in said
+    assert not (tmp_path / "none").exists()
+
+
+def test_log_of_another_pipeline(fails, tmp_path, log, make_pipeline):
+    make_pipeline("other_pipeline", "")
+    said = fails(errors.ERROR, "identify", "other_pipeline", "--log", log)
+    assert "log of pipeline 'pendulum', not of 'other_pipeline'" in said
+    assert not (tmp_path / "runs").exists()
+
+
+def test_files_that_are_no_logs(fails, tmp_path, log):
+    whole = log.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for content, word in ((b"hello", "no MCAP"), (whole[:800], "cut before"), (whole[:4], "cut before"), (b"", "cut")):
+        cut.write_bytes(content)
+        assert word in fails(errors.ERROR, "identify", "pendulum", "--log", cut, "--runs", tmp_path)
+    assert "there is no log" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path / "none.mcap")
+    assert "there is no log" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path, "--runs", tmp_path)
+    assert not (tmp_path / "pendulum").exists()
+
+
+def test_logs_that_are_too_short(fails, tmp_path, log):
+    said = fails(errors.USAGE, "identify", "pendulum", "--log", log, "--horizon-s", "11", "--runs", tmp_path)
+    assert "record for at least" in said
+    short = tmp_path / "short.mcap"
+    short.write_bytes(log.read_bytes()[: log.stat().st_size // 20])
+    said = fails(errors.USAGE, "identify", "pendulum", "--log", short, "--runs", tmp_path)
+    assert "is not whole" in said
+    assert "segments" in said
+
+
+def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[: log.stat().st_size * 4 // 5])
+    flags = ["--log", cut, "--generations", 10, "--population", 8, "--runs", tmp_path]
+    assert cli.main(["identify", "pendulum", *map(str, flags)]) == 0
+    said = capsys.readouterr()
+    assert "warning: the log" in said.err
+    assert "is not whole" in said.err
+    assert "round_trip_delay" in said.out
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["gain", "30", "60"], "exclude its nominal value"),
+        (["gian", "30", "60"], "Available: gain, gravity"),
+        (["gain", "60", "30"], "no interval"),
+        (["gain", "nan", "30"], "no interval"),
+        (["gain", "-3", "30"], "positive lower bound"),
+        (["gain", "30"], "Expected 3 values"),
+        (["actuator_delay", "0", "0.2"], "--max-delay-s"),
+    ],
+)
+def test_bounds(fails, root, recorded, flags, word):
+    del recorded
+    assert word in fails(errors.USAGE, "identify", "pendulum", "--runs", root, "--bounds", *flags, hint=False)
+
+
+def test_several_bounds(root, recorded, fails):
+    del recorded
+    bounds = ["--bounds", "gain", "5", "60", "--bounds", "gravity", "200", "300"]
+    assert "'gravity'" in fails(errors.USAGE, "identify", "pendulum", "--runs", root, *bounds)
+    bounds = ["--bounds", "gain", "50", "60", "--bounds", "gravity", "100", "300"]
+    assert "'gain'" in fails(errors.USAGE, "identify", "pendulum", "--runs", root, *bounds)
+
+
+@pytest.mark.parametrize("port", ["/dev/no_such_port", "/dev/null"])
+def test_ports_that_are_none(fails, tmp_path, port):
+    assert port in fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", port, "--runs", tmp_path)
+    (manifest,) = tmp_path.glob("pendulum/*/record/manifest.json")
+    assert json.loads(manifest.read_text())["exit_code"] == errors.HARDWARE_LOST
+
+
+def test_two_runs_on_one_port(fails, tmp_path, lone_robot):
+    port, _ = lone_robot
+    taken = WaitingPort(port, 1_000_000, 0.01)
+    try:
+        said = fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", port, "--runs", tmp_path)
+    finally:
+        taken.closePort()
+    assert f"serial port {port} cannot be opened" in said
+
+
+def test_a_port_without_a_servo(fails, tmp_path):
+    host, device = os.openpty()
+    try:
+        said = fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", os.ttyname(device), "--runs", tmp_path)
+    finally:
+        os.close(host)
+        os.close(device)
+    assert "servo 1 does not answer" in said
+
+
+def test_run_folders_that_cannot_be_written(fails, tmp_path):
+    (tmp_path / "file").write_text("")
+    said = fails(errors.ERROR, "record", "pendulum", "--runs", tmp_path / "file")
+    assert "cannot write the run folder" in said
+    assert "--runs DIR" in said
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--gate.limit", "nan"],
+        ["--gate.slew-per-s", "0"],
+        ["--gate.command-timeout-s", "-1"],
+        ["--gate.servo-watchdog-s", "0"],
+        ["--seed", "-1"],
+        ["--high-hz", "40"],
+    ],
+)
+def test_limits_that_are_none(fails, tmp_path, flags):
+    fails(errors.USAGE, "record", "pendulum", "--runs", tmp_path / "runs", *flags, hint=False)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_damaged_parameters(fails, tmp_path, completed):
+    good = json.loads((completed / "identify" / "parameters.json").read_text())
+    path = tmp_path / "parameters.json"
+
+    def damaged(text):
+        path.write_text(text)
+        return fails(errors.ERROR, "train", "pendulum", "--parameters", path, "--runs", tmp_path)
+
+    for text in ("", "{", "[]", "{}", '{"parameters": 3, "pipeline": "pendulum", "log": {"path": "x"}}'):
+        assert "holds no identified parameters" in damaged(text)
+    assert "of pipeline 'arm'" in damaged(json.dumps({**good, "pipeline": "arm"}))
+    assert "damping" in damaged(
+        json.dumps({**good, "parameters": [p for p in good["parameters"] if p["name"] != "damping"]})
+    )
+    rows = [{**p, "estimate": float("nan")} if p["name"] == "gain" else p for p in good["parameters"]]
+    assert "gain" in damaged(json.dumps({**good, "parameters": rows}))
+    assert "there is no log" in damaged(json.dumps({**good, "log": {"path": "none.mcap"}}))
+    assert "holds no identified parameters" in fails(errors.ERROR, "train", "pendulum", "--parameters", tmp_path)
+    assert not (tmp_path / "pendulum").exists()
+
+
+def test_parameters_that_are_whole_are_read(completed):
+    document = load_parameters(completed / "identify" / "parameters.json", load_pipeline("pendulum"))
+    assert np.isfinite([p["estimate"] for p in document["parameters"]]).all()
+
+
+def test_damaged_bundles(fails, tmp_path, completed):
+    bundle = tmp_path / "bundle"
+
+    def damaged():
+        return fails(errors.ERROR, "deploy", "pendulum", "--bundle", bundle, "--runs", tmp_path)
+
+    assert "no policy bundle" in damaged()
+    shutil.copytree(completed / "train" / "bundle", bundle)
+    weights = (bundle / "policy.safetensors").read_bytes()
+    (bundle / "policy.safetensors").write_bytes(weights[:-8])
+    assert "is not what was exported" in damaged()
+    (bundle / "policy.safetensors").unlink()
+    assert "lacks policy.safetensors" in damaged()
+    (bundle / "policy.safetensors").write_bytes(weights)
+    about = json.loads((bundle / "policy.json").read_text())
+    (bundle / "policy.json").write_text("{")
+    assert "no JSON" in damaged()
+    del about["action"]
+    (bundle / "policy.json").write_text(json.dumps(about))
+    assert "incomplete" in damaged()
+    assert not (tmp_path / "pendulum").exists()
+
+
+@pytest.mark.parametrize("what", ["observation", "action", "rate_hz"])
+def test_bundles_of_another_robot(fails, tmp_path, completed, what):
+    bundle = tmp_path / "bundle"
+    shutil.copytree(completed / "train" / "bundle", bundle)
+    about = json.loads((bundle / "policy.json").read_text())
+    if what == "rate_hz":
+        about["rate_hz"] = 100.0
+    else:
+        about[what][0]["name"] = "something else"
+    (bundle / "policy.json").write_text(json.dumps(about))
+    said = fails(errors.ERROR, "deploy", "pendulum", "--bundle", bundle, "--runs", tmp_path)
+    assert "this robot" in said
+    assert not (tmp_path / "pendulum").exists()

@@ -1,0 +1,87 @@
+"""The host dies, or is told to stop, at a random moment."""
+
+import random
+import signal
+import time
+import warnings
+
+import numpy as np
+import pytest
+from live_robots import assert_torque_ends_off, manifest_of, motor, wait_until_running
+
+from sim2real.hardware.truth import Kind, read_truth
+from sim2real.log.reader import TruncatedLogWarning, read_log
+
+
+def check_death(log, killed_ns, truth):
+    """The log holds all but the last 0.25 s before the death, and the motor stopped within 0.2 s of it."""
+    with pytest.warns(TruncatedLogWarning, match="has no end"):
+        episode = read_log(log)
+    assert not any(episode.metadata["log"]["missing_steps"].values())
+    to_monotonic_ns = time.monotonic_ns() - time.time_ns() + episode.metadata["log"]["epoch_ns"]
+    for name, steps in episode.steps.items():
+        logged_ns = to_monotonic_ns + 1000 * int(steps.end[-1])
+        assert (killed_ns - logged_ns) * 1e-9 < 0.25, name
+    # Every command that reached the motor until then stands in the log.
+    effects = truth.of(Kind.EFFECT)
+    arrived_ns = effects["t_host_ns"][(effects["t_host_ns"] > 0) & (effects["values"][:, 1] != 0.0)]
+    ends_ns = to_monotonic_ns + 1000 * episode.steps["actuator"].end
+    starts_ns = to_monotonic_ns + 1000 * episode.steps["actuator"].start
+    inside = arrived_ns[(arrived_ns >= starts_ns[0]) & (arrived_ns < killed_ns - 250_000_000)]
+    assert len(inside) > 10
+    step = np.searchsorted(starts_ns, inside, side="right") - 1
+    assert np.all(inside <= ends_ns[step])
+    t_ns, _, goals = motor(truth)
+    (trip,) = truth.of(Kind.WATCHDOG)
+    assert (trip["t_ns"] - killed_ns) * 1e-9 < 0.2
+    assert goals[-1] == 0.0
+    assert (t_ns[-1] - killed_ns) * 1e-9 < 0.2
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_kill_9_of_record(tmp_path, lone_robot, start_cli, seed):
+    port, end_robot = lone_robot
+    process = start_cli("record", "pendulum", "--port", port, "--duration-s", 20, "--runs", tmp_path)
+    log = wait_until_running(tmp_path, "pendulum/*/record/session.mcap", process)
+    time.sleep(random.Random(seed).uniform(0.5, 1.5))
+    killed_ns = time.monotonic_ns()
+    process.kill()
+    time.sleep(0.5)
+    check_death(log, killed_ns, end_robot())
+    assert manifest_of(log.parent)["status"] == "running"
+
+
+def test_kill_9_of_deploy(tmp_path, lone_robot, start_cli, completed):
+    port, end_robot = lone_robot
+    bundle = completed / "train" / "bundle"
+    flags = ["--port", port, "--bundle", bundle, "--duration-s", 20, "--runs", tmp_path]
+    process = start_cli("deploy", "pendulum", *flags)
+    log = wait_until_running(tmp_path, "pendulum/*/deploy/episode_0.mcap", process)
+    time.sleep(random.Random(3).uniform(0.5, 1.5))
+    killed_ns = time.monotonic_ns()
+    process.kill()
+    time.sleep(0.5)
+    check_death(log, killed_ns, end_robot())
+
+
+@pytest.mark.parametrize(("number", "code", "twice"), [(signal.SIGINT, 130, True), (signal.SIGTERM, 143, False)])
+def test_signals_end_a_recording_in_order(tmp_path, start_cli, number, code, twice):
+    process = start_cli("record", "pendulum", "--duration-s", 20, "--runs", tmp_path)
+    log = wait_until_running(tmp_path, "pendulum/*/record/session.mcap", process)
+    process.send_signal(number)
+    if twice:
+        time.sleep(0.01)
+        process.send_signal(number)
+    process.communicate(timeout=20)
+    assert process.returncode == code
+    manifest = manifest_of(log.parent)
+    assert (manifest["status"], manifest["exit_code"]) == ("interrupted", code)
+    assert "log" in manifest["outputs"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        episode = read_log(log)
+    end = episode.metadata["log"]["session_end"]
+    assert end["exit_code"] == code
+    assert end["status"].split(":")[0] in ("KeyboardInterrupt", "SystemExit")
+    assert end["timing"]["sensor"]["steps"] == len(episode.steps["sensor"])
+    assert_torque_ends_off(read_truth(log.parent / "truth.bin"))

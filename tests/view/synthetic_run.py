@@ -1,0 +1,178 @@
+"""A run folder of a robot that never was: a sine that is measured, predicted, learned and deployed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.graph.episode import MessageRecord, StepRecord
+from sim2real.hardware.truth import Kind, TruthLog
+from sim2real.log.writer import McapRecorder
+
+EVIL = "<b>gain</b> & $x_1$"
+"""A name that must neither become markup nor mathematics."""
+PERIOD_US = 20_000
+STEPS = 200
+MONOTONIC_NS = 5_000_000_000
+NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
+UNITS = {"th": "rad", "thdot": "rad/s", "action": "V"}
+
+
+def write_log(path: Path, steps: int = STEPS, end: bool = True) -> None:
+    """Write a session of three nodes; the agent wakes 4 ms late at step 100."""
+    graph = {
+        n: {"rate_hz": 50.0, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
+        for n, s in NODES.items()
+    }
+    outputs: dict[str, Any] = {
+        "sensor": {"th": np.float32(0), "thdot": np.float32(0)},
+        "agent": {"action": np.zeros(1, np.float32)},
+        "actuator": {"action": np.zeros(1, np.float32)},
+    }
+    metadata = {"pipeline": "pendulum", "graph": graph, "units": UNITS}
+    inputs = [(n, s) for n, s in NODES.items() if s]
+    recorder = McapRecorder(path, metadata, {}, outputs, inputs, {})
+    recorder.start(1_790_000_000_000_000_000, MONOTONIC_NS)
+    for k in range(steps):
+        begin, t = k * PERIOD_US, k * PERIOD_US / 1e6
+        action = np.array([np.sin(3 * t)], np.float32)
+        values = {
+            "sensor": {"th": np.float32(np.sin(t)), "thdot": np.float32(np.cos(t))},
+            "agent": {"action": action},
+            "actuator": {"action": action},
+        }
+        at = begin
+        for number, node in enumerate(NODES):
+            late = 4000 if (node, k) == ("agent", 100) else 50
+            end_at = at + late + 1000
+            recorder.step(StepRecord(node, k, begin + 500 * number, at, at + late, -1, end_at, 0), values[node])
+            if number < 2:
+                reader = list(NODES)[number + 1]
+                recorder.message(MessageRecord(reader, node, k, k, end_at, end_at + 10))
+            at = end_at + 10
+    timing = {n: {"steps": steps, "period_s": [0.02] * 3, "lateness_s": [0.0] * 3, "overruns": 1} for n in NODES}
+    if end:
+        recorder.close("finished", 0, {"timing": timing, "lost_replies": 3, "monotonic_ns": MONOTONIC_NS})
+    else:
+        recorder.close()
+
+
+def write_truth(path: Path) -> None:
+    """Write the truth at 200 Hz, from half a second before the episode."""
+    log = TruthLog(path, {"state_names": ["th", "thdot", "voltage"], "truth": {}, "servo_ids": [1]})
+    for k in range(-100, STEPS * 4 + 50):
+        t_ns = MONOTONIC_NS + k * 5_000_000
+        t = k * 0.005
+        log.write(Kind.STATE, 0, 0, t_ns, 0, 0, (np.sin(t + 0.012), np.cos(t + 0.012), 0.0))
+    log.close()
+
+
+def parameters(truth: bool = True) -> dict[str, Any]:
+    def entry(name: str, unit: str, kind: str, estimate: float, se: float | None, nominal: float, true: float) -> dict:
+        low, high = (None, None) if se is None else (estimate - 2 * se, estimate + 2 * se)
+        return {
+            "name": name, "unit": unit, "kind": kind, "about": f"about {name}", "nominal": nominal,
+            "estimate": estimate, "standard_error": se, "low95": low, "high95": high,
+            "lower": 0.0 if kind != "dynamics" else nominal / 4, "upper": 0.06 if unit == "s" else nominal * 4,
+            "verdict": "accepted", "truth": true if truth else None,
+        }  # fmt: skip
+
+    names = [EVIL, "friction", "sensor_delay"]
+    return {
+        "pipeline": "pendulum",
+        "log": {"path": "session.mcap", "sha256": "0" * 64},
+        "parameters": [
+            entry(EVIL, "rad/s^2/V", "dynamics", 21.0784, 0.0231, 26.96, 21.10),
+            entry("friction", "rad/s^2", "dynamics", 8.507, None, 6.097, 8.482),
+            entry("sensor_delay", "s", "delay", 0.01234, 0.0005, 0.0, 0.0119),
+            entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446),
+        ],
+        "correlation": {"names": names, "matrix": (np.eye(3) * 0.5 + 0.5).tolist()},
+        "search": {"history": [9.0, 4.0, 1.5, None, 1.0], "evaluations": 1920, "seconds": 12.3},
+        "prediction": [
+            {"model": m, "horizon_s": h, "held_out": o, "th_rmse": e * (1 + h), "thdot_rmse": 5 * e}
+            for m, e in (("identified", 0.0117), ("nominal", 0.29), ("hold", 0.8))
+            for h in (0.1, 0.5, 1.0)
+            for o in (False, True)
+        ],
+        "segments": 6,
+        "held_out_from_s": 3.0,
+        "units": UNITS,
+    }
+
+
+def predictions() -> dict[str, np.ndarray]:
+    """Six segments of 1 s each; the last two are held out and overlap by half a second."""
+    starts = [0.0, 1.0, 2.0, 3.0, 3.5, 4.1]
+    t = np.concatenate([s + np.arange(0, 1.0, 0.02) for s in starts])
+    segment = np.repeat(np.arange(len(starts)), 50)
+    values = {"t": t, "segment": segment, "held_out": segment >= 3}
+    for field, true in (("th", np.sin(t)), ("thdot", np.cos(t))):
+        values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_nominal": 1.3 * true}
+    return values
+
+
+def history(seeds: int = 3) -> dict[str, Any]:
+    steps = [1000 * k for k in range(1, 11)]
+    curves = [[-1300.0 / k - 10 * s for s in range(seeds)] for k in range(1, 11)]
+    success = [[min(1.0, 0.1 * k) for _ in range(seeds)] for k in range(1, 11)]
+    return {"steps": steps, "return": curves, "success": success, "seconds": [1.5 * k for k in range(1, 11)]}
+
+
+def result(simulated: bool = True) -> dict[str, Any]:
+    real = {"success": 0.98, "first_upright_s": 1.375, "command_rms_v": 0.97}
+    model = {"success": 1.0, "first_upright_s": 1.340, "command_rms_v": 0.46} if simulated else None
+    rows = [
+        {"quantity": q, "real": v, "simulation": model[q] if model else None, "gap": v - model[q] if model else None}
+        for q, v in real.items()
+    ]
+    return {"episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
+
+
+def simulation() -> dict[str, np.ndarray]:
+    """Two episodes: states at 100 Hz, commands at 50 Hz, the second one's with times of their own."""
+    t = np.arange(1, 401) / 100
+    found: dict[str, np.ndarray] = {}
+    for i in range(2):
+        found |= {f"t_{i}": t, f"th_{i}": np.sin(t), f"thdot_{i}": np.cos(t), f"command_{i}": np.sin(3 * t[::2])}
+    return {**found, "t_command_1": t[::2] + 0.003}
+
+
+def write_stage(run: Path, stage: str, folder: str | None = None, status: str = "finished") -> Path:
+    """Write a stage's folder with its manifest."""
+    path = run / (folder or stage)
+    path.mkdir(parents=True)
+    outputs = {"record": {"log": "session.mcap", "truth": "truth.bin"}, "train": {"history": "history.json"}}
+    if stage == "record":
+        write_log(path / "session.mcap")
+        write_truth(path / "truth.bin")
+    elif stage == "identify":
+        (path / "parameters.json").write_text(json.dumps(parameters()))
+        np.savez(path / "predictions.npz", **predictions())
+    elif stage == "train":
+        (path / "history.json").write_text(json.dumps(history()))
+    else:
+        for i in range(2):
+            write_log(path / f"episode_{i}.mcap")
+        (path / "result.json").write_text(json.dumps(result()))
+        np.savez(path / "simulation.npz", **simulation())
+        write_truth(path / "truth.bin")
+    manifest = {
+        "format": 1, "pipeline": "pendulum", "stage": stage, "status": status, "started": "2026-11-21T08:26:16+00:00",
+        "duration_s": 6.875, "config": {"seed": 7, "gate": {"limit": 2.0}}, "inputs": {},
+        "outputs": {n: {"path": f, "sha256": "ab" * 32} for n, f in outputs.get(stage, {}).items()},
+        "summary": {"lost replies": 3}, "versions": {"sim2real": "0.1.0"},
+    }  # fmt: skip
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    return path
+
+
+def write_run(root: Path) -> Path:
+    """Write a run with all four stages, and a later attempt at identify that failed."""
+    run = root / "pendulum" / "20261121-082616-360"
+    for stage in ("record", "identify", "train", "deploy"):
+        write_stage(run, stage)
+    return run

@@ -1,0 +1,141 @@
+"""The figures: well-formed, readable without colour, and showing what they are given."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic_run
+
+from sim2real.view import figures, intervals, timing
+from sim2real.view.artifacts import read_deployment, read_identification, read_training
+from sim2real.view.run import finished
+from sim2real.view.signals import read_recording
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def artifacts(finished_run):
+    return finished(finished_run)
+
+
+@pytest.fixture(scope="module")
+def found(artifacts):
+    return read_identification(artifacts["identify"])
+
+
+@pytest.fixture(scope="module")
+def log(artifacts):
+    return read_recording(artifacts["record"].folder / "session.mcap", artifacts["record"].folder / "truth.bin")
+
+
+@pytest.fixture(scope="module")
+def drawn(artifacts, found, log):
+    """Every figure there is, by name."""
+    training = read_training(artifacts["train"])
+    return {
+        "record": figures.recording(log, "record"),
+        "intervals": intervals.intervals(found.estimates, "intervals"),
+        "predictions": figures.predictions(found, "predictions"),
+        "errors": figures.prediction_errors(found, "errors"),
+        "search": figures.search(found, "search"),
+        "correlation": figures.correlation(*found.correlation, "correlation"),
+        "training": figures.training(training, "training"),
+        "best": figures.training(replace(training, best_seed=1), "best"),
+        "deployment": figures.deployment(read_deployment(artifacts["deploy"]), 1, "deployment"),
+        "histograms": timing.histograms(log.episode, "histograms"),
+        "schedule": timing.schedule(log.episode, "schedule"),
+    }
+
+
+def texts(svg: str) -> list[str]:
+    return ["".join(t.itertext()) for t in ET.fromstring(svg).iter(f"{SVG}text")]
+
+
+def test_every_figure_is_one_well_formed_element_with_a_label(drawn):
+    for name, svg in drawn.items():
+        root = ET.fromstring(svg)
+        assert root.tag == f"{SVG}svg", name
+        assert root.get("role") == "img"
+        assert root.get("aria-label")
+        assert "<metadata" not in svg
+        assert "<image" not in svg, f"{name} holds pixels"
+
+
+def test_ids_differ_between_the_figures_of_a_page(drawn):
+    ids = [element.get("id") for svg in drawn.values() for element in ET.fromstring(svg).iter() if element.get("id")]
+    assert len(ids) == len(set(ids))
+
+
+def test_every_reference_in_a_figure_leads_somewhere(drawn):
+    link = "{http://www.w3.org/1999/xlink}href"
+    for name, svg in drawn.items():
+        elements = list(ET.fromstring(svg).iter())
+        ids = {e.get("id") for e in elements}
+        references = {e.get(link)[1:] for e in elements if e.get(link)}
+        references |= {e.get("clip-path")[5:-1] for e in elements if e.get("clip-path")}
+        assert references <= ids, name
+
+
+def test_text_is_text_and_is_never_parsed_as_mathematics(drawn):
+    assert synthetic_run.EVIL in texts(drawn["intervals"])
+    for name, svg in drawn.items():
+        assert not [t for t in texts(svg) if "mathdefault" in t], name
+
+
+def test_colours_follow_the_page_and_stand_alone(drawn):
+    for svg in drawn.values():
+        assert "var(--ink, #1b2430)" in svg
+
+
+def test_units_stand_at_the_axes(drawn):
+    assert {"th [rad]", "thdot [rad/s]", "actuator.action [V]"} <= set(texts(drawn["record"]))
+    assert {"th [rad]", "actuator.action [V]"} <= set(texts(drawn["deployment"]))
+
+
+def test_lines_differ_by_more_than_colour(drawn):
+    assert "stroke-dasharray" in drawn["predictions"]
+    legend = texts(drawn["predictions"])
+    assert {"measured", "identified model", "nominal model", "held out"} <= set(legend)
+
+
+def test_the_latest_awakening_is_named(drawn):
+    assert "Around the latest awakening: agent, 4.0 ms" in texts(drawn["schedule"])
+
+
+def test_correlations_stand_in_the_cells(drawn):
+    assert texts(drawn["correlation"]).count("0.50") == 6
+
+
+def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
+    bare = [
+        replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
+        for e in found.estimates
+    ]
+    labels = texts(intervals.intervals(bare, "bare"))
+    assert "truth" not in labels
+    assert labels.count("no standard error") == len(bare)
+
+
+def test_overlapping_segments_are_drawn_once(found):
+    t_s = found.samples["t"][found.disjoint()]
+    assert np.all(np.diff(t_s) > 0)
+    assert set(found.samples["segment"][found.disjoint()]) == {0, 1, 2, 3, 5}
+
+
+def test_a_sample_is_shown_when_it_was_taken_and_a_command_when_it_was_sent(log):
+    th = next(s for s in log.measured if s.name == "th")
+    action = next(s for s in log.last_command() if s.name == "action")
+    assert action.source == "actuator"
+    assert th.t_s[3] == pytest.approx(0.06)
+    assert action.t_s[3] == pytest.approx(0.06 + 3 * 1050e-6 + 20e-6)
+
+
+def test_the_truth_is_on_the_clock_of_the_log_and_cut_to_it(log):
+    true = log.truth["th"]
+    assert 0 <= true.t_s[0] < 0.006
+    assert true.t_s[-1] <= log.episode.duration_s
+    np.testing.assert_allclose(true.values, np.sin(true.t_s + 0.012), atol=1e-9)

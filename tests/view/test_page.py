@@ -1,0 +1,234 @@
+"""The report: complete, escaped, self-contained, and without an error in a real browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import synthetic_run
+
+from sim2real.errors import Sim2RealError
+from sim2real.view.blocks import MISSING, decimals_for, fixed, number, spoken
+from sim2real.view.page import deploy_page, identify_page, report
+
+CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--enable-logging=stderr",
+)  # fmt: skip
+
+
+class Page(HTMLParser):
+    """Collects what a page consists of, and checks that its elements are nested in order."""
+
+    VOID = frozenset({"meta", "link", "br", "img", "input", "hr"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert not self.stack
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        if self.stack and self.stack[-1] != "style":
+            self.words.append(data.strip())
+
+    def values(self, name: str) -> list[str]:
+        return [attrs[name] or "" for _, attrs in self.elements if name in attrs]
+
+
+@pytest.fixture(scope="module")
+def page(finished_run):
+    return Page(report(finished_run).read_text(encoding="utf-8"))
+
+
+def test_the_numbers_are_there(page):
+    words = set(page.words)
+    assert {"21.078", "0.023", "rad/s²/V", "26.96", "21.100", "accepted", "about friction"} <= words
+    assert {"12.34", "0.50", "11.90", "0 to 60.00", "ms"} <= words, "delays are given in ms"
+    assert {"first upright", "1.375", "1.340", "0.03500"} <= words, "the gap table"
+    assert {"44.8 ± 0.1 ms", "truth 44.6 ms", "98%"} <= words, "the tiles"
+    assert {"gate.limit", "2", "ab" * 32} <= words, "configuration and hashes"
+
+
+def test_every_stage_has_a_section_and_an_entry_in_the_contents(page):
+    sections = [attrs["id"] for tag, attrs in page.elements if tag == "section"]
+    assert sections == ["record", "identify", "train", "deploy"]
+    links = [attrs["href"] for tag, attrs in page.elements if tag == "a"]
+    assert {f"#{s}" for s in sections} <= set(links)
+
+
+def test_ids_are_unique_and_links_lead_somewhere(page):
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert {href[1:] for tag, a in page.elements if tag == "a" and (href := a["href"] or "")} <= set(ids)
+
+
+def test_names_become_no_markup(page):
+    assert "b" not in {tag for tag, _ in page.elements}
+    assert synthetic_run.EVIL in page.words
+
+
+def test_nothing_is_fetched_and_nothing_runs(page):
+    for name in ("src", "href", "xlink:href", "srcset", "data", "action"):
+        assert all(v.startswith("#") for v in page.values(name)), name
+    assert not {"script", "link", "iframe", "object", "img"} & {tag for tag, _ in page.elements}
+    styles = " ".join(page.values("style"))
+    assert set(re.findall(r"url\((.)", styles)) <= {"#"}
+    assert "default-src 'none'; style-src 'unsafe-inline'" in page.values("content")
+
+
+def test_it_can_be_read_without_seeing_it(page):
+    assert {"lang": "en"} in [attrs for tag, attrs in page.elements if tag == "html"]
+    tables = [tag for tag, _ in page.elements if tag == "table"]
+    captions = [tag for tag, _ in page.elements if tag == "caption"]
+    assert len(tables) == len(captions) > 5
+    assert {"col", "row"} == set(page.values("scope"))
+    for tag, attrs in page.elements:
+        assert tag != "svg" or (attrs["role"] == "img" and attrs["aria-label"])
+
+
+def test_a_record_alone_makes_a_report(tmp_path):
+    run = tmp_path / "pendulum" / "run"
+    synthetic_run.write_stage(run, "record")
+    text = report(run).read_text(encoding="utf-8")
+    assert '<section id="record"' in text
+    assert '<section id="train"' not in text
+
+
+def test_the_newest_finished_attempt_is_shown_and_a_newer_failure_is_told(only):
+    run = only("identify")
+    (run / "identify").rename(run / "identify.1")
+    failed = run / "identify"
+    failed.mkdir()
+    (failed / "manifest.json").write_text(json.dumps({"stage": "identify", "status": "failed", "error": "<i>no</i>"}))
+    text = report(run).read_text(encoding="utf-8")
+    assert "The newest attempt at identify is failed (&lt;i&gt;no&lt;/i&gt;): this page shows identify.1." in text
+    assert "21.078" in text
+
+
+def test_a_log_that_was_cut_is_shown_with_a_note(only):
+    run = only("record")
+    log = run / "record" / "session.mcap"
+    log.write_bytes(log.read_bytes()[: int(0.6 * log.stat().st_size)])
+    text = report(run).read_text(encoding="utf-8")
+    assert "is not whole" in text
+    assert "actuator.action [V]" in text
+
+
+@pytest.mark.parametrize(("stage", "write"), [("identify", identify_page), ("deploy", deploy_page)])
+def test_a_stage_writes_its_page_before_its_manifest_lists_anything(run, stage, write):
+    (run / stage / "manifest.json").write_text(json.dumps({"pipeline": "pendulum", "status": "running"}))
+    path = write(run / stage)
+    assert path == run / stage / "report.html"
+    assert f'<section id="{stage}"' in path.read_text(encoding="utf-8")
+
+
+def test_a_deployment_without_a_simulation_is_shown(run):
+    (run / "deploy" / "result.json").write_text(json.dumps(synthetic_run.result(simulated=False)))
+    np.savez(run / "deploy" / "simulation.npz")
+    words = Page(deploy_page(run / "deploy").read_text(encoding="utf-8")).words
+    assert {"first upright", "1.375"} <= set(words)
+    assert "1.340" not in words
+
+
+def test_one_seed_and_missing_numbers_are_shown(only):
+    run = only("identify", "train")
+    (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
+    data = synthetic_run.parameters(truth=False)
+    del data["correlation"], data["search"]
+    (run / "identify" / "parameters.json").write_text(json.dumps(data))
+    words = Page(report(run).read_text(encoding="utf-8")).words
+    assert "one seed" in words
+    assert "truth" not in words
+
+
+MALFORMED = {
+    "no JSON": ("identify", "parameters.json", b"{", "parameters.json is malformed"),
+    "no parameters": ("identify", "parameters.json", b"{}", "no entry 'parameters'"),
+    "a list": ("train", "history.json", b"[]", "not a JSON object"),
+    "ragged": (
+        "train",
+        "history.json",
+        b'{"steps":[1],"return":[[1],[2,3]],"success":[[1]],"seconds":[1]}',
+        "malformed",
+    ),
+    "no archive": ("identify", "predictions.npz", b"PK", "predictions.npz is malformed"),
+    "no episodes": ("deploy", "result.json", b'{"episodes":[],"gap":[]}', "no episode"),
+    "missing": ("deploy", "simulation.npz", None, "has no 'simulation'"),
+    "no log": ("record", "session.mcap", b"nothing", "session.mcap"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_what_is_malformed_is_named_with_a_hint(only, case):
+    stage, name, content, message = MALFORMED[case]
+    run = only(stage)
+    path = run / stage / name
+    path.unlink() if content is None else path.write_bytes(content)
+    with pytest.raises(Sim2RealError, match=re.escape(message)) as caught:
+        report(run)
+    assert caught.value.hint
+    assert not (run / "report.html").exists()
+
+
+def test_no_finished_stage_and_no_folder_are_errors(tmp_path):
+    with pytest.raises(Sim2RealError, match="no finished stage"):
+        report(tmp_path)
+    with pytest.raises(Sim2RealError, match="there is no folder"):
+        identify_page(tmp_path / "identify")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (21.0784, "21.08"), (0.0, "0"), (6.4e-5, "6.400e\u22125"), (-0.25, "\u22120.2500"), (12345.6, "1.235e4"),
+        (1_064_960, "1\u202f064\u202f960"), (None, MISSING), (float("nan"), MISSING), (float("inf"), "∞"),
+        (True, "yes"),
+    ],
+)  # fmt: skip
+def test_numbers_are_written_for_people(value, text):
+    assert number(value) == text
+
+
+def test_a_value_has_as_many_decimals_as_its_standard_error_is_worth():
+    assert fixed(21.0784, decimals_for(0.0231, 21.0784)) == "21.078"
+    assert fixed(112.5, decimals_for(13.0, 112.5)) == "112"
+    assert fixed(8.507, decimals_for(None, 8.507)) == "8.507"
+
+
+def test_a_quantity_says_its_unit():
+    assert spoken("angle_rms_rad") == ("angle rms", "rad")
+    assert spoken("speed_rms_rad_s") == ("speed rms", "rad/s")
+    assert spoken("success") == ("success", "1")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_shows_it_without_an_error(finished_run, tmp_path):
+    assert CHROMIUM is not None
+    url = report(finished_run).resolve().as_uri()
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path}", "--dump-dom", url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "CONSOLE" not in done.stderr
+    dom = Page(done.stdout)
+    assert [attrs["id"] for tag, attrs in dom.elements if tag == "section"] == ["record", "identify", "train", "deploy"]
+    assert sum(tag == "svg" for tag, _ in dom.elements) == done.stdout.count("<figure")
+    assert synthetic_run.EVIL in dom.words

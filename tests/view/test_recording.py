@@ -1,0 +1,176 @@
+"""The Rerun recording: whole, on one timeline, by columns; and what is said without the viewer."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import subprocess
+import sys
+import sysconfig
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_run
+
+from sim2real.errors import Sim2RealError
+from sim2real.graph.episode import StepRecord, steps_from_records
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.view.content import states_of, tabs_of
+from sim2real.view.recording import view
+from sim2real.view.run import finished
+
+RERUN = Path(sysconfig.get_path("scripts")) / "rerun"
+LAVAPIPE = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
+needs_rerun = pytest.mark.skipif(not RERUN.exists(), reason="rerun-sdk is not installed")
+
+
+def rerun(*arguments: str | Path, **environment: str) -> str:
+    """Run the viewer's command line and return what it says."""
+    done = subprocess.run(
+        [RERUN, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "RERUN_ANALYTICS_ENABLED": "0", **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def saved(finished_run, tmp_path_factory):
+    pytest.importorskip("rerun")
+    path = tmp_path_factory.mktemp("rerun") / "run.rrd"
+    view(finished_run, path, load_pipeline("pendulum").load("scene").log_scene)
+    return path
+
+
+@needs_rerun
+def test_the_recording_is_whole_by_the_viewers_own_check(saved):
+    assert "1 file verified without error" in rerun("rrd", "verify", saved)
+
+
+@needs_rerun
+def test_it_was_sent_by_columns(saved):
+    stats = rerun("rrd", "stats", saved)
+    numbers = dict(line.split(" = ", 1) for line in stats.splitlines() if " = " in line)
+    rows, chunks = (int(numbers[n].split()[0].replace(" ", "")) for n in ("num_rows_max", "num_chunks"))
+    assert rows >= synthetic_run.STEPS, "a column of a whole episode in one chunk"
+    assert chunks < 250
+
+
+def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
+    rows = rows_by_entity(saved)
+    for tab in tabs_of(finished(finished_run)):
+        for curve in (c for curves in tab.plots.values() for c in curves):
+            assert rows[f"/{curve.entity}"] == len(curve.t_s), curve.entity
+    for folder in ("record", "deploy/0", "deploy/1"):
+        assert rows[f"/{folder}/lateness/agent"] == synthetic_run.STEPS
+        assert rows[f"/{folder}/schedule/agent"] >= 3 * synthetic_run.STEPS
+        assert rows[f"/{folder}/scene/robot/turning"] == synthetic_run.STEPS
+    assert rows["/deploy/0/scene/simulation/turning"] == 400
+    assert rows["/identify/scene/identified/turning"] == 250
+
+
+def rows_by_entity(path: Path) -> Counter[str]:
+    """Return entity -> rows on the timeline; any other timeline is a failure."""
+    from rerun.chunk import RrdReader
+
+    rows: Counter[str] = Counter()
+    for chunk in RrdReader(path).stream().to_chunks():
+        if not chunk.is_static:
+            assert chunk.timeline_names == ["time"], chunk.entity_path
+            rows[chunk.entity_path] += chunk.num_rows
+    return rows
+
+
+def test_a_record_alone_can_be_viewed_without_a_scene(tmp_path):
+    pytest.importorskip("rerun")
+    run = tmp_path / "pendulum" / "run"
+    synthetic_run.write_stage(run, "record")
+    view(run, tmp_path / "new" / "run.rrd")
+    assert not [entity for entity in rows_by_entity(tmp_path / "new" / "run.rrd") if "scene" in entity]
+
+
+def test_plots_bring_together_who_speaks_of_the_same(finished_run):
+    tabs = {tab.title: tab for tab in tabs_of(finished(finished_run))}
+    assert list(tabs) == ["Record", "Identify", "Deploy 0", "Deploy 1"]
+    labels = {title: [c.label for c in curves] for title, curves in tabs["Deploy 0"].plots.items()}
+    assert labels["th [rad]"] == ["measured by sensor", "true state", "simulation"]
+    assert labels["action [V]"] == ["sent by actuator", "simulation"]
+    command = tabs["Deploy 1"].plots["action [V]"][1]
+    assert command.t_s[0] == pytest.approx(0.013), "the times that the simulation gave"
+
+
+def test_a_line_is_interrupted_where_a_segment_ends(finished_run):
+    tab = next(t for t in tabs_of(finished(finished_run)) if t.title == "Identify")
+    curve = tab.plots["th [rad]"][1]
+    assert np.isnan(curve.values).sum() == 4
+    assert np.all(np.diff(curve.t_s) > 0)
+
+
+def test_states_follow_each_other_from_due_to_end():
+    records = [
+        StepRecord("n", 0, 0, 0, 100, -1, 30_000, 0),
+        StepRecord("n", 1, 20_000, 30_000, 30_000, -1, 31_000, 0),
+        StepRecord("n", 2, 40_000, 45_000, 45_200, -1, 46_000, 0),
+    ]
+    times, states = states_of(steps_from_records(records))
+    assert list(zip((1e3 * times).round(3).tolist(), states, strict=True)) == [
+        (0.0, "late"), (0.1, "computing"),
+        (30.0, "computing"), (31.0, "idle"),
+        (40.0, "waiting"), (45.0, "late"), (45.2, "computing"), (46.0, "idle"),
+    ]  # fmt: skip
+
+
+def test_the_pendulum_points_where_the_angle_says(saved):
+    from rerun.chunk import RrdReader
+
+    chunks = RrdReader(saved).stream().to_chunks()
+    turns = next(c for c in chunks if c.entity_path == "/record/scene/robot/turning" and not c.is_static)
+    batch = turns.to_record_batch()
+    column = next(c for c in batch.schema.names if "quaternion" in c)
+    x, y, z, w = np.array([q[0] for q in batch.column(column).to_pylist()]).T
+    np.testing.assert_allclose(2 * np.arctan2(y, w), np.sin(0.02 * np.arange(len(y))), atol=1e-5)
+    assert not x.any()
+    assert not z.any()
+
+
+def test_without_the_viewer_the_error_names_the_extra(run, monkeypatch):
+    real_import = builtins.__import__
+
+    def no_rerun(name, *arguments, **keywords):
+        if name.partition(".")[0] == "rerun":
+            raise ModuleNotFoundError("No module named 'rerun'")
+        return real_import(name, *arguments, **keywords)
+
+    monkeypatch.setattr(builtins, "__import__", no_rerun)
+    with pytest.raises(Sim2RealError, match="not installed") as caught:
+        view(run, run / "run.rrd")
+    assert caught.value.hint == "pip install 'sim2real[view]'"
+
+
+def test_a_place_that_cannot_be_written_is_named(run):
+    pytest.importorskip("rerun")
+    with pytest.raises(Sim2RealError, match="cannot write"):
+        view(run, run / "record" / "session.mcap" / "run.rrd")
+
+
+def test_importing_the_room_imports_no_viewer():
+    code = "import sys, sim2real.view.recording, sim2real.view.page; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+@needs_rerun
+@pytest.mark.skipif(not LAVAPIPE.exists(), reason="no software Vulkan (mesa-vulkan-drivers) is installed")
+def test_the_viewer_draws_it(saved, tmp_path):
+    picture = tmp_path / "run.png"
+    rerun(
+        "--headless", "--screenshot-to", picture, "--window-size", "900x600", saved, VK_ICD_FILENAMES=str(LAVAPIPE)
+    )  # fmt: skip
+    from matplotlib.image import imread
+
+    pixels = imread(picture)[..., :3]
+    assert len(np.unique((pixels * 16).astype(int).reshape(-1, 3), axis=0)) > 20, "more than an empty window"
