@@ -194,9 +194,12 @@ def _view(command: str, arguments: list[str]) -> None:
     parsed = flags.parse(default, rest, f"sim2real {command} {target}", description, epilog)
     run_dir = runs.find_run(parsed.runs, target)
     if isinstance(parsed, flags.ViewFlags):
+        from sim2real.stages.pipeline import load_pipeline
         from sim2real.view.recording import view
+        from sim2real.view.run import pipeline_of
 
-        view(run_dir, parsed.save)
+        pipeline = load_pipeline(pipeline_of(run_dir))
+        view(run_dir, parsed.save, pipeline.load(pipeline.scene).log_scene if pipeline.scene else None)
         if parsed.save is not None:
             console.wrote(parsed.save)
     else:

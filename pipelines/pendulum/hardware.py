@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,8 @@ class Session:
                 plant = f"{Path(__file__).with_name('plant.py')}:PendulumPlant"
                 self.embedded = opening.enter_context(EmbeddedRobot(plant, config, truth_path=truth_path))
                 port = self.embedded.port
+                # The last command, torque off, takes its time to the motor; the truth shall show that it came.
+                opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
             gate = GateConfig(limits.limit, limits.slew_per_s, limits.command_timeout_s, limits.max_speed_rad_s)
             bus = BusConfig(port, BAUD_RATE, watchdog_s=limits.servo_watchdog_s)
             self.rig = opening.enter_context(ServoRig(bus, gate, [SERVO_ID], SUPPLY_V))

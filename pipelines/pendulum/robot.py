@@ -23,6 +23,7 @@ from .task import SwingUp, upright
 RATE_HZ = 50.0
 SUPERVISOR = "agent"
 COMMAND = ("actuator", "action")
+UNITS = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V", "command": "V"}
 JOINTS = {
     "sensor": {"hinge": {"position": "th", "velocity": "thdot"}},
 }
@@ -33,6 +34,8 @@ OBSERVATION = [
 ]
 ACTION = [("voltage", "V")]
 WORLD_HZ = 100.0
+_BURST = 3
+"""After a hiccup of a thread, commands that waited for it leave at once: so many more than the rate explains."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 DELAY_SPREAD_S = 0.002
 """By how much delays vary between episodes of training, either way [s]."""
@@ -56,7 +59,8 @@ class IdentifiablePendulum:
         sensor = SimSensor("sensor", RATE_HZ)
         actuator = SimActuator("actuator", RATE_HZ)
         world = DelayedWorld("world", WORLD_HZ)
-        world.connect(actuator, skip=True, delay_dist=TrainableDist.create(start, 0.0, max_delay_s, "zoh_mean"))
+        to_world = TrainableDist.create(start, 0.0, max_delay_s, "zoh_mean", burst=_BURST)
+        world.connect(actuator, skip=True, delay_dist=to_world)
         sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s, "linear"))
         return {n.name: n for n in (sensor, actuator, world)}
 
@@ -88,7 +92,7 @@ def simulated_nodes(
     )
     nodes = control_nodes(sensor, agent, actuator)
     world = DelayedWorld("world", WORLD_HZ)
-    to_world = TrainableDist.create(*delays["actuator_delay"], "zoh_mean") if delays else None
+    to_world = TrainableDist.create(*delays["actuator_delay"], "zoh_mean", _BURST) if delays else None
     from_world = TrainableDist.create(*delays["sensor_delay"], "linear") if delays else None
     world.connect(actuator, skip=True, delay_dist=to_world)
     # The expected delay stays out of the phases: on the robot nothing waits for the world either.

@@ -6,7 +6,6 @@ import operator
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 from flax import struct
 
 T = TypeVar("T", bound="Base")
@@ -120,10 +119,3 @@ class GraphState(Base):
     delays: Any = struct.field(default_factory=dict)
     buffer: Any = struct.field(default_factory=dict)
     aux: Any = struct.field(default_factory=dict)
-
-
-def fill_window(output: Any, window: int) -> InputState:
-    """Return the window of an input on which nothing has arrived: ``window`` copies of one default output."""
-    data = jax.tree_util.tree_map(lambda leaf: jnp.broadcast_to(leaf, (window, *jnp.shape(leaf))), output)
-    zeros = jnp.zeros(window, jnp.float32)
-    return InputState(seq=jnp.full(window, -1, jnp.int32), ts_sent=zeros, ts_recv=zeros, data=data)

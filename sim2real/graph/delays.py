@@ -148,16 +148,20 @@ class TrainableDist(Base, DelayDistribution):
         min: Least delay [s].
         max: Largest delay [s].
         interp: ``zoh``, ``linear``, ``linear_real_only`` (real messages only), or ``zoh_mean`` (inputs of a world).
+        burst: Messages that may come within the bounds on top of what the sender's rate explains.
     """
 
     alpha: Any
     min: float = struct.field(pytree_node=False)
     max: float = struct.field(pytree_node=False)
     interp: str = struct.field(pytree_node=False, default="zoh")
+    burst: int = struct.field(pytree_node=False, default=0)
 
     @classmethod
-    def create(cls, delay: float, min: float, max: float, interp: str = "zoh") -> TrainableDist:
+    def create(cls, delay: float, min: float, max: float, interp: str = "zoh", burst: int = 0) -> TrainableDist:
         """Return the distribution with ``delay`` [s] between ``min`` and ``max`` [s].
+
+        ``burst`` messages more than the sender's rate explains may come within the bounds: recorded timing needs some.
 
         Raises:
             UsageError: Unless ``0 <= min < max``, ``min <= delay <= max`` and ``interp`` is known.
@@ -168,7 +172,8 @@ class TrainableDist(Base, DelayDistribution):
             raise UsageError(f"a trainable delay needs 0 <= min < max, got min={min} s and max={max} s")
         if not min <= delay <= max:
             raise UsageError(f"the delay {delay} s lies outside its bounds [{min}, {max}] s")
-        return cls(alpha=jnp.float32((delay - min) / (max - min)), min=min, max=max, interp=interp)
+        alpha = jnp.float32((delay - min) / (max - min))
+        return cls(alpha=alpha, min=min, max=max, interp=interp, burst=burst)
 
     @property
     def delay(self) -> Any:
@@ -191,8 +196,8 @@ class TrainableDist(Base, DelayDistribution):
         return float(self.delay)
 
     def window(self, rate_out: float) -> int:
-        """Return ``ceil(rate_out * (max - min))``, what the reader's window grows by."""
-        return math.ceil(round(rate_out * (self.max - self.min), 9))
+        """Return ``ceil(rate_out * (max - min)) + burst``, what the reader's window grows by."""
+        return math.ceil(round(rate_out * (self.max - self.min), 9)) + self.burst
 
     def apply(
         self, inputs: InputState, age_s: Any, window: int, period_s: float, ts_s: Any = 0.0, skip: bool = False

@@ -57,7 +57,9 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         ]
         simulated = _simulate(pipeline, robot, policy, stage.run_dir, read_log(logs[0]), config.duration_s)
         result = _compare(robot, real, simulated)
-        stage.output("result", "result.json").write_text(json.dumps({**result, "timing": timing}, indent=1))
+        stage.output("result", "result.json").write_text(
+            json.dumps({**result, "timing": timing, "units": dict(robot.UNITS)}, indent=1)
+        )
         columns: dict[str, Any] = _first_episodes(simulated, len(logs))
         np.savez_compressed(stage.output("simulation", "simulation.npz"), **columns)
         from sim2real.view.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
@@ -162,7 +164,8 @@ def _simulate(
         ran = command.seq[e] >= 0
         sent = getattr(command.output, robot.COMMAND[1])[e][ran].reshape(int(ran.sum()), -1)[:, 0]
         states = {f: np.asarray(getattr(world.output, f)[e]) for f in world.output.__dataclass_fields__}
-        runs.append(((world.seq[e] + 1) / rate, {**states, "command": sent}))
+        when = graph.timeline.vertices[robot.COMMAND[0]].end[e][command.seq[e][ran]] / TICKS_PER_S
+        runs.append(((world.seq[e] + 1) / rate, {**states, "command": sent, "t_command": when}))
     return runs
 
 

@@ -60,6 +60,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         samples: dict[str, Any] = _predictions(problem, {"identified": values, "nominal": _nominal(problem)}, config)
         errors = _errors(problem, samples, config)
         document = _document(pipeline, path, problem, found, spread, values, truth, errors, seconds)
+        document["units"] = dict(robot.UNITS)
         stage.output("parameters", "parameters.json").write_text(json.dumps(document, indent=1))
         np.savez_compressed(stage.output("predictions", "predictions.npz"), **samples)
         from sim2real.view.page import identify_page  # matplotlib and jinja2 take 0.5 s to import

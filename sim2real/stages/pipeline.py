@@ -29,6 +29,7 @@ class Pipeline:
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
         robot: Module in the package with the robot's parts for the stages (see ``sim2real.stages.robot.Robot``).
+        scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None draws none.
         record: Defaults of the stage; its fields become the flags.
         identify: Defaults of the stage.
         train: Defaults of the stage.
@@ -39,6 +40,7 @@ class Pipeline:
     summary: str
     package: str
     robot: str = "robot"
+    scene: str | None = None
     record: RecordConfig = RecordConfig()
     identify: IdentifyConfig = IdentifyConfig()
     train: TrainConfig = TrainConfig()

@@ -32,6 +32,7 @@ class Robot(Protocol):
         RATE_HZ: Rate of the supervisor [Hz].
         SUPERVISOR: Name of the node that the policy acts for.
         COMMAND: Node and field of the command that reaches the motors.
+        UNITS: Field of a message -> its unit, for axes.
         JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
         OBSERVATION: Terms of the policy's observation in order: name, units of its entries, steps of history.
         ACTION: Names of the actions, with units, in order.
@@ -40,6 +41,7 @@ class Robot(Protocol):
     RATE_HZ: float
     SUPERVISOR: str
     COMMAND: tuple[str, str]
+    UNITS: Mapping[str, str]
     JOINTS: Mapping[str, Any]
     OBSERVATION: list[tuple[str, tuple[str, ...], int]]
     ACTION: list[tuple[str, str]]

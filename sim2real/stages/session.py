@@ -175,6 +175,7 @@ def _recorder(
         "pipeline": pipeline.name,
         "config": plain(asdict(config)),
         "graph": topology,
+        "units": dict(robot.UNITS),
         "versions": plain(versions()),
         "git": plain(git_state()),
         "seed": config.seed,

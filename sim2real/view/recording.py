@@ -54,7 +54,8 @@ def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) ->
     rr = _rerun()
     tabs = tabs_of(finished(run_dir))  # before a viewer opens
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
-    recording = rr.RecordingStream("sim2real", recording_id=name.replace(" ", "/"))
+    # A viewer keeps one arrangement for each application: another run, with other stages, must not inherit this one's.
+    recording = rr.RecordingStream(f"sim2real {name}")
     try:
         if save is None:
             recording.spawn()
@@ -139,8 +140,15 @@ def _page(tab: Tab, with_scene: bool) -> Any:
     import rerun.blueprint as rrb
 
     legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop)
+    last = max(float(c.t_s[-1]) for curves in tab.plots.values() for c in curves if len(c.t_s))
+    # The timeline is as long as the longest episode; each tab shows its own.
+    whole = rrb.TimeAxis(
+        view_range=rrb.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seconds=0.0), end=rrb.TimeRangeBoundary.absolute(seconds=last)
+        )
+    )
     plots = [
-        rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend)
+        rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend, axis_x=whole)
         for title, curves in tab.plots.items()
     ]
     side: list[Any] = []
@@ -156,7 +164,9 @@ def _page(tab: Tab, with_scene: bool) -> Any:
             rrb.StateTimelineView(
                 name="Schedule", origin=f"/{tab.entity}/schedule", time_view=rrb.TimeAxis(view_range=near)
             ),
-            rrb.TimeSeriesView(name="Lateness [ms]", origin=f"/{tab.entity}/lateness", plot_legend=legend),
+            rrb.TimeSeriesView(
+                name="Lateness [ms]", origin=f"/{tab.entity}/lateness", plot_legend=legend, axis_x=whole
+            ),
         ]
     left = rrb.Vertical(*plots, name=tab.title)
     if not side:

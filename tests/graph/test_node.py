@@ -7,7 +7,6 @@ import pytest
 import sim2real.graph as base
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling
-from sim2real.graph.base import fill_window
 from sim2real.graph.tree import strong, tree_dynamic_slice, tree_take, tree_where
 
 
@@ -79,7 +78,6 @@ def test_arithmetic_and_indexing_of_messages():
     assert double.data.tolist() == (2 * np.arange(6.0).reshape(3, 2)).tolist()
     assert ((state * 2.0 - state) / 2.0).ts_sent.tolist() == [0.0, 0.5, 1.0]
     assert (-state).seq.tolist() == [0, -1, -2]
-    assert fill_window(jnp.ones(2), 3).data.shape == (3, 2)
 
 
 def test_tree_helpers():

@@ -21,6 +21,7 @@ TINY = [
 ]
 
 FAULTY = """
+import time
 from dataclasses import replace
 from sim2real.stages.pipeline import load_pipeline
 

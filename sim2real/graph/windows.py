@@ -1,0 +1,78 @@
+"""What stands in a reader's window, worked out from a timeline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.delays import TrainableDist
+from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, to_ticks
+from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
+
+_ROUNDING = 2
+"""By how much slots that are rounded one by one may lie closer together than their period [ticks]."""
+
+
+def newest_message(edge: Edge, reader: Vertex) -> np.ndarray:
+    """Return the newest message that each step of the reader has consumed, shape ``(E, N)``; -1 before the first."""
+    steps = np.broadcast_to(np.arange(reader.start.shape[1], dtype=np.int64), reader.start.shape)
+    return search_rows(np.where(edge.seq_in < 0, NEVER, edge.seq_in), steps, "right") - 1
+
+
+def longest_burst(edge: Edge, reader: Vertex) -> int:
+    """Return the most messages that one step after the first has consumed at once."""
+    newest = np.where(np.arange(reader.start.shape[1]) < reader.count[:, None], newest_message(edge, reader), -1)
+    return int(np.diff(newest, axis=1).max(initial=0))
+
+
+def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex) -> np.ndarray:
+    """Return at which steps a trainable delay near its upper bound needs messages that have left the window.
+
+    The window holds what a sender that keeps its rate sends within the bounds. In a burst it holds less time than that;
+    what is in it may then not have arrived yet at the largest delay, and would be a message from the future.
+
+    Returns:
+        Shape ``(E, N)``, bool.
+    """
+    dist = connection.delay_dist
+    if not isinstance(dist, TrainableDist):
+        return np.zeros(reader.start.shape, bool)
+    # The newest message that must have arrived whatever the delay is; of a mean, the one that holds at the start.
+    oldest = newest_message(edge, reader) - (connection.total_window - connection.window)
+    if not (edge.seq_in.shape[1] and reader.start.shape[1]):
+        return np.zeros(reader.start.shape, bool)
+    sent = np.take_along_axis(sender.end, oldest.clip(0), axis=1)
+    young = reader.start - sent < to_ticks(dist.max) - _ROUNDING
+    return young & (oldest >= 0) & (np.arange(reader.start.shape[1]) < reader.count[:, None])
+
+
+def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.ndarray:
+    """Return which episodes have bursts that a window widened for a trainable delay does not hold, ``(E,)``, bool."""
+    bursty = np.zeros(timeline.episodes, bool)
+    for (name, input_name), edge in timeline.edges.items():
+        connection = nodes[name].inputs[input_name]
+        bursty |= overfull(connection, edge, timeline.vertices[name], timeline.vertices[edge.sender]).any(axis=1)
+    return bursty
+
+
+def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
+    """Check that no trainable delay within its bounds ever meets a window that is too short.
+
+    Raises:
+        UsageError: The first place where one would.
+    """
+    for (name, input_name), edge in timeline.edges.items():
+        connection, reader = nodes[name].inputs[input_name], timeline.vertices[name]
+        places = np.argwhere(overfull(connection, edge, reader, timeline.vertices[edge.sender]))
+        if len(places) and isinstance(connection.delay_dist, TrainableDist):
+            episode, step = places[0]
+            raise UsageError(
+                f"input {input_name!r} of node {name!r}: messages of {edge.sender!r} come in bursts that its window of "
+                f"{connection.total_window} does not hold: at {reader.start[episode, step] / TICKS_PER_S:.3f} s of "
+                f"episode {episode} a delay of {connection.delay_dist.max:g} s would need a message that has left it "
+                f"({len(places)} such steps)",
+                hint="leave these episodes out (sim2real.graph.windows.bursty_episodes finds them), or let the "
+                "window hold more: TrainableDist.create(..., burst=2)",
+            )

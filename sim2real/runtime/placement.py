@@ -1,0 +1,249 @@
+"""In which row, and at which turn of it, each step of a timeline is computed.
+
+A world ticks on a fixed grid and always runs. Between the last tick that a step sees and the first tick that its output
+touches there is slack, so the step can be computed at any tick in between. A **row** is one boundary, where steps of
+the other nodes run in **turns**, followed by n world ticks. Pure numpy, ahead of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.graph.schedule import topological
+from sim2real.graph.timeline import Edge, Timeline, search_rows
+from sim2real.graph.windows import newest_message
+
+TURNS = 256
+"""Turns at one boundary, at most."""
+_UNREAD = np.int64(2**40)
+
+Steps = dict[str, np.ndarray]
+"""Node -> a number for each of its steps, shape ``(E, N)``, int64."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the steps are computed.
+
+    Attributes:
+        ticks: World ticks in a row; 1 without a world.
+        rows: Rows in an episode.
+        row: Each step's row; steps whose row lies behind the last one are not computed.
+        turn: Each step's turn at the boundary of its row.
+        slots: (turn, place among the nodes, node) of every slot of a boundary, in the order in which they run.
+    """
+
+    ticks: int
+    rows: int
+    row: Steps
+    turn: Steps
+    slots: list[tuple[int, int, str]]
+
+
+class Placer:
+    """Places the steps of one timeline; see ``place``.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The node whose rate sets the longest row.
+        timeline: What ran when.
+        given: Nodes whose outputs are known beforehand, so that they are not computed.
+
+    Attributes:
+        nodes: The nodes of the timeline, senders before readers.
+        world: The node that ticks in every row: the fastest world; None without one.
+        others: The nodes that are computed at boundaries.
+        edges: The connections between nodes of the timeline.
+        newest: The newest message that each step has consumed, by connection.
+    """
+
+    def __init__(
+        self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, given: frozenset[str]
+    ) -> None:
+        self.timeline, self.supervisor, self.given = timeline, supervisor, given
+        self.nodes = {n: nodes[n] for n in topological(nodes) if n in timeline.vertices}
+        worlds = [n for n in self.nodes.values() if isinstance(n, BaseWorld) and n.name not in given]
+        self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
+        self.others = [n for n in self.nodes if n != self.world and n not in given]
+        self.edges = {k: e for k, e in timeline.edges.items() if k[0] in self.nodes and e.sender in self.nodes}
+        self.newest = {k: newest_message(e, timeline.vertices[k[0]]) for k, e in self.edges.items()}
+
+    def place(self) -> Placement:
+        """Place all steps.
+
+        Raises:
+            UsageError: When the timeline holds no row, or steps of it cannot be put in an order.
+        """
+        if self.world is None:
+            row = self._rows_of_supervisor()
+            placement = self._fill(1, int(self.timeline.vertices[self.supervisor].count.min()), row)
+        else:
+            placement = self._cheapest(int(self.timeline.vertices[self.world].count.min()))
+        if placement.rows < 1:
+            raise UsageError("these timelines are shorter than one row", hint="draw longer timelines")
+        return placement
+
+    def steps(self, name: str) -> np.ndarray:
+        """Return the numbers of a node's steps, shape ``(E, N)``."""
+        shape = self.timeline.vertices[name].start.shape
+        return np.broadcast_to(np.arange(shape[1], dtype=np.int64), shape)
+
+    def valid(self, name: str) -> np.ndarray:
+        """Return which of a node's steps belong to the episode, shape ``(E, N)``, bool."""
+        return self.steps(name) < self.timeline.vertices[name].count[:, None]
+
+    def live(self) -> Iterator[tuple[str, Edge, np.ndarray]]:
+        """Yield reader, edge and newest messages of each connection between nodes that run, by reader."""
+        order = list(self.nodes)
+        keys = [k for k, e in self.edges.items() if e.sender not in self.given and k[0] not in self.given]
+        for key in sorted(keys, key=lambda k: order.index(k[0])):
+            yield key[0], self.edges[key], self.newest[key]
+
+    def _cheapest(self, world_ticks: int) -> Placement:
+        """Return, of the placements that fit every slack, the one with the fewest slots a tick.
+
+        The largest row that fits is not always the best: three steps in ten ticks fit rows of four ticks with two slots
+        each, and rows of three with one.
+        """
+        rate = self.nodes[self.world or ""].rate
+        most = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
+        lowest = self._earliest()
+        highest = self._latest(lowest, 2 * most)
+        best = None
+        for n in range(most, 0, -1):
+            if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self.valid(o)].all() for o in self.others):
+                continue
+            found = self._fill(n, world_ticks // n, self._rows(lowest, highest, n))
+            if best is None or len(found.slots) / n < len(best.slots) / best.ticks:
+                best = found
+        if best is None:
+            raise UsageError("these timelines have no tick of the world", hint="draw longer timelines")
+        return best
+
+    def _fill(self, ticks: int, rows: int, row: Steps) -> Placement:
+        """Return the placement of steps in given rows; steps behind the last row need no slot."""
+        counts = {n: self.valid(n) & (row[n] < rows) for n in self.others}
+        turn = self._turns(row, counts)
+        slots = sorted((int(t), i, n) for i, n in enumerate(self.others) for t in np.unique(turn[n][counts[n]]))
+        return Placement(ticks, rows, row, turn, slots)
+
+    def _earliest(self) -> Steps:
+        """Return for each step how many world ticks it has seen the output of, directly or not."""
+        earliest = {n: np.zeros_like(self.steps(n)) for n in self.others}
+        changed = True
+        while changed:  # one pass carries a bound over one connection; loops run through skipped ones and are short
+            changed = False
+            for reader, edge, newest in self.live():
+                if reader == self.world:
+                    continue
+                bound = newest + 1 if edge.sender == self.world else _heard(earliest[edge.sender], newest)
+                new = np.maximum.accumulate(np.maximum(earliest[reader], bound), axis=1)
+                changed |= bool((new != earliest[reader]).any())
+                earliest[reader] = new
+        return earliest
+
+    def _latest(self, lowest: Steps, slack: int) -> Steps:
+        """Return for each step the first world tick that its output touches, directly or not.
+
+        A step whose output comes to the world late or never could wait forever, and what it reads would have to be kept
+        for it: it waits for at most ``slack`` ticks from its start.
+        """
+        ticks = self.timeline.vertices[self.world or ""].start
+        latest = {}
+        for n in self.others:
+            natural = search_rows(ticks, self.timeline.vertices[n].start)
+            latest[n] = np.maximum(lowest[n], natural) + slack
+        changed = True
+        while changed:
+            changed = False
+            for reader, edge, _ in reversed(list(self.live())):
+                if edge.sender == self.world:
+                    continue
+                at = edge.seq_in
+                touched = at if reader == self.world else np.take_along_axis(latest[reader], at.clip(0), 1)
+                new = np.minimum(latest[edge.sender], np.where(at >= 0, touched, _UNREAD))
+                new = np.minimum.accumulate(new[:, ::-1], axis=1)[:, ::-1]
+                changed |= bool((new != latest[edge.sender]).any())
+                latest[edge.sender] = new
+        return latest
+
+    def _rows(self, lowest: Steps, highest: Steps, n: int) -> Steps:
+        """Return the row of each step: as early as it can be, one step of a node in a row where the slack allows it."""
+        rows = {o: -(-lowest[o] // n) for o in self.others}
+        changed = True
+        while changed:
+            changed = False
+            for name in self.others:
+                row = rows[name]
+                for reader, edge, newest in self.live():
+                    if reader == name and edge.sender != self.world:
+                        row = np.maximum(row, _heard(rows[edge.sender], newest))
+                step = self.steps(name)
+                spread = np.maximum.accumulate(row - step, axis=1) + step
+                row = np.maximum(row, np.minimum(spread, highest[name] // n))
+                changed |= bool((row != rows[name]).any())
+                rows[name] = row
+        return rows
+
+    def _rows_of_supervisor(self) -> Steps:
+        """Without a world a row is one step of the supervisor; the others run as early as their inputs allow."""
+        starts = self.timeline.vertices[self.supervisor].start
+        rows = {n: search_rows(starts, np.ascontiguousarray(self.timeline.vertices[n].start)) for n in self.others}
+        rows[self.supervisor] = self.steps(self.supervisor).copy()
+        changed = True
+        while changed:  # a step never runs in a row before those of the steps that it hears
+            changed = False
+            for reader, edge, newest in self.live():
+                if reader == self.supervisor:
+                    continue
+                new = np.maximum.accumulate(np.maximum(rows[reader], _heard(rows[edge.sender], newest)), axis=1)
+                changed |= bool((new != rows[reader]).any())
+                rows[reader] = new
+        return {n: rows[n] for n in self.others}
+
+    def _turns(self, row: Steps, counts: Mapping[str, np.ndarray]) -> Steps:
+        """Return each step's turn at the boundary: after what it hears and after the node's step before.
+
+        Only the steps in ``counts``, shape ``(E, N)``, bool, take turns.
+        """
+        order = {n: i for i, n in enumerate(self.nodes)}
+        turns = {n: np.zeros_like(r) for n, r in row.items()}
+        changed = True
+        while changed:
+            changed = False
+            for name, r in row.items():
+                new = turns[name].copy()
+                again = r[:, 1:] == r[:, :-1]
+                new[:, 1:] = np.where(again, np.maximum(new[:, 1:], new[:, :-1] + 1), new[:, 1:])
+                for reader, edge, at in self.live():
+                    if reader != name or edge.sender == self.world:
+                        continue
+                    here = (at >= 0) & (np.take_along_axis(row[edge.sender], at.clip(0), 1) == r)
+                    later = int(order[edge.sender] >= order[name])
+                    after = np.take_along_axis(turns[edge.sender], at.clip(0), 1) + later
+                    new = np.where(here, np.maximum(new, after), new)
+                new = np.where(counts[name], new, 0)
+                changed |= bool((new != turns[name]).any())
+                turns[name] = new
+            self._check_turns(turns)
+        return turns
+
+    def _check_turns(self, turns: Steps) -> None:
+        crowded = [n for n, t in turns.items() if int(t.max(initial=0)) >= TURNS]
+        if crowded:
+            between = "ticks of the world" if self.world else f"steps of the supervisor {self.supervisor!r}"
+            raise UsageError(
+                f"node {crowded[0]!r} makes more than {TURNS} steps between two {between}, or steps of "
+                f"{', '.join(crowded)} wait for each other's messages of the same instant",
+                hint="bring the rates closer together; give the nodes of a loop a computation delay",
+            )
+
+
+def _heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:
+    """Return a number of the newest message that each step has consumed; 0 where there is none."""
+    return np.where(newest >= 0, np.take_along_axis(of_sender, newest.clip(0), 1), 0)

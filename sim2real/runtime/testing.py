@@ -1,0 +1,114 @@
+"""An interpreter of index tables in plain Python: what the compiled program does, without compiling it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sim2real.graph.node import BaseNode
+from sim2real.graph.testing.nodes import hash_step
+from sim2real.runtime.wiring import SlotTable, Wiring
+
+Windows = dict[str, tuple[list[int], list[Any]]]
+"""Input name -> seq and value of each message in the window, oldest first."""
+
+
+class TableError(AssertionError):
+    """The tables of a wiring contradict themselves."""
+
+
+def interpret(
+    nodes: Mapping[str, BaseNode],
+    wiring: Wiring,
+    episode: int,
+    step: Callable[[str, int, Windows], Any],
+    defaults: Mapping[str, Any],
+    given: Mapping[str, list[Any]] | None = None,
+) -> dict[str, list[Any]]:
+    """Play one episode of a wiring.
+
+    Messages are found as the compiled program finds them: by their age in a ring of the sender's last outputs. The
+    tables say apart from that which messages they are, so every one is checked.
+
+    Args:
+        nodes: The nodes by name.
+        wiring: The tables.
+        episode: Which episode.
+        step: Makes a step: node, seq, windows -> output.
+        defaults: Default output of each node.
+        given: Outputs of nodes that do not run.
+
+    Returns:
+        The outputs of each node, by seq.
+
+    Raises:
+        TableError: When a window holds another message than the table says, or a node's steps are not in order.
+    """
+    rings = {n: [(-1, defaults[n])] * length for n, length in wiring.rings.items()}
+    made: dict[str, list[Any]] = {n: [] for n in nodes}
+
+    def one(name: str, table: SlotTable, at: tuple[int, ...]) -> None:
+        seq = int(table.seq[at])
+        if seq < 0:
+            return
+        if seq != len(made[name]):
+            raise TableError(f"node {name!r}: step {seq} comes when {len(made[name])} steps are made (row {at})")
+        windows = {}
+        for input_name, t in table.inputs.items():
+            connection = nodes[name].inputs[input_name]
+            sender, width = connection.output_node.name, connection.total_window
+            seqs = t.seq[at].tolist()
+            if given and sender in given:
+                windows[input_name] = seqs, [given[sender][s] if s >= 0 else defaults[sender] for s in seqs]
+                continue
+            ring, age = rings[sender], int(t.age[at])
+            shown = ring[len(ring) - age - width : len(ring) - age]
+            if [s for s, _ in shown] != seqs:
+                raise TableError(
+                    f"node {name!r}, input {input_name!r}, step {seq}: the ring shows {[s for s, _ in shown]}, the table "
+                    f"says {seqs}"
+                )
+            windows[input_name] = seqs, [x for _, x in shown]
+        output = step(name, seq, windows)
+        made[name].append(output)
+        if rings[name]:
+            rings[name] = [*rings[name][1:], (seq, output)]
+
+    for row in range(wiring.rows):
+        for name, table in zip(wiring.slots, wiring.tables, strict=True):
+            one(name, table, (episode, row))
+        if wiring.world is not None and wiring.world_table is not None:
+            for tick in range(wiring.ticks):
+                one(wiring.world, wiring.world_table, (episode, row, tick))
+    return made
+
+
+def interpret_hashes(
+    nodes: Mapping[str, BaseNode],
+    wiring: Wiring,
+    episode: int,
+    states: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+) -> dict[str, np.ndarray]:
+    """Play one episode of hash nodes.
+
+    Args:
+        nodes: Hash nodes (``sim2real.graph.testing``) without trainable delays, by name.
+        wiring: The tables.
+        episode: Which episode.
+        states: Initial states.
+        outputs: Default outputs, numbers.
+
+    Returns:
+        The outputs of each node, by seq, uint32.
+    """
+    current = {n: int(s) for n, s in states.items()}
+
+    def step(name: str, seq: int, windows: Windows) -> int:
+        current[name], out = hash_step(current[name], seq, [windows[i] for i in sorted(windows)])
+        return out
+
+    made = interpret(nodes, wiring, episode, step, {n: int(x) for n, x in outputs.items()})
+    return {n: np.array(values, np.uint32) for n, values in made.items()}

@@ -1,0 +1,47 @@
+"""The recorded logs under datasets/ must go on giving the parameters that their robot really had."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sim2real.log import read_log
+from sim2real.stages import identify
+from sim2real.stages.pipeline import load_pipeline
+
+DATASETS = Path(__file__).parents[2] / "datasets"
+MANIFEST = json.loads((DATASETS / "manifest.json").read_text())["logs"]
+
+
+def test_the_logs_are_those_of_the_manifest():
+    found = {p.name for p in (DATASETS / "pendulum").glob("*.mcap")}
+    assert found == set(MANIFEST)
+    for name, entry in MANIFEST.items():
+        assert hashlib.sha256((DATASETS / entry["pipeline"] / name).read_bytes()).hexdigest() == entry["sha256"]
+    assert sum(entry["bytes"] for entry in MANIFEST.values()) < 3_000_000
+
+
+@pytest.mark.parametrize("name", MANIFEST)
+def test_the_log_is_complete(name):
+    episode = read_log(DATASETS / MANIFEST[name]["pipeline"] / name)
+    assert episode.complete
+    assert episode.metadata["pipeline"] == MANIFEST[name]["pipeline"]
+    assert abs(episode.duration_s - MANIFEST[name]["duration_s"]) < 0.1
+
+
+@pytest.mark.parametrize("name", MANIFEST)
+def test_identification_finds_the_true_parameters(name, tmp_path):
+    entry = MANIFEST[name]
+    pipeline = load_pipeline(entry["pipeline"])
+    config = replace(pipeline.identify, log=str(DATASETS / entry["pipeline"] / name), seed=1)
+    stage = identify.run(pipeline, config, tmp_path, None)
+    rows = {p["name"]: p for p in json.loads(stage.output("parameters").read_text())["parameters"]}
+    for parameter, truth in entry["truth"].items():
+        error = rows[parameter]["estimate"] - truth
+        scale = 1.0 if parameter == "round_trip_delay" else truth
+        assert abs(error / scale) < entry["tolerance"][parameter], (parameter, rows[parameter]["estimate"], truth)
+        assert rows[parameter]["verdict"] == "accepted"
+    # Only the sum of the two delays can be told from a log, and the report has to say so.
+    assert rows["sensor_delay"]["verdict"] == rows["actuator_delay"]["verdict"] == "not identifiable"

@@ -1,0 +1,133 @@
+"""The pendulum's model against an integrator of another make, and its embedded robot against physics by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sim2real.hardware.registers import OperatingMode
+from sim2real.stages.pipeline import load_pipeline
+
+PIPELINE = load_pipeline("pendulum")
+MODEL, PLANT, PARAMETERS = (PIPELINE.load(name) for name in ("model", "plant", "parameters"))
+OFF, PWM = OperatingMode.OFF, OperatingMode.PWM
+
+
+def acceleration(groups, th, thdot, voltage, turn):
+    """The equation of motion, written down again."""
+    motor = groups["gain"] * voltage - groups["damping"] * thdot
+    return motor + groups["gravity"] * np.sin(th) - groups["friction"] * turn
+
+
+@pytest.mark.parametrize("start", [(np.pi, 0.0), (1.0, -3.0), (0.1, 8.0)])
+@pytest.mark.parametrize("voltage", [0.0, 1.7])
+def test_the_model_is_integrated_as_scipy_does(start, voltage):
+    world = MODEL.PendulumWorld("world", 100.0)
+    params = MODEL.nominal_params().replace(start=jnp.array(start))
+    state = MODEL.Measurement(th=jnp.float32(start[0]), thdot=jnp.float32(start[1]))
+
+    def tick(x, _):
+        x = world.integrate(params, x, jnp.float32(voltage))
+        return x, x
+
+    _, simulated = jax.jit(lambda x: jax.lax.scan(tick, x, length=100))(state)
+    groups = {n: float(v) for n, v in PARAMETERS.groups(params).items()}
+
+    def f(_, x):
+        return x[1], acceleration(groups, x[0], x[1], voltage, np.tanh(x[1] / params.smooth_rad_s))
+
+    exact = solve_ivp(f, (0.0, 1.0), start, "LSODA", np.arange(1, 101) / 100, rtol=1e-9, atol=1e-10, max_step=0.001)
+    np.testing.assert_allclose(simulated.th, exact.y[0], atol=2e-3)
+    np.testing.assert_allclose(simulated.thdot, exact.y[1], atol=2e-2)
+
+
+def test_groups_and_back():
+    values = {"gain": 21.0, "gravity": 110.0, "damping": 0.8, "friction": 8.0}
+    back = PARAMETERS.groups(PARAMETERS.from_groups(values, [np.pi, 0.0]))
+    for name, value in values.items():
+        assert float(back[name]) == pytest.approx(value, rel=1e-5)
+
+
+def released(plant, th, thdot=0.0):
+    plant.data.qpos[0], plant.data.qvel[0] = th, thdot
+    return plant
+
+
+def trajectory(plant, duration_s, step_s=0.0005):
+    """Advance and return angle and velocity at every step, `(N, 2)`."""
+    begin = plant.data.time
+    rows = []
+    for i in range(round(duration_s / step_s)):
+        rows.append((plant.data.qpos[0], plant.data.qvel[0]))
+        plant.advance(begin + (i + 1) * step_s)
+    return np.array(rows)
+
+
+def energy(plant, states):
+    """Kinetic and potential energy [J], by the plant's true groups times its inertia."""
+    groups = plant.truth()
+    return plant._J * (states[:, 1] ** 2 / 2 + groups["gravity"] * np.cos(states[:, 0]))
+
+
+@pytest.mark.parametrize(("th", "thdot", "voltage"), [(2.0, 5.0, 1.0), (0.5, -7.0, -2.0), (np.pi, 3.0, 2.0)])
+def test_the_plant_accelerates_as_its_truth_says(th, thdot, voltage):
+    plant = released(PLANT.PendulumPlant(), th, thdot)
+    plant.command(1, PWM, voltage / PLANT.SUPPLY_V)
+    states = trajectory(plant, 0.01)
+    measured = (states[-1, 1] - states[0, 1]) / 0.0095
+    middle = states.mean(axis=0)
+    expected = acceleration(plant.truth(), middle[0], middle[1], voltage, np.sign(thdot))
+    assert measured == pytest.approx(expected, rel=0.01, abs=0.2)
+
+
+def test_energy_stays_without_friction_and_motor():
+    plant = released(PLANT.PendulumPlant(friction=0.0), 1.0)
+    plant.command(1, OFF, 0.0)
+    states = trajectory(plant, 3.0)
+    total = energy(plant, states)
+    assert np.ptp(states[:, 0]) > 3.0
+    assert np.ptp(total) < 0.01 * np.ptp(plant._J * states[:, 1] ** 2 / 2)
+
+
+def test_energy_goes_into_friction():
+    plant = released(PLANT.PendulumPlant(), 1.0)
+    plant.command(1, OFF, 0.0)
+    states = trajectory(plant, 1.0)
+    total, speed = energy(plant, states), np.abs(states[:, 1])
+    lost = (plant._c * speed + plant._b * speed**2).sum() * 0.0005
+    assert total[0] - total[-1] == pytest.approx(lost, rel=0.02)
+
+
+def test_dry_friction_holds_it_within_a_band_and_not_beyond():
+    groups = PLANT.PendulumPlant().truth()
+    band = np.arcsin(groups["friction"] / groups["gravity"])
+    for share, moves in ((0.8, False), (1.25, True)):
+        plant = released(PLANT.PendulumPlant(), np.pi - share * band)
+        plant.command(1, OFF, 0.0)
+        states = trajectory(plant, 1.0)
+        assert (abs(states[-1, 0] - states[0, 0]) > 0.005) == moves
+    plant = released(PLANT.PendulumPlant(), np.pi - 1.5)
+    plant.command(1, OFF, 0.0)
+    states = trajectory(plant, 5.0)
+    assert abs(states[-1, 0] - np.pi) < 1.05 * band
+    assert abs(states[-1, 1]) < 0.01
+
+
+def test_the_motor_brakes_only_while_torque_is_on():
+    """At 0 V the winding is shorted and the back-EMF brakes; with torque off it is open."""
+    slow, fast = released(PLANT.PendulumPlant(friction=0.0), np.pi, 5.0), released(PLANT.PendulumPlant(0.0), np.pi, 5.0)
+    slow.command(1, PWM, 0.0)
+    fast.command(1, OFF, 0.0)
+    lost = [energy(p, trajectory(p, 1.0))[[0, -1]] @ [1, -1] for p in (slow, fast)]
+    assert lost[0] > 20 * abs(lost[1])
+
+
+def test_the_plant_starts_hanging_and_says_what_it_is():
+    plant = PLANT.PendulumPlant()
+    assert plant.state() == {"th": np.pi, "thdot": 0.0, "voltage": 0.0}
+    nominal = {n: float(v) for n, v in PARAMETERS.groups(MODEL.nominal_params()).items()}
+    truth = plant.truth()
+    assert truth["gain"] / nominal["gain"] == pytest.approx(0.9 / 1.15, rel=1e-5)
+    assert truth["gravity"] / nominal["gravity"] == pytest.approx(1 / 1.15, rel=1e-5)
+    assert truth["friction"] / nominal["friction"] == pytest.approx(1.6 / 1.15, rel=1e-5)
