@@ -280,6 +280,80 @@ def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repe
     ]
 
 
+def arm() -> tuple[Any, dict[str, BaseNode]]:
+    """Return a six-hinge arm with friction loss on MJX, and its graph with a policy at 50 Hz over a world at 100 Hz."""
+    import mujoco
+
+    from sim2real.worlds.mjx import MjxWorld
+
+    link = (
+        '<body pos="0 0 {z}"><joint name="j{i}" axis="{axis}" damping=".05" frictionloss=".02" armature=".01"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 .2" size=".02" mass=".2" contype="0" conaffinity="0"/>'
+    )
+    bodies = "".join(link.format(z=0.2 * (i > 0), i=i, axis="0 1 0" if i % 2 else "1 0 0") for i in range(6))
+    motors = "".join(f'<position joint="j{i}" kp="2"/>' for i in range(6))
+    text = (
+        '<mujoco><option timestep="0.01" iterations="4" ls_iterations="4"/><worldbody>'
+        f"{bodies}{'</body>' * 6}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    world = MjxWorld("world", 100.0, mujoco.MjModel.from_xml_string(text))
+    agent = ArmAgent("actuator", 50.0, delay_dist=0.002)
+    agent.connect(world, skip=True, delay_dist=0.01)
+    world.connect(agent, skip=True, delay_dist=0.012)
+    return world, {"actuator": agent, "world": world}
+
+
+class ArmAgent(BaseNode):
+    """Waves six joints."""
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the joints at zero."""
+        del rng, graph_state
+        return MODEL.Command(action=jnp.zeros(6))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Return the next set points, and lean on what the joints do."""
+        q = step_state.inputs["world"][-1].data.qpos
+        wave = 0.3 * jnp.sin(3.0 * step_state.ts + jnp.arange(6.0)) - 0.1 * q
+        return step_state, MODEL.Command(action=wave)
+
+
+def mjx_case(device: str, copies: int, repeats: int) -> list[dict]:
+    """Measure the arm's graph against the same number of bare ``mjx.step``."""
+    from mujoco import mjx
+
+    world, graph_nodes = arm()
+    graph = CompiledGraph(graph_nodes, "actuator", draw(graph_nodes, 1.0, EPISODES, 0))
+    ticks = graph.rows * graph.wiring.ticks
+
+    def in_graph(key: Any) -> Any:
+        eps = jax.random.randint(key, (), 0, graph.episodes)
+        return graph.rollout(graph.init(key, eps=eps))[0].state["world"].qpos.sum()
+
+    def bare(key: Any) -> Any:
+        params = world.init_params()
+        data = world.init_state(key).replace(ctrl=jax.random.uniform(key, (6,), minval=-0.3, maxval=0.3))
+        step = lambda d, _: (mjx.step(params.model, d), None)  # noqa: E731
+        return jax.lax.scan(step, data, length=ticks)[0].qpos.sum()
+
+    seconds, compile_s = compare({"bare": bare, "graph": in_graph}, copies, repeats)
+    name = f"graph/{device}/mjx_arm/{copies}"
+    print(name, seconds, graph.report(), file=sys.stderr)
+    rate = copies * ticks / seconds["graph"]
+    bare_rate = copies * ticks / seconds["bare"]
+    over = round(seconds["graph"] / seconds["bare"], 3)
+    return [
+        {"name": f"{name}/over_bare", "value": over, "unit": "1", "yardstick": "bare mjx.step", "goal": "<= 1.1"},
+        {
+            "name": f"{name}/ticks_per_s",
+            "value": round(rate),
+            "unit": "1/s",
+            "yardstick": f"{bare_rate:.3g} bare",
+            "compile_s": round(compile_s["graph"], 1),
+        },
+    ]
+
+
 def building() -> list[dict[str, Any]]:
     """Measure how long timelines take to draw and to wire."""
     found = []
@@ -312,6 +386,7 @@ def main(arguments: list[str]) -> dict[str, Any]:
     parser.add_argument("--copies", type=int, nargs="+", help="default: 1024 on the CPU, 20000 and 100000 on a GPU")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
+    parser.add_argument("--mjx", type=int, default=256, help="copies of the MJX arm; 0 leaves it out")
     options = parser.parse_args(arguments)
     device = options.name or jax.default_backend()
     copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
@@ -322,6 +397,8 @@ def main(arguments: list[str]) -> dict[str, Any]:
         rows += case(
             f"graph/{device}/30_over_100_hz", nodes(30.0, 100.0, 0.005), (3, 3, 4), count, options.repeats, False
         )
+    if options.mjx:
+        rows += mjx_case(device, options.mjx, options.repeats)
     graph_nodes = nodes()
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
     rows.append({"name": "graph/bytes_per_copy", "value": bytes_per_copy(graph), "unit": "B", "goal": "< 2000"})

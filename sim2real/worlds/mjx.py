@@ -1,0 +1,114 @@
+"""Worlds on MJX: MuJoCo in JAX."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+from mujoco import mjx
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseWorld
+
+
+@struct.dataclass
+class MjxParams(Base):
+    """What a copy may have of its own.
+
+    Attributes:
+        model: The compiled model; leaves may differ between copies.
+        qpos: Shape ``(nq,)``: positions at the start of an episode [rad or m].
+        qvel: Shape ``(nv,)``: velocities at the start [rad/s or m/s].
+    """
+
+    model: Any
+    qpos: Any
+    qvel: Any
+
+
+@struct.dataclass
+class JointState(Base):
+    """Positions ``qpos (nq,)`` [rad or m] and velocities ``qvel (nv,)`` [rad/s or m/s]."""
+
+    qpos: Any
+    qvel: Any
+
+
+class MjxWorld(BaseWorld):
+    """A MuJoCo model that ticks in MJX; its controls come from one input.
+
+    Args:
+        name: Unique in the graph.
+        rate: Ticks per second [Hz]; a tick is a whole number of the model's time steps.
+        model: The model.
+        command: Name of the input that carries the controls.
+        field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
+        color: Colour in drawings.
+        order: Place in drawings.
+
+    Raises:
+        UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
+            delays of its own (ignored or misplaced there; they belong to the graph) or the no-slip solver.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        model: mujoco.MjModel,  # pyright: ignore[reportAttributeAccessIssue]
+        command: str = "actuator",
+        field: str = "action",
+        color: str | None = None,
+        order: int | None = None,
+    ) -> None:
+        super().__init__(name, rate, color=color, order=order)
+        self.model = model
+        self.input_name, self.field = command, field
+        steps = 1.0 / (self.rate * model.opt.timestep)
+        self.substeps = round(steps)
+        if self.substeps < 1 or not math.isclose(steps, self.substeps, rel_tol=1e-6):
+            raise UsageError(
+                f"world {name!r}: a tick of {1 / self.rate:g} s is {steps:g} time steps of {model.opt.timestep:g} s",
+                hint="choose a rate or a timestep that divides the tick",
+            )
+        if int(model.nhistory) > 0:
+            raise UsageError(
+                f"world {name!r}: the model delays actuators or sensors itself, which MJX ignores",
+                hint="take delay and nsample out of the MJCF and put the delay on the graph's connection",
+            )
+        if int(model.opt.noslip_iterations) > 0:
+            raise UsageError(f"world {name!r}: MJX has no no-slip solver", hint="set noslip_iterations to 0")
+        self._mjx_model = mjx.put_model(model)
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:
+        """Return the model and its reference position at rest."""
+        del rng, graph_state
+        return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(self.model.nv))
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return MJX data at the parameters' start."""
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        data = mjx.make_data(self.model).replace(qpos=params.qpos, qvel=params.qvel)
+        return mjx.forward(params.model, data)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return positions and velocities at the start."""
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        return JointState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
+
+    def step(self, step_state: StepState) -> tuple[StepState, JointState]:
+        """Integrate over one tick under the newest control."""
+        model = step_state.params.model
+        control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
+        data = step_state.state.replace(ctrl=jnp.asarray(control, jnp.float32))
+        if self.substeps == 1:
+            data = mjx.step(model, data)
+        else:
+            data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=self.substeps)
+        new = step_state.replace(state=data)  # pyright: ignore[reportAttributeAccessIssue]
+        return new, JointState(data.qpos, data.qvel)
