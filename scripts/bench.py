@@ -18,7 +18,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-BENCHES = ("demo", "graph")
+BENCHES = {"async": "asynchronous", "demo": "demo", "graph": "graph", "train": "train"}
 
 
 def machine() -> dict[str, Any]:
@@ -40,7 +40,7 @@ def main() -> int:
     parser.add_argument("bench", choices=BENCHES)
     parser.add_argument("--json", type=Path, help="write the rows, machine and versions to this file")
     known, rest = parser.parse_known_args()
-    result = importlib.import_module(f"benches.{known.bench}").main(rest)
+    result = importlib.import_module(f"benches.{BENCHES[known.bench]}").main(rest)
     headers = ["name", "value", "unit", "yardstick", "goal"]
     print(table([[row.get(h) for h in headers] for row in result["rows"]], headers))
     if known.json:

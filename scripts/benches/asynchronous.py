@@ -1,0 +1,84 @@
+"""The asynchronous runtime: how fast the simulated clock steps, and how late threads wake on the wall clock."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import jax
+
+from sim2real.graph.node import BaseNode
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
+from sim2real.stages.pipeline import load_pipeline
+
+
+def loop(rate_hz: float) -> dict[str, BaseNode]:
+    """Return the pendulum's four nodes at one rate."""
+    model = load_pipeline("pendulum").load("model")
+    delay = 0.2 / rate_hz
+    sensor = model.SimSensor("sensor", rate_hz, delay_dist=delay)
+    agent = model.Agent("agent", rate_hz, delay_dist=delay)
+    actuator = model.SimActuator("actuator", rate_hz, delay_dist=delay)
+    world = model.PendulumWorld("world", rate_hz)
+    sensor.connect(world)
+    agent.connect(sensor, blocking=True, window=3)
+    actuator.connect(agent, blocking=True)
+    world.connect(actuator, skip=True)
+    return {n.name: n for n in (sensor, agent, actuator, world)}
+
+
+def simulated(steps: int) -> list[dict[str, Any]]:
+    """Measure the simulated clock, as fast as it goes."""
+    nodes = loop(50.0)
+    graph = AsyncGraph(nodes, nodes["agent"], clock=Clock.SIMULATED, duration_s=(steps + 50) / 50.0)
+    state = graph.init(jax.random.key(0))
+    graph.warmup(state)
+    with graph:
+        state, _ = graph.reset(state)
+        begin = time.perf_counter()
+        for _ in range(steps):
+            state, _ = graph.step(state)
+        seconds = time.perf_counter() - begin
+    return [
+        {
+            "name": "graph/simulated/steps_per_s",
+            "value": round(steps / seconds),
+            "unit": "supervisor steps/s",
+            "yardstick": "the seed's framework: 115 to 204",
+            "goal": ">= 1000",
+        }
+    ]
+
+
+def wall_clock(rate_hz: float, seconds: float) -> list[dict[str, Any]]:
+    """Measure four jitted nodes on the wall clock."""
+    nodes = loop(rate_hz)
+    graph = AsyncGraph(nodes, nodes["agent"])
+    state = graph.init(jax.random.key(0))
+    graph.warmup(state)
+    with graph:
+        graph.start(state)
+        graph.run_for(0.5)
+        begin = time.process_time()
+        graph.run_for(seconds)
+        cpu = (time.process_time() - begin) / seconds
+    rows = []
+    for name, node in graph.statistics().items():
+        late = [round(1e3 * q, 3) for q in node.lateness_s]
+        what = f"async/{rate_hz:g}_hz/{name}"
+        rows.append({"name": f"{what}/lateness_ms", "value": late, "unit": "ms", "yardstick": "p50, p99, max"})
+        rows.append({"name": f"{what}/overruns", "value": node.overruns, "unit": f"of {node.steps}"})
+    rows.append({"name": f"async/{rate_hz:g}_hz/cpu", "value": round(cpu, 3), "unit": "cores", "goal": "< 0.5"})
+    return rows
+
+
+def main(arguments: list[str]) -> dict[str, Any]:
+    """Measure both clocks."""
+    parser = argparse.ArgumentParser(prog="bench.py async")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the run on the wall clock")
+    parser.add_argument("--rate", type=float, default=200.0, help="rate of every node [Hz]")
+    parser.add_argument("--steps", type=int, default=5000, help="supervisor steps on the simulated clock")
+    options = parser.parse_args(arguments)
+    return {"rows": [*simulated(options.steps), *wall_clock(options.rate, options.seconds)]}
