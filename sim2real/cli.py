@@ -9,8 +9,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -49,7 +48,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
 
 examples
   sim2real demo --seed 1
-  sim2real record {DEMO_PIPELINE} --duration-s 20 --gate.limit 1.5
+  sim2real record {DEMO_PIPELINE} --duration-s 20 --amplitude 1.5
   sim2real train {DEMO_PIPELINE} --help
   sim2real run {DEMO_PIPELINE} --train.episode-s 4
   sim2real report {DEMO_PIPELINE}
@@ -68,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; None takes the process's own.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    with _signals_as_exceptions():
+    with _Signals() as signals:
         try:
             _dispatch(arguments)
             sys.stdout.flush()
@@ -82,11 +81,14 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"\nhint: {hint[0]}", file=sys.stderr)
             return error.exit_code
         except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            return 128 + signal.SIGINT
+            return _ended_by(signal.SIGINT)
         except SystemExit as end:
+            if isinstance(end.code, int) and end.code > 128:
+                return _ended_by(end.code - 128)
             return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
         except Exception as error:
+            if signals.received:  # an extension that is interrupted while it is imported raises ImportError
+                return _ended_by(signals.received)
             if os.environ.get(DEBUG):
                 traceback.print_exc()
             reason = " ".join(str(error).split()) or "no message"
@@ -298,6 +300,12 @@ def _epilog(*examples: str) -> str:
     return "\n".join(["examples", *(f"  {example}" for example in examples), "", EXIT_CODES])
 
 
+def _ended_by(number: int) -> int:
+    """Say which signal ended the command and return its exit code."""
+    print("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}", file=sys.stderr)
+    return 128 + number
+
+
 def _notes(error: BaseException) -> list[str]:
     """Return an exception's notes, one line each."""
     return [f"  {' '.join(note.split())}" for note in getattr(error, "__notes__", [])]
@@ -310,38 +318,54 @@ def _save_traceback() -> str:
     return file.name
 
 
-@contextmanager
-def _signals_as_exceptions() -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
+class _Signals:
+    """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
 
-    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away.
+    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away. One that
+    is raised where Python drops exceptions (a finaliser, a callback of the garbage collector) is sent again.
+
+    Attributes:
+        received: Number of the signal that was raised; 0 before one.
     """
-    raised = False
 
-    def handler(number: int, frame: FrameType | None) -> None:
-        nonlocal raised
+    def __init__(self) -> None:
+        self.received = 0
+        self._raised: BaseException | None = None
+        self._before: dict[int, Any] = {}
+        self._hook = sys.unraisablehook
+
+    def __enter__(self) -> _Signals:
+        if threading.current_thread() is threading.main_thread():
+            numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            # nohup and background jobs of a shell start with signals ignored; they stay ignored.
+            self._before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
+            sys.unraisablehook = self._dropped
+            for number in self._before:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._before:
+            sys.unraisablehook = self._hook
+        for number, old in self._before.items():
+            signal.signal(number, old)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
-        if raised:
+        if self._raised is not None:
             os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
             return
-        raised = True
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        raise SystemExit(128 + number)
+        self.received = number
+        self._raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+        raise self._raised
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    # nohup and background jobs of a shell start with signals ignored; they stay ignored.
-    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) is not signal.SIG_IGN}
-    for number in before:
-        signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+    def _dropped(self, unraisable: Any) -> None:
+        if self._raised is None or unraisable.exc_value is not self._raised:
+            self._hook(unraisable)
+            return
+        self._raised = None
+        # A moment later: until this hook returns, it would be dropped again.
+        threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
 
 
 if __name__ == "__main__":

@@ -160,10 +160,10 @@ def test_unexpected_errors_name_the_saved_traceback(monkeypatch, capsys, tmp_pat
 
 
 def test_flags_reach_the_stage_and_the_result_goes_to_stdout(calls, capsys, tmp_path):
-    arguments = ["--duration-s", "7", "--gate.limit", "1.9", "--no-strict-timing", "--runs", "elsewhere"]
+    arguments = ["--duration-s", "7", "--gate.limit", "2.5", "--no-strict-timing", "--runs", "elsewhere"]
     assert cli.main(["record", "pendulum", *arguments]) == 0
     ((stage, config, run_dir),) = calls
-    assert (stage, config.duration_s, config.gate.limit, run_dir) == ("record", 7.0, 1.9, None)
+    assert (stage, config.duration_s, config.gate.limit, run_dir) == ("record", 7.0, 2.5, None)
     out, err = capsys.readouterr()
     (folder,) = (tmp_path / "elsewhere" / "pendulum").iterdir()
     assert f"wrote elsewhere/pendulum/{folder.name}/record/result.txt" in out
@@ -206,7 +206,7 @@ def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
 def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_path):
     recording, page = ModuleType("sim2real.view.recording"), ModuleType("sim2real.view.page")
     seen = []
-    recording.view = lambda run_dir, save: seen.append((run_dir, save))
+    recording.view = lambda run_dir, save, draw=None: seen.append((run_dir, save))
     page.report = lambda run_dir: run_dir / "report.html"
     monkeypatch.setitem(sys.modules, recording.__name__, recording)
     monkeypatch.setitem(sys.modules, page.__name__, page)

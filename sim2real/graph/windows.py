@@ -64,6 +64,8 @@ def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
         UsageError: The first place where one would.
     """
     for (name, input_name), edge in timeline.edges.items():
+        if name not in nodes or input_name not in nodes[name].inputs:
+            continue
         connection, reader = nodes[name].inputs[input_name], timeline.vertices[name]
         places = np.argwhere(overfull(connection, edge, reader, timeline.vertices[edge.sender]))
         if len(places) and isinstance(connection.delay_dist, TrainableDist):

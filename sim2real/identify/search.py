@@ -63,18 +63,7 @@ def cma_es(
     state = strong(strategy.init(key, jnp.asarray(start, jnp.float32), params))  # else the second call compiles again
     batch = min(10, generations)
 
-    @jax.jit
-    def run(state: Any, key: Any) -> tuple[Any, Any]:
-        def generation(state: Any, key: Any) -> tuple[Any, Any]:
-            ask, tell = jax.random.split(key)
-            candidates, state = strategy.ask(ask, state, params)
-            fitness = losses(candidates, strategy.get_mean(state))
-            fitness = jnp.where(jnp.isfinite(fitness), fitness, 1e9)
-            state, _ = strategy.tell(tell, candidates, fitness, state, params)
-            return state, state.best_fitness
-
-        return jax.lax.scan(generation, state, jax.random.split(key, batch))
-
+    run = _generations(strategy, params, losses, batch)
     history: list[np.ndarray] = []
     for index in range(-(-generations // batch)):
         state, best = run(state, jax.random.fold_in(key, index + 1))
@@ -92,3 +81,21 @@ def cma_es(
     return SearchResult(
         np.asarray(state.best_solution), float(best_so_far[-1]), best_so_far, population * best_so_far.size
     )
+
+
+def _generations(strategy: Any, params: Any, losses: Callable[[Any, Any], Any], count: int) -> Any:
+    """Return the program of some generations: ``(state, key) -> (state, best loss up to each)``."""
+
+    @jax.jit
+    def run(state: Any, key: Any) -> tuple[Any, Any]:
+        def generation(state: Any, key: Any) -> tuple[Any, Any]:
+            ask, tell = jax.random.split(key)
+            candidates, state = strategy.ask(ask, state, params)
+            fitness = losses(candidates, strategy.get_mean(state))
+            fitness = jnp.where(jnp.isfinite(fitness), fitness, 1e9)
+            state, _ = strategy.tell(tell, candidates, fitness, state, params)
+            return state, state.best_fitness
+
+        return jax.lax.scan(generation, state, jax.random.split(key, count))
+
+    return run

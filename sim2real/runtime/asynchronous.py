@@ -15,6 +15,7 @@ from sim2real.graph.episode import Recorder
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
+from sim2real.graph.windows import check_bursts
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.handover import Reply
@@ -271,12 +272,15 @@ class AsyncGraph:
         if self._timeline is not None:
             if not 0 <= eps < self._timeline.episodes:
                 raise UsageError(f"there is no episode {eps}: the timeline has {self._timeline.episodes}")
+            check_bursts(self.nodes, self._timeline[[eps]])
             return self._timeline, eps
         key = graph_state.rng[self.supervisor.name]
         if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key):
             key = jax.random.key_data(key)
         seed = np.random.default_rng([eps, *np.asarray(key).ravel().tolist()])
-        return draw(self.nodes, self._duration_s or 0.0, 1, seed), 0
+        timeline = draw(self.nodes, self._duration_s or 0.0, 1, seed)
+        check_bursts(self.nodes, timeline)
+        return timeline, 0
 
     def _running(self) -> WallClockRun | SimulatedRun:
         if self._run is None:

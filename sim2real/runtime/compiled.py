@@ -7,38 +7,37 @@ of each, an episode and a row.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
-from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
+from sim2real.runtime.fit import check_fit, nodes_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.wiring import SlotTable, Wiring, wire
-
-
-class Rollout(NamedTuple):
-    """What a node did in a rollout, in the order of rows.
-
-    Attributes:
-        seq: Shape ``(C,)``, int32: the node's step in each place; -1 where it made none.
-        output: Leaves ``(C, ...)``; meaningless where ``seq`` is -1.
-    """
-
-    seq: Any
-    output: Any
+from sim2real.runtime.program import Rollout, RowProgram, select
+from sim2real.runtime.wiring import Wiring, wire
 
 
 class CompiledGraph:
     """A graph over given timelines, for ``jit``, ``vmap``, ``scan`` and ``grad``.
 
+    Three ways to run it, all from what ``init`` returns. ``rollout``: the supervisor makes its own steps. ``reset`` and
+    ``step``, like a gym environment: each returns what the supervisor sees at its next step, and the caller provides
+    the output; ``run`` is ``step`` with the supervisor's own output. ``observe`` and ``advance``: the same row by row,
+    for programs that look at every row anyway; in some of them the supervisor makes no step.
+
+    Running past the end, or stepping before a reset, is an error; so is mixing the ways. Where ``jit`` or ``vmap`` hide
+    where a state stands, running past the end cannot be seen: what the supervisor gets has ``seq`` -1 then.
+
     Args:
         nodes: The nodes, by name or as a list. Those that the timeline does not hold are left out.
-        supervisor: The node at whose steps ``reset`` and ``step`` hand over, usually the policy.
+        supervisor: The node at whose steps ``reset`` and ``step`` hand over, usually the policy; or its name.
         timeline: What ran when, in one or more episodes.
         given: Nodes that are not run, as their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
@@ -49,21 +48,25 @@ class CompiledGraph:
     def __init__(
         self,
         nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
-        supervisor: str,
+        supervisor: str | BaseNode,
         timeline: Timeline,
         given: Mapping[str, Any] | None = None,
     ) -> None:
-        named = dict(nodes) if isinstance(nodes, Mapping) else {n.name: n for n in nodes}
-        self.nodes = {n: node for n, node in named.items() if n in timeline.vertices}
-        _check_edges(self.nodes, timeline)
-        self.supervisor = supervisor
+        self.nodes = nodes_of(nodes, timeline)
+        self.supervisor = supervisor if isinstance(supervisor, str) else supervisor.name
         self.timeline = timeline
-        self.wiring: Wiring = wire(self.nodes, supervisor, timeline, frozenset(given or ()))
-        self._given = jax.tree_util.tree_map(jnp.asarray, dict(given or {}))
-        self._tables = jax.tree_util.tree_map(jnp.asarray, [_pytree(t) for t in self.wiring.tables])
-        self._world = jax.tree_util.tree_map(jnp.asarray, _pytree(self.wiring.world_table))
-        self._always = [bool((t.seq >= 0).all()) for t in self.wiring.tables]
-        self._turns = [i for i, n in enumerate(self.wiring.slots) if n == supervisor]
+        self.given = tuple(given or ())
+        check_fit(self.nodes, timeline, self.given)
+        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
+        self.program = RowProgram(self.nodes, self.wiring, given or {})
+        self._turns = [i for i, n in enumerate(self.wiring.slots) if n == self.supervisor]
+        # Place of each of the supervisor's steps, (E, K): row * turns + turn; behind the last row where there is none.
+        self._places = np.full((self.episodes, 0), 0)
+        if self._turns:
+            seq = np.stack([self.wiring.tables[i].seq for i in self._turns], axis=-1).reshape(self.episodes, -1)
+            self._places = np.full((self.episodes, int(seq.max()) + 1), seq.shape[1])
+            e, at = np.nonzero(seq >= 0)
+            self._places[e, seq[e, at]] = at
 
     @property
     def rows(self) -> int:
@@ -74,6 +77,11 @@ class CompiledGraph:
     def episodes(self) -> int:
         """Episodes."""
         return self.timeline.episodes
+
+    @property
+    def steps(self) -> int:
+        """Steps of the supervisor in the shortest episode: ``reset`` shows the first, ``step`` the others."""
+        return int((self._places < self.rows * len(self._turns)).sum(axis=1).min())
 
     def init(
         self,
@@ -89,23 +97,74 @@ class CompiledGraph:
             params: Parameters of some nodes; the others' come from ``init_params``.
             order: Nodes that are initialised first.
             eps: Which episode, int or traced.
+
+        Raises:
+            UsageError: When there is no such episode, or a name is unknown.
         """
+        if not _traced(eps) and not 0 <= int(eps) < self.episodes:
+            raise UsageError(f"there is no episode {int(eps)}: the timeline has {self.episodes}")
         gs = init_graph_state(self.nodes, self.supervisor, rng, params, order)
-        buffer = {}
-        for name, length in self.wiring.rings.items():
-            if length:
-                buffer[name] = (gs.aux[OUTPUTS][name],) * length
-        buffer |= {name: gs.aux[OUTPUTS][name] for name in self._given}
+        outputs = gs.aux[OUTPUTS]
+        buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
+        buffer |= {name: outputs[name] for name in self.given}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
-        return gs.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            eps=jnp.asarray(eps, jnp.int32), step=jnp.int32(0), seq={}, buffer=buffer, aux=aux
-        )
+        return _replace(gs, eps=jnp.asarray(eps, jnp.int32), step=jnp.int32(0), seq={}, buffer=buffer, aux=aux)
+
+    def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
+        """Run to the supervisor's first step.
+
+        Args:
+            gs: What ``init`` returned.
+
+        Returns:
+            The graph's state, in which ``seq`` says which step of the supervisor awaits, and what the supervisor sees.
+        """
+        self._check_row_start(gs, "reset")
+        gs = self.program.run_slots(gs, 0, self._first_turn(), {})
+        found = self.program.seq(gs, self._turns[0]) >= 0
+        return self._stand(*self._search(gs, 0, found, int(self._places[:, 0].max())))
+
+    def step(
+        self, gs: GraphState, step_state: StepState | None = None, output: Any = None
+    ) -> tuple[GraphState, StepState]:
+        """Make the supervisor's step, and run to its next one.
+
+        Args:
+            gs: What ``reset`` or ``step`` returned.
+            step_state: The supervisor's step state after the step; None: as ``gs`` has it.
+            output: The step's output; None: the supervisor makes the step itself, from ``step_state``.
+
+        Raises:
+            UsageError: Before ``reset``, or when the episode has no further step.
+        """
+        k = self._awaited(gs, "step")
+        if not (_traced(k) or _traced(gs.eps)):
+            last = int((self._places[int(gs.eps)] < self.rows * len(self._turns)).sum()) - 1
+            if not 0 <= int(k) < last:
+                raise UsageError(
+                    f"the timeline ends after step {last} of the supervisor {self.supervisor!r}",
+                    hint="start again with init() and reset(), or draw longer timelines",
+                )
+        turn = jnp.asarray(self._places)[gs.eps, jnp.maximum(k, 0)] % len(self._turns)
+        before = self._seen(gs, turn) if step_state is None else step_state
+        after, made = self.program.call(self.supervisor, before) if output is None else (before, output)
+        gs = self.program.commit(gs, self._turns[0], after, made, k >= 0)
+        hops = int(np.diff(self._places, axis=1).max(initial=1))
+        return self._stand(*self._search(gs, turn, jnp.bool_(False), hops))
+
+    def run(self, gs: GraphState) -> GraphState:
+        """Run to the supervisor's next step, make it as the supervisor does, and run to the one after it.
+
+        From what ``init`` returned it resets first; in a scan, reset before it, as the carried state changes its form.
+        """
+        return self.step(gs if gs.seq else self.reset(gs)[0])[0]
 
     def run_row(self, gs: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
         """Run one row: every slot of the boundary, then the world's ticks."""
+        self._check_row_start(gs, "run_row")
         outputs: dict[str, list[Rollout]] = {}
-        gs = self._run_slots(gs, 0, len(self.wiring.slots), outputs)
-        return self._run_world(gs, outputs), outputs
+        gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs)
+        return self.program.run_world(gs, outputs), outputs
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
@@ -113,9 +172,9 @@ class CompiledGraph:
         """Run an episode from ``init`` to its last row, or ``rows`` of it.
 
         Args:
-            gs: The state that ``init`` returned.
+            gs: What ``init`` or another rollout returned.
             record: Nodes whose outputs are returned.
-            rows: How many rows; default: all that are left from row 0.
+            rows: How many rows; default: all that are left, or all that there are where ``gs`` is traced.
 
         Returns:
             The last state, and the records by node.
@@ -123,12 +182,15 @@ class CompiledGraph:
         Raises:
             UsageError: When ``rows`` or ``record`` asks for what is not there.
         """
-        rows = self.rows if rows is None else rows
-        if not 1 <= rows <= self.rows:
-            raise UsageError(f"this graph has {self.rows} rows, {rows} were asked for")
+        self._check_row_start(gs, "rollout")
+        left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
+        rows = left if rows is None else rows
+        if not 1 <= rows <= left:
+            raise UsageError(f"{left} of this graph's {self.rows} rows are left, {rows} were asked for")
         for name in record:
-            if name not in self.nodes:
-                raise UsageError(f"no node {name!r} to record. Nodes: {', '.join(self.nodes)}")
+            if name not in self.nodes or name in self.given:
+                running = [n for n in self.nodes if n not in self.given]
+                raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
 
         def body(state: GraphState, _: None) -> tuple[GraphState, Any]:
             state, outputs = self.run_row(state)
@@ -151,168 +213,129 @@ class CompiledGraph:
         Raises:
             UsageError: When the supervisor makes several steps in one row.
         """
-        turn = self._turn()
-        gs = self._run_slots(gs, 0, turn, {})
-        step_state = self._step_state(gs, self.supervisor, _at(self._tables[turn], gs))
-        return gs, step_state, step_state.seq >= 0
+        self._check_row_start(gs, "observe")
+        turn = self._only_turn()
+        gs = self.program.run_slots(gs, 0, turn, {})
+        step_state = self.program.step_state(gs, turn)
+        return _replace(gs, seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
     def advance(self, gs: GraphState, step_state: StepState, output: Any) -> GraphState:
         """Put in the supervisor's step and run the rest of the row; the counterpart of ``observe``."""
-        turn = self._turn()
-        gs = self._commit(gs, turn, step_state, output, step_state.seq >= 0)
-        return self._run_world(self._run_slots(gs, turn + 1, len(self.wiring.slots), {}), {})
+        turn, k = self._only_turn(), self._awaited(gs, "advance")
+        gs = self.program.commit(_replace(gs, seq={}), turn, step_state, output, k >= 0)
+        return self._rest_of_row(gs, turn)
 
     def report(self) -> dict[str, Any]:
-        """Return what the compiler made of the timelines."""
+        """Return what the compiler made of the timelines.
+
+        Returns:
+            ``episodes``, ``rows``, ``ticks_per_row`` (n), ``slots`` (the node of each slot of a row),
+            ``supervisor_slots``, ``supervisor_steps``, ``longest_gap`` (rows between two steps of the supervisor),
+            ``discarded`` (share of slots whose result is not used), ``rings`` (outputs kept, by node), ``bursts``
+            (``node/input``: the most messages that a step after the first consumes at once, and how many its window
+            holds), ``bytes_per_copy`` (of the state that is carried).
+        """
         w = self.wiring
+        shapes = jax.eval_shape(self.init, jax.random.key(0))
+        rows = self._places // max(1, len(self._turns))
+        windows = {(n, i): self.nodes[n].inputs[i].total_window for n, i in w.bursts}
         return {
             "episodes": self.episodes,
             "rows": w.rows,
             "ticks_per_row": w.ticks,
             "slots": list(w.slots),
             "supervisor_slots": len(self._turns),
+            "supervisor_steps": self.steps if self._turns else 0,
+            "longest_gap": int(np.diff(rows, axis=1).max(initial=1)),
             "discarded": w.discarded,
             "rings": dict(w.rings),
+            "bursts": {f"{n}/{i}": {"burst": b, "window": windows[n, i]} for (n, i), b in w.bursts.items()},
+            "bytes_per_copy": sum(x.size * x.dtype.itemsize for x in jax.tree_util.tree_leaves(shapes)),
         }
 
-    def _turn(self) -> int:
-        if len(self._turns) != 1:
-            raise UsageError(
-                f"the supervisor {self.supervisor!r} makes up to {len(self._turns)} steps in a row of these timelines",
-                hint="draw timelines without bursts, or leave the episodes with a hiccup out",
-            )
+    def _rest_of_row(self, gs: GraphState, turn: int) -> GraphState:
+        return self.program.run_world(self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}), {})
+
+    def _hop(self, gs: GraphState, i: int) -> GraphState:
+        """Run from the supervisor's turn ``i`` of a row to its next turn, in this row or the next one."""
+        if i + 1 < len(self._turns):
+            return self.program.run_slots(gs, self._turns[i] + 1, self._turns[i + 1], {})
+        return self.program.run_slots(self._rest_of_row(gs, self._turns[i]), 0, self._turns[0], {})
+
+    def _search(self, gs: GraphState, turn: Any, found: Any, hops: int) -> tuple[GraphState, Any]:
+        """Hop on, up to ``hops`` times, until the supervisor makes a step; return the state and its turn.
+
+        What is computed behind the step that was found is selected away. With one turn in a row and a step in every
+        row there is nothing to select.
+        """
+        turns = len(self._turns)
+        if turns == 1:
+            for i in range(hops):
+                new = self._hop(gs, 0)
+                gs = new if i == 0 and hops == 1 else select(found, gs, new)
+                found = found | (self.program.seq(gs, self._turns[0]) >= 0)
+            return gs, turn
+        for _ in range(-(-hops // turns) + (hops > 0)):  # one sweep more, as it starts at any turn
+            for i in range(turns):
+                active = ~found & (turn == i)
+                gs = select(active, self._hop(gs, i), gs)
+                arrived = (i + 1) % turns
+                turn = jnp.where(active, arrived, turn)
+                found = found | (active & (self.program.seq(gs, self._turns[arrived]) >= 0))
+        return gs, turn
+
+    def _stand(self, gs: GraphState, turn: Any) -> tuple[GraphState, StepState]:
+        """Return the state that awaits a step of the supervisor, and what it sees."""
+        step_state = self._seen(gs, turn)
+        return _replace(gs, seq={self.supervisor: step_state.seq}), step_state
+
+    def _seen(self, gs: GraphState, turn: Any) -> StepState:
+        step_state = self.program.step_state(gs, self._turns[0])
+        seq = self.program.seq(gs, self._turns[0])
+        for i, slot in enumerate(self._turns[1:], start=1):
+            step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
+            seq = jnp.where(turn == i, self.program.seq(gs, slot), seq)
+        return step_state.replace(seq=seq)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _first_turn(self) -> int:
+        if not self._turns:
+            raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
         return self._turns[0]
 
-    def _run_slots(self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]]) -> GraphState:
-        for i in range(begin, end):
-            name = self.wiring.slots[i]
-            step_state = self._step_state(gs, name, _at(self._tables[i], gs))
-            new, output = self._call(name, step_state)
-            gs = self._commit(gs, i, new, output, step_state.seq >= 0)
-            outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
-        return gs
+    def _only_turn(self) -> int:
+        first = self._first_turn()
+        if len(self._turns) > 1:
+            raise UsageError(
+                f"the supervisor {self.supervisor!r} makes up to {len(self._turns)} steps in a row of these timelines",
+                hint="draw timelines without bursts, leave the episodes with a hiccup out, or use reset() and step()",
+            )
+        return first
 
-    def _run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]]) -> GraphState:
-        name = self.wiring.world
-        if name is not None:
-            table = _at(self._world, gs)
-            for tick in range(self.wiring.ticks):
-                now = jax.tree_util.tree_map(lambda t, i=tick: t[i], table)
-                step_state = self._step_state(gs, name, now)
-                new, output = self._call(name, step_state)
-                gs = self._commit(gs, None, new, output, True)
-                outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
-        return gs.replace(step=gs.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+    def _awaited(self, gs: GraphState, call: str) -> Any:
+        """Return which step of the supervisor awaits."""
+        if self.supervisor not in gs.seq:
+            raise UsageError(
+                f"{call}() needs a state in which a step of the supervisor {self.supervisor!r} awaits",
+                hint="call observe() first" if call == "advance" else "call reset() first",
+            )
+        return gs.seq[self.supervisor]
 
-    def _call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
-        try:
-            return self.nodes[name].step(step_state)
-        except Exception as error:
-            error.add_note(f"in the step of node {name!r}")
-            raise
-
-    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any]) -> StepState:
-        inputs = {}
-        for input_name, t in table["inputs"].items():
-            connection = self.nodes[name].inputs[input_name]
-            width, age = connection.total_window, t["age"]
-            sender = connection.output_node.name
-            if sender in self._given:
-                data = self._look_up(gs, sender, t["seq"])
-            else:
-                data = _window(gs.buffer[sender], age, width)
-            dist = gs.delays.get(name, {}).get(input_name)
-            state = InputState(t["seq"], t["sent"], t["received"], data)
-            if dist is not None:
-                period = 1.0 / self.nodes[name].rate
-                served = dist.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
-                state = served.replace(delay_dist=dist)
-            inputs[input_name] = state
-        rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
-        return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
-
-    def _look_up(self, gs: GraphState, sender: str, seq: Any) -> Any:
-        """Return recorded messages by seq; the default output where a slot is empty."""
-
-        def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
-            filled = seq.reshape(-1, *[1] * default.ndim) >= 0
-            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default.astype(recorded.dtype))
-
-        return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
-
-    def _commit(self, gs: GraphState, slot: int | None, new: StepState, output: Any, ran: Any) -> GraphState:
-        """Take over a step's results: everywhere if the slot always runs, else where it ran."""
-        name = self.wiring.world if slot is None else self.wiring.slots[slot]
-        if name is None:
-            raise Sim2RealError("a graph without a world has no tick to commit")
-        always = slot is None or self._always[slot]
-
-        def merge(fresh: Any, old: Any) -> Any:
-            if fresh is old:
-                return old
-            cast = lambda a, b: jnp.asarray(a) if _is_key(b) else jnp.asarray(a, b.dtype)  # noqa: E731
-            fresh = jax.tree_util.tree_map(cast, fresh, old)
-            return fresh if always else _select(ran, fresh, old)
-
-        changed: dict[str, Any] = {
-            "state": {**gs.state, name: merge(new.state, gs.state[name])},
-            "rng": {**gs.rng, name: merge(new.rng, gs.rng[name])},
-        }
-        if new.params is not gs.params[name]:
-            changed["params"] = {**gs.params, name: merge(new.params, gs.params[name])}
-        if name in gs.buffer:
-            kept = gs.buffer[name]
-            fresh = jax.tree_util.tree_map(lambda x, old: jnp.asarray(x, old.dtype), output, kept[-1])
-            pushed = (*kept[1:], fresh)
-            changed["buffer"] = {**gs.buffer, name: pushed if always else _select(ran, pushed, kept)}
-        return gs.replace(**changed)  # pyright: ignore[reportAttributeAccessIssue]
+    def _check_row_start(self, gs: GraphState, call: str) -> None:
+        if gs.seq:
+            raise UsageError(
+                f"{call}() was called while a step of the supervisor {self.supervisor!r} awaits",
+                hint="start from init(), or go on with advance() or step()",
+            )
+        if not _traced(gs.step) and (int(gs.step) >= self.rows or (call == "reset" and int(gs.step))):
+            raise UsageError(
+                f"{call}() was called at row {int(gs.step)} of {self.rows}", hint="start a new episode with init()"
+            )
 
 
-def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
-    """Return ``width`` of a node's last outputs, oldest first, that end ``age`` before its newest.
-
-    The outputs are kept one by one and chosen by selects: both fuse into one elementwise program, where a stacked ring
-    costs a GPU a concatenation, a copy and a gather a leaf.
-    """
-    spare = len(kept) - width
-    window = list(kept[spare:])
-    for a in range(1, spare + 1):
-        window = [_select(age == a, kept[spare - a + i], window[i]) for i in range(width)]
-    return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
+def _traced(x: Any) -> bool:
+    """Return whether a value is not known yet, or is one of many."""
+    return isinstance(x, Tracer) or np.ndim(x) > 0
 
 
-def _select(mask: Any, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(mask, a, b), new, old)
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _pytree(table: SlotTable | None) -> dict[str, Any]:
-    if table is None:
-        return {}
-    inputs = {n: {f: getattr(t, f) for f in t.__dataclass_fields__} for n, t in table.inputs.items()}
-    return {"seq": table.seq, "ts": table.ts, "inputs": inputs}
-
-
-def _at(table: Any, gs: GraphState) -> Any:
-    return jax.tree_util.tree_map(lambda t: t[gs.eps, gs.step], table)
-
-
-def _check_edges(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
-    """Every connection between nodes of the graph must have an edge, and the other way round."""
-    wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
-    missing = sorted(wanted - set(timeline.edges))
-    if missing:
-        name, input_name = missing[0]
-        raise UsageError(
-            f"the timeline has no messages for input {input_name!r} of node {name!r}",
-            hint="draw them: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
-        )
-    lost = [n for n in timeline.vertices if n not in nodes]
-    if lost:
-        raise UsageError(f"the timeline holds node {lost[0]!r}, which was not given. Nodes: {', '.join(nodes)}")
-    for name, vertex in timeline.vertices.items():
-        if not np.isfinite(vertex.start).all() or (np.diff(vertex.start, axis=1) < 0).any():
-            raise UsageError(f"the steps of node {name!r} are not in the order of time")
+def _replace(gs: GraphState, /, **fields: Any) -> GraphState:
+    return gs.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]

@@ -66,10 +66,8 @@ def interpret(
             ring, age = rings[sender], int(t.age[at])
             shown = ring[len(ring) - age - width : len(ring) - age]
             if [s for s, _ in shown] != seqs:
-                raise TableError(
-                    f"node {name!r}, input {input_name!r}, step {seq}: the ring shows {[s for s, _ in shown]}, the table "
-                    f"says {seqs}"
-                )
+                where = f"node {name!r}, input {input_name!r}, step {seq}"
+                raise TableError(f"{where}: the ring shows {[s for s, _ in shown]}, the table says {seqs}")
             windows[input_name] = seqs, [x for _, x in shown]
         output = step(name, seq, windows)
         made[name].append(output)

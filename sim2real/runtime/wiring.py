@@ -155,7 +155,7 @@ class _Tables:
         return SlotTable(split(flat.seq), split(flat.ts), inputs)
 
     def _table(self, name: str, seq: np.ndarray, moment: np.ndarray, ticks: np.ndarray) -> SlotTable:
-        """Return the table of steps ``seq`` ``(E, C)`` at moments ``(C,)``; the world has made ``ticks`` ``(C,)`` then."""
+        """Return the table of steps ``seq`` ``(E, C)`` at moments ``(C,)``: the world has made ``ticks``, ``(C,)``."""
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
         inputs = {}
         for key, edge in self.placer.edges.items():

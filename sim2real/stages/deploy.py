@@ -46,6 +46,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     bundle, run_dir = _find_bundle(pipeline, config, root, run_dir)
     policy = _load_policy(robot, bundle)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir) as stage:
+        values = _identified(pipeline, stage.run_dir)
         logs = [stage.output(f"log_{i}", f"episode_{i}.mcap") for i in range(config.episodes)]
         with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
             if session.embedded is not None:
@@ -55,7 +56,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         real = [
             _true_states(stage.folder / TRUTH, s, read_log(log), robot) for log, s in zip(logs, timing, strict=True)
         ]
-        simulated = _simulate(pipeline, robot, policy, stage.run_dir, read_log(logs[0]), config.duration_s)
+        simulated = _simulate(robot, policy, values, read_log(logs[0]), config.duration_s)
         result = _compare(robot, real, simulated)
         stage.output("result", "result.json").write_text(
             json.dumps({**result, "timing": timing, "units": dict(robot.UNITS)}, indent=1)
@@ -136,18 +137,21 @@ def _true_states(
     return t_s, {**episode.outputs["sensor"], "command": command}
 
 
-def _simulate(
-    pipeline: Pipeline, robot: Robot, policy: Policy, run_dir: Path, episode: Episode, duration_s: float
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
-    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
-
-    None when the run holds no identified parameters to simulate with.
-    """
+def _identified(pipeline: Pipeline, run_dir: Path) -> dict[str, float] | None:
+    """Return the parameters to simulate with, read before anything moves; None when the run holds none."""
     identified = finished(run_dir, "identify")
     if identified is None:
         return None
     document = load_parameters(identified.output("parameters"), pipeline)
-    values = {p["name"]: float(p["estimate"]) for p in document["parameters"] if p["kind"] != "derived"}
+    return {p["name"]: float(p["estimate"]) for p in document["parameters"] if p["kind"] != "derived"}
+
+
+def _simulate(
+    robot: Robot, policy: Policy, values: Mapping[str, float] | None, episode: Episode, duration_s: float
+) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
+    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's."""
+    if values is None:
+        return None
     nodes, _ = robot.training(values, {}, computation_delays(episode), True)
     graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, duration_s, _SIMULATIONS, 0))
     params = robot.simulation_params(values, policy)

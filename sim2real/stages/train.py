@@ -49,6 +49,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     path, run_dir = _find_parameters(pipeline, config, root, run_dir)
     identified = load_parameters(path, pipeline)
     log = Path(identified["log"]["path"])
+    if log.is_file() and sha256(log) != identified["log"].get("sha256"):
+        note(f"warning: {log} is not the log that {path} was identified from: it has changed since")
     values, spread = model_values(robot, identified, config)
     delays = config.model == "identified"
     computation = computation_delays(load_log(log, pipeline)) if delays else {}

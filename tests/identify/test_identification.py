@@ -12,7 +12,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.problem import Problem
 from sim2real.identify.search import cma_es
-from sim2real.identify.uncertainty import uncertainty
+from sim2real.identify.uncertainty import centred, uncertainty
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
@@ -132,6 +132,18 @@ def test_the_delays_alone_are_not_identifiable_and_the_groups_are(fitted):
     assert np.all(spread.low < spread.high)
 
 
+def test_time_is_shifted_to_the_middle_of_what_the_bounds_admit(fitted):
+    table = fitted.problem.table
+    middle = {n: float(v) for n, v in table.decode(jnp.asarray(centred(table, fitted.found.z))).items()}
+    total = fitted.values["sensor_delay"] + fitted.values["actuator_delay"]
+    assert middle["sensor_delay"] + middle["actuator_delay"] == pytest.approx(total, abs=1e-4)
+    least = max(table["sensor_delay"].low, total - table["actuator_delay"].high)
+    most = min(table["sensor_delay"].high, total - table["actuator_delay"].low)
+    assert middle["sensor_delay"] == pytest.approx((least + most) / 2, abs=1e-4)
+    for group in ("gain", "gravity", "damping", "friction"):
+        assert middle[group] == pytest.approx(fitted.values[group], rel=1e-4)
+
+
 def test_shifting_time_between_the_delays_changes_little(fitted):
     problem = fitted.problem
     shifted = {**fitted.values}
@@ -155,10 +167,10 @@ def test_nan_in_the_log_is_an_error(fitted, node, field):
 
 def test_logs_that_lack_something_are_errors(fitted):
     episode = fitted.episode
-    with pytest.raises(Sim2RealError, match="no steps of node 'actuator'. Available: sensor"):
+    with pytest.raises(Sim2RealError, match=r"no steps of node 'actuator'\. Available: sensor"):
         make_problem(replace(episode, steps={"sensor": episode.steps["sensor"]}))
     outputs = {**episode.outputs, "sensor": {"th": episode.outputs["sensor"]["th"]}}
-    with pytest.raises(Sim2RealError, match="no field 'thdot' in this log. Available: th"):
+    with pytest.raises(Sim2RealError, match=r"no field 'thdot' in this log\. Available: th"):
         make_problem(replace(episode, outputs=outputs))
     model = fitted.problem.model
     with pytest.raises(UsageError, match="too few to start a segment"):

@@ -2,26 +2,11 @@
 
 import threading
 import time
-import zlib
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from sim2real.graph import Base, BaseNode, EmpiricalDist, Jitter, Scheduling
-
-MASK = 2**32 - 1
-
-
-@struct.dataclass
-class Value(Base):
-    x: jax.Array
-
-
-def mix(a: int, b: int) -> int:
-    """Mix two 32-bit integers: the order of the mixed values matters."""
-    return ((a ^ (b & MASK)) * 16777619 + 12345) & MASK
+from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
+from sim2real.graph.testing import Value
 
 
 class Plain(BaseNode):
@@ -66,41 +51,6 @@ class Jitted(Plain):
 
     def step(self, step_state):
         return step_state.replace(state=step_state.state + 1), Value(x=step_state.seq)
-
-
-class HashInPython(BaseNode):
-    """Its state depends on everything that it was given: every slot of every window, in order."""
-
-    jittable = False
-
-    def init_state(self, rng=None, graph_state=None):
-        return jnp.uint32(zlib.crc32(self.name.encode()))
-
-    def init_output(self, rng=None, graph_state=None):
-        return Value(x=jax.random.bits(rng, (), jnp.uint32))
-
-    def step(self, step_state):
-        acc = mix(int(step_state.state), int(step_state.seq))
-        for name in sorted(step_state.inputs):
-            window = step_state.inputs[name]
-            for seq, x in zip(window.seq, window.data.x, strict=True):
-                acc = mix(mix(acc, int(seq)), int(x))
-        return step_state.replace(state=np.uint32(acc)), Value(x=np.uint32(mix(acc, 7)))
-
-
-class HashInJax(HashInPython):
-    jittable = True
-
-    def step(self, step_state):
-        def mixed(a, b):
-            return (a ^ b.astype(jnp.uint32)) * jnp.uint32(16777619) + jnp.uint32(12345)
-
-        acc = mixed(step_state.state, step_state.seq)
-        for name in sorted(step_state.inputs):
-            window = step_state.inputs[name]
-            for i in range(window.seq.shape[0]):
-                acc = mixed(mixed(acc, window.seq[i]), window.data.x[i])
-        return step_state.replace(state=acc), Value(x=mixed(acc, jnp.uint32(7)))
 
 
 def pair(cls=Plain, rate=100.0, **options):

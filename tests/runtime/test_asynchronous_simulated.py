@@ -1,127 +1,22 @@
 """The simulated clock: the rules as an independent simulation, determinism, trainable delays, the gym-like calls."""
 
-import math
 import time
-from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from asynchronous_nodes import HashInJax, HashInPython, Jitted, Plain, Value, jittery, mix, random_graph
+from asynchronous_nodes import Jitted, Plain, jittery, random_graph
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, Timeline, TrainableDist
+from sim2real.graph import BaseNode, BaseWorld, Timeline, TrainableDist
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
+from sim2real.graph.testing import HashInJax, HashInPython, Reference, Value
+from sim2real.graph.testing.nodes import mix
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS
-
-
-class Reference:
-    """The timing rules by the letter, in Python integers, one message at a time; for one episode."""
-
-    def __init__(self, nodes, timeline, outputs, states):
-        self.nodes = nodes
-        self.starts = {n: [] for n in nodes}
-        self.ends = {n: [] for n in nodes}
-        self.busy = {n: (timeline.vertices[n].end - timeline.vertices[n].start)[0].tolist() for n in nodes}
-        self.travel = {}
-        for key, edge in timeline.edges.items():
-            self.travel[key] = (edge.received - timeline.vertices[edge.sender].end)[0].tolist()
-        self.count = {n: int(timeline.vertices[n].count[0]) for n in nodes}
-        self.outputs, self.hashes, self.made = outputs, {n: [s] for n, s in states.items()}, {}
-        while any([self._advance(n) for n in nodes]):
-            pass
-        self.seq_in = {(n, i): self._consumers(node, c) for n, node in nodes.items() for i, c in node.inputs.items()}
-
-    def phase(self, node):
-        return max([0, *(self.arrival(c) for c in node.inputs.values() if not c.skip)])
-
-    def arrival(self, c):
-        return self.phase(c.output_node) + round(c.output_node.delay * 1e6) + round(c.delay * 1e6)
-
-    def slot(self, node, k):
-        return math.floor(Fraction(k * 1_000_000) / Fraction(node.rate) + Fraction(1, 2)) + self.phase(node)
-
-    def group(self, c, k):
-        """Messages that step k of a blocking input waits for."""
-        out, high = [], self.slot(c.input_node, k)
-        low = self.slot(c.input_node, k - 1) if k else None
-        for i in range(len(self.busy[c.output_node.name])):
-            s = self.slot(c.output_node, i)
-            if s > high:
-                break
-            after = low is None or (s >= low if c.skip else s > low)
-            if after and not (c.skip and s == high):
-                out.append(i)
-        return out
-
-    def received(self, c, i):
-        travel, ends = self.travel[c.input_node.name, c.name], self.ends[c.output_node.name]
-        return max(ends[j] + travel[j] for j in range(i + 1))
-
-    def _advance(self, name):
-        node, starts, ends = self.nodes[name], self.starts[name], self.ends[name]
-        k, blocked = len(starts), 0
-        if k == len(self.busy[name]):
-            return False
-        for c in node.inputs.values():
-            if c.blocking:
-                group = self.group(c, k)
-                if group and group[-1] >= len(self.ends[c.output_node.name]):
-                    return False
-                if group:
-                    blocked = max(blocked, self.received(c, group[-1]))
-        previous = ends[-1] if ends else 0
-        drift = 0
-        for j in range(k):  # what the overruns before this step added up to
-            end_before = ends[j - 1] if j else 0
-            if node.scheduling is Scheduling.FREQUENCY:
-                drift += max(0, end_before - self.slot(node, j) - drift)
-        begin = max(previous, blocked)
-        if not (node.advance and all(c.blocking for c in node.inputs.values())):
-            begin = max(begin, self.slot(node, k) + drift)
-        starts.append(begin)
-        ends.append(begin + self.busy[name][k])
-        return True
-
-    def _consumers(self, node, c):
-        sent = self.count[c.output_node.name]
-        out, head = [-1] * sent, 0
-        for k in range(self.count[node.name]):
-            group = self.group(c, k) if c.blocking else []
-            while head < sent:
-                if c.blocking:
-                    take = head in group
-                else:
-                    t, r = self.starts[node.name][k], self.received(c, head)
-                    take = r < t if c.skip else r <= t
-                    if c.jitter is Jitter.BUFFER:
-                        nominal = self.slot(c.output_node, head) - self.phase(c.output_node) + self.arrival(c)
-                        take = take and nominal <= t
-                if not take:
-                    break
-                out[head] = k
-                head += 1
-        return out
-
-    def hash(self, name, k):
-        """State after step k."""
-        hashes = self.hashes[name]
-        while len(hashes) <= k + 1:
-            step = len(hashes) - 1
-            acc = mix(hashes[-1], step)
-            for i in sorted(self.nodes[name].inputs):
-                c = self.nodes[name].inputs[i]
-                sender = c.output_node.name
-                window = [m for m, s in enumerate(self.seq_in[name, i]) if 0 <= s <= step][-c.window :]
-                for m in [-1] * (c.window - len(window)) + window:
-                    x = self.outputs[sender] if m < 0 else mix(self.hash(sender, m), 7)
-                    acc = mix(mix(acc, m), x)
-            hashes.append(acc)
-        return hashes[k + 1]
 
 
 def hash_graph(seed):
@@ -147,16 +42,17 @@ def test_matches_an_independent_simulation(seed):
     supervisor = list(nodes)[-1]
     initial = AsyncGraph(nodes, nodes[supervisor], Clock.SIMULATED, timeline=timeline).init(jax.random.key(seed))
     outputs = {n: int(o.x) for n, o in initial.aux[OUTPUTS].items()}
-    expected = Reference(nodes, timeline, outputs, {n: int(s) for n, s in initial.state.items()})
+    expected = Reference(nodes, timeline)
+    hashes = expected.hashes({n: int(s) for n, s in initial.state.items()}, outputs)
     episode, final = record(nodes, supervisor, seed=seed, timeline=timeline)
     for n in nodes:
         count = expected.count[n]
         assert len(episode.steps[n]) == count > 5
         np.testing.assert_array_equal(episode.steps[n].start, expected.starts[n][:count])
         np.testing.assert_array_equal(episode.steps[n].end, expected.ends[n][:count])
-        assert int(final.state[n]) == expected.hash(n, count - 1)
+        assert int(final.state[n]) == hashes[n][count - 1]
         assert int(final.seq[n]) == count
-        assert [int(x) for x in episode.outputs[n]["x"]] == [mix(expected.hash(n, k), 7) for k in range(count)]
+        assert [int(x) for x in episode.outputs[n]["x"]] == [mix(h, 7) for h in hashes[n]]
     for key, seq_in in expected.seq_in.items():
         np.testing.assert_array_equal(episode.messages[key].seq_in, seq_in)
 

@@ -14,7 +14,7 @@ from asynchronous_nodes import Jitted, Plain, Value, pair, random_graph
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Jitter, Scheduling, Timeline
 from sim2real.graph.episode import MemoryRecorder
-from sim2real.graph.schedule import derive
+from sim2real.graph.schedule import rederive
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 
@@ -34,9 +34,7 @@ def assert_rules_explain(episode, nodes):
     """The timeline that the rules derive from measured delays is the recorded one."""
     nodes = {n.name: n for n in nodes}
     recorded = Timeline.from_episode(episode, nodes)
-    busy = {n: (s.end - s.start)[None] for n, s in episode.steps.items()}
-    travel = {k: (m.received - m.sent)[None] for k, m in episode.messages.items()}
-    derived = derive(nodes, busy, travel, duration=2**60)
+    derived = rederive(episode, nodes)
     for n, vertex in recorded.vertices.items():
         np.testing.assert_array_equal(derived.vertices[n].start, vertex.start, err_msg=n)
         np.testing.assert_array_equal(derived.vertices[n].end, vertex.end, err_msg=n)

@@ -2,16 +2,13 @@
 
 import jax
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim2real.errors import UsageError
-from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Scheduling, Timeline, TrainableDist
+from sim2real.graph import Timeline
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw, rederive
-from sim2real.graph.testing import HashInPython, hash_node, random_graph
-from sim2real.graph.windows import bursty_episodes
+from sim2real.graph.testing import random_graph
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS
@@ -44,7 +41,7 @@ def compare(nodes, supervisor, timeline, eps=0):
 
 
 def soon(nodes, supervisor, wiring, timeline, eps, name):
-    """Return how many steps a node must have made by the last row: those that start two steps of the supervisor before."""
+    """Return how many steps a node must have made by the last row: those that start a few rows before."""
     if wiring.world:
         last = wiring.rows * wiring.ticks / nodes[wiring.world].rate * 1e6
         wait = 3 * np.ceil(nodes[wiring.world].rate / nodes[supervisor].rate) / nodes[wiring.world].rate * 1e6

@@ -1,5 +1,8 @@
 """What a test of nodes and runtimes needs: nodes that give wrong messages away, the rules by the letter, suites."""
 
+from sim2real.graph.testing.conformance import NodeConformance as NodeConformance
+from sim2real.graph.testing.conformance import Played as Played
+from sim2real.graph.testing.conformance import RuntimeConformance as RuntimeConformance
 from sim2real.graph.testing.nodes import HashInJax as HashInJax
 from sim2real.graph.testing.nodes import HashInPython as HashInPython
 from sim2real.graph.testing.nodes import Value as Value

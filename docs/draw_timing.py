@@ -1,0 +1,349 @@
+"""Draw the pictures of timing.md: `python docs/draw_timing.py` writes docs/timing/*.svg.
+
+What they show is computed by `sim2real.graph.schedule`, and stands in each file's description as well: a test compares it
+with what the code computes now.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sim2real.graph.node import BaseNode, Jitter, Scheduling, to_ticks
+from sim2real.graph.schedule import derive, eligible, slot
+from sim2real.graph.timeline import NEVER, Timeline
+
+FOLDER = Path(__file__).resolve().parent / "timing"
+INK, MUTED, GRID, BAR, WAIT, MESSAGE, LATE = "#1b2430", "#5c6875", "#d9dfe6", "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
+_BAR, _LANE = 0.30, 1.0
+
+Case = dict[str, Any]
+"""One picture, in milliseconds: ``title``, ``lanes`` and ``messages`` (see ``case``), and what is written into it."""
+
+
+def case(title: str, nodes: Sequence[BaseNode], timeline: Timeline, names: Mapping[str, str] | None = None) -> Case:
+    """Return a picture of the first episode of a timeline, one lane for each node."""
+    lanes, messages = [], []
+    for node in nodes:
+        v = timeline.vertices[node.name]
+        count = int(v.count[0])
+        lanes.append(
+            {
+                "node": (names or {}).get(node.name, node.name),
+                "slots": _ms(slot(node, np.arange(count))),
+                "start": _ms(v.start[0, :count]),
+                "end": _ms(v.end[0, :count]),
+            }
+        )
+    place = {n.name: i for i, n in enumerate(nodes)}
+    for (reader, name), edge in timeline.edges.items():
+        begin, sent = timeline.vertices[reader].start[0], timeline.vertices[edge.sender].end[0]
+        for m, k in enumerate(edge.seq_in[0].tolist()):
+            if edge.received[0, m] >= NEVER:
+                continue
+            messages.append(
+                {
+                    "seq": m,
+                    "from": place[edge.sender],
+                    "to": place[reader],
+                    "input": name,
+                    "sent": _ms(sent[m]),
+                    "received": _ms(edge.received[0, m]),
+                    "read": _ms(begin[k]) if k >= 0 else None,
+                }
+            )
+    return {"title": title, "lanes": lanes, "messages": messages, "notes": []}
+
+
+def cases() -> Iterator[tuple[str, Case]]:
+    """Yield name and picture, one or more for each rule."""
+    yield "1_phase", _phase()
+    yield "2_schedule", _schedule()
+    yield "3_overrun", _overrun()
+    yield "3_blocking", _blocking()
+    yield "4_end", _end()
+    yield "5_order", _order()
+    yield "6_latest", _latest()
+    yield "6_buffer", _buffer()
+    yield "6_blocking", _quota()
+    yield "7_window", _window()
+
+
+def _derive(nodes: Sequence[BaseNode], busy: Mapping[str, Sequence[float]], travel: Mapping[Any, Any] = {}) -> Timeline:  # noqa: B006
+    ticks = lambda values: np.array([[to_ticks(v / 1000) for v in values]])  # noqa: E731
+    return derive(
+        {n.name: n for n in nodes},
+        {n: ticks(b) for n, b in busy.items()},
+        {k: ticks(t) for k, t in travel.items()},
+        int(NEVER),
+    )
+
+
+def _phase() -> Case:
+    sensor, agent, actuator = (
+        BaseNode(n, 50, delay=d) for n, d in [("sensor", 0.002), ("agent", 0.004), ("actuator", 0.001)]
+    )
+    agent.connect(sensor, delay=0.001)
+    actuator.connect(agent, delay=0.002)
+    sensor.connect(actuator, skip=True, delay=0.001)
+    nodes = [sensor, agent, actuator]
+    picture = case(
+        "Rule 1: with delays as expected, every message arrives exactly when its reader starts",
+        nodes,
+        _derive(
+            nodes,
+            {"sensor": [2, 2], "agent": [4, 4], "actuator": [1, 1]},
+            {("agent", "sensor"): [1, 1], ("actuator", "agent"): [2, 2], ("sensor", "actuator"): [1, 1]},
+        ),
+    )
+    picture["notes"] += [[n.phase * 1000, i, f"phase {n.phase * 1000:g} ms"] for i, n in enumerate(nodes)]
+    return picture
+
+
+def _schedule() -> Case:
+    fast, slow = BaseNode("50 Hz", 50), BaseNode("30 Hz", 30)
+    slow.connect(fast, delay=0.008)
+    timeline = _derive([fast, slow], {"50 Hz": [3] * 6, "30 Hz": [3] * 4}, {("30 Hz", "50 Hz"): [8] * 6})
+    picture = case(
+        "Rule 2: step k is scheduled at its slot, rounded by itself", [fast, slow], Timeline(timeline.vertices, {})
+    )
+    for lane, node in enumerate((fast, slow)):
+        for k, s in enumerate(picture["lanes"][lane]["slots"]):
+            picture["notes"].append([s, lane, f"{s:g}" if node is slow and k else f"s{k} = {s:g}"])
+    return picture
+
+
+def _overrun() -> Case:
+    nodes = [BaseNode(s.name, 100, scheduling=s) for s in Scheduling]
+    busy = [3, 24, 3, 3, 3, 3]
+    return case(
+        "Rule 3: an overrun moves the whole later schedule (FREQUENCY), or is caught up with (PHASE)",
+        nodes,
+        _derive(nodes, {n.name: busy for n in nodes}),
+    )
+
+
+def _blocking() -> Case:
+    sender = BaseNode("sender", 100)
+    waits, advances = BaseNode("waits", 100), BaseNode("advance=True", 100, advance=True)
+    for reader in (waits, advances):
+        reader.connect(sender, blocking=True, delay=0.004)
+    nodes = [advances, sender, waits]
+    return case(
+        "Rule 3: waiting for a message does not move the schedule; with advance a step need not wait for its slot",
+        nodes,
+        _derive(
+            nodes,
+            {"sender": [1] * 4, "waits": [2] * 4, "advance=True": [2] * 4},
+            {(r.name, "sender"): [1, 8, 1, 1] for r in (waits, advances)},
+        ),
+    )
+
+
+def _end() -> Case:
+    node, reader = BaseNode("sensor", 50, delay=0.006), BaseNode("reader", 50)
+    reader.connect(node, delay=0.002)
+    picture = case(
+        "Rule 4: a late thread does not change when a step starts, only how long it takes",
+        [node, reader],
+        _derive([node, reader], {"sensor": [7.5, 4], "reader": [3, 3]}, {("reader", "sensor"): [2, 2]}),
+    )
+    picture["marks"] = [[3.0, 0, "woken"], [5.0, 0, "ts"]]
+    picture["notes"] += [[0.0, 0, "start"], [7.5, 0, "end"]]
+    return picture
+
+
+def _order() -> Case:
+    sender, reader = BaseNode("sender", 100), BaseNode("reader", 100)
+    reader.connect(sender, delay=0.003)
+    return case(
+        "Rule 5: a fast message does not overtake a slow one",
+        [sender, reader],
+        _derive(
+            [sender, reader],
+            {"sender": [2] * 5, "reader": [2] * 5},
+            {("reader", "sender"): [3, 19, 3, 3, 3]},
+        ),
+    )
+
+
+def _latest() -> Case:
+    sender, plain, skips = BaseNode("sender", 100, delay=0.002), BaseNode("reader", 100), BaseNode("skip=True", 100)
+    clock = BaseNode("clock", 100, delay=0.005)
+    plain.connect(sender, delay=0.003)
+    skips.connect(sender, delay=0.003, skip=True)
+    skips.connect(clock)  # gives it the same phase
+    nodes = [plain, sender, skips]
+    travel = [3, 3, 6, 3]
+    timeline = _derive(
+        [*nodes, clock],
+        {"sender": [2] * 4, "reader": [2] * 4, "skip=True": [2] * 4, "clock": [0] * 4},
+        {("reader", "sender"): travel, ("skip=True", "sender"): travel, ("skip=True", "clock"): [5] * 4},
+    )
+    return case("Rule 6: a message that arrives exactly at the start is read, or with skip left to the next step", nodes,
+                timeline.filter([n.name for n in nodes]))  # fmt: skip
+
+
+def _buffer() -> Case:
+    sender = BaseNode("sender", 100, delay=0.001)
+    readers = [BaseNode(j.name, 100, delay=0.0) for j in Jitter]
+    for reader, jitter in zip(readers, Jitter, strict=True):
+        reader.connect(sender, delay=0.012, jitter=jitter)
+    nodes = [readers[0], sender, readers[1]]
+    travel = [2, 2, 17, 2, 2]
+    picture = case(
+        "Rule 6: LATEST reads what is there; BUFFER holds a message until its nominal arrival",
+        nodes,
+        _derive(
+            nodes,
+            {"sender": [1] * 5, **{r.name: [2] * 5 for r in readers}},
+            {(r.name, "sender"): travel for r in readers},
+        ),
+    )
+    connection = readers[1].inputs["sender"]
+    nominal = eligible(connection, np.zeros((1, 5), np.int64))[0]
+    picture["due"] = [[value, 2] for value in _ms(nominal)]
+    return picture
+
+
+def _quota() -> Case:
+    sender = BaseNode("50 Hz", 50)
+    same, half = BaseNode("50 Hz, blocking", 50), BaseNode("25 Hz, blocking", 25)
+    same.connect(sender, blocking=True, delay=0.02)
+    half.connect(sender, blocking=True, delay=0.003)
+    nodes = [same, sender, half]
+    return case(
+        "Rule 6: a blocking step waits for the messages whose sender was scheduled since its last slot",
+        nodes,
+        _derive(
+            nodes,
+            {"50 Hz": [2] * 6, "50 Hz, blocking": [2] * 5, "25 Hz, blocking": [2] * 3},
+            {(same.name, "50 Hz"): [1] * 6, (half.name, "50 Hz"): [1, 1, 4, 1, 1, 1]},
+        ),
+    )
+
+
+def _window() -> Case:
+    sender, reader = BaseNode("sender", 100), BaseNode("reader, window=3", 50)
+    reader.connect(sender, delay=0.003, window=3)
+    timeline = _derive(
+        [sender, reader],
+        {"sender": [2] * 8, reader.name: [2] * 4},
+        {(reader.name, "sender"): [1, 4, 1, 14, 1, 1, 1, 1]},
+    )
+    picture = case("Rule 7: a step sees the last three messages consumed, oldest first", [sender, reader], timeline)
+    seq_in = timeline.edges[reader.name, "sender"].seq_in[0]
+    for k, t in enumerate(picture["lanes"][1]["start"]):
+        seen = np.flatnonzero((seq_in >= 0) & (seq_in <= k))[-3:].tolist()
+        picture["notes"].append(
+            [
+                t,
+                1,
+                "["
+                + ", ".join("–" for _ in range(3 - len(seen)))
+                + (", " if seen and len(seen) < 3 else "")
+                + ", ".join(map(str, seen))
+                + "]",
+            ]
+        )
+    return picture
+
+
+def _ms(ticks: Any) -> Any:
+    return (np.asarray(ticks) / 1000).round(3).tolist()
+
+
+def draw(picture: Case) -> Figure:
+    """Draw a picture."""
+    count = len(picture["lanes"])
+    figure = Figure(figsize=(9.0, 0.75 + 0.95 * count))
+    axes = figure.subplots()
+    heights = [-_LANE * i for i in range(count)]
+    for height, lane in zip(heights, picture["lanes"], strict=True):
+        _draw_lane(axes, height, lane)
+    for message in picture["messages"]:
+        _draw_message(axes, heights, message)
+    for time, lane, label in picture["notes"]:
+        axes.text(time, heights[lane] - 0.27, label, ha="center", va="top", fontsize=7.5, color=MUTED)
+    for time, lane, label in picture.get("marks", []):
+        axes.plot([time, time], [heights[lane] - 0.21, heights[lane] + 0.21], color=WAIT, lw=1.6)
+        axes.text(time, heights[lane] - 0.27, label, ha="center", va="top", fontsize=7.5, color=WAIT)
+    for time, lane in picture.get("due", []):
+        axes.plot(time, heights[lane] + 0.32, marker="v", ms=4.5, color=LATE, mew=0)
+    axes.set_title(picture["title"], fontsize=9.5, loc="left", color=INK)
+    axes.set_yticks(heights, [lane["node"] for lane in picture["lanes"]], fontsize=9, color=INK)
+    axes.set_ylim(heights[-1] - 0.6, 0.6)
+    last = max(max(lane["end"]) for lane in picture["lanes"])
+    axes.set_xlim(-0.03 * last, 1.04 * last)
+    axes.set_xlabel("time [ms]", fontsize=8.5, color=MUTED)
+    axes.tick_params(axis="x", labelsize=8, colors=MUTED)
+    axes.tick_params(axis="y", length=0)
+    for side in ("left", "right", "top"):
+        axes.spines[side].set_visible(False)
+    axes.spines["bottom"].set_color(GRID)
+    figure.tight_layout()
+    return figure
+
+
+def _draw_lane(axes: Axes, height: float, lane: Mapping[str, Any]) -> None:
+    axes.axhline(height, color=GRID, lw=1.0, zorder=0)
+    for s in lane["slots"]:
+        axes.plot([s, s], [height - 0.22, height + 0.22], color=MUTED, lw=1.0, ls=(0, (2, 1.5)), zorder=1)
+    for k, (begin, end) in enumerate(zip(lane["start"], lane["end"], strict=True)):
+        axes.barh(height, max(end - begin, 0.15), left=begin, height=_BAR, color=BAR, alpha=0.92, zorder=2, lw=0)
+        if end - begin > 1.0:
+            axes.text(
+                (begin + end) / 2, height, str(k), ha="center", va="center", fontsize=7.5, color="white", zorder=4
+            )
+
+
+def _draw_message(axes: Axes, heights: Sequence[float], m: Mapping[str, Any]) -> None:
+    sender, reader = heights[m["from"]], heights[m["to"]]
+    side = np.sign(sender - reader)
+    leave, arrive = sender - side * _BAR / 2, reader + side * (_BAR / 2 + 0.10)
+    read = m["read"]
+    color = MESSAGE if read is not None else MUTED
+    axes.plot([m["sent"], m["received"]], [leave, arrive], color=color, lw=1.1, zorder=3)
+    face = color if read is not None else "white"
+    axes.plot(m["received"], arrive, marker="o", ms=4.5, color=color, mfc=face, zorder=5)
+    middle = ((m["sent"] + m["received"]) / 2, (leave + arrive) / 2)
+    axes.text(*middle, f" {m['seq']}", fontsize=7.5, color=color, ha="left", va="center", zorder=5)
+    if read is not None:
+        if read > m["received"]:
+            axes.plot([m["received"], read], [arrive, arrive], color=color, lw=1.0, ls=":", zorder=3)
+        axes.plot([read, read], [arrive, reader + side * _BAR / 2], color=color, lw=1.0, zorder=3)
+
+
+def write(folder: Path, kind: str = "svg") -> None:
+    """Write all pictures to a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sim2real", "font.family": "sans-serif"}):
+        for name, picture in cases():
+            metadata = {"Date": None, "Description": json.dumps(picture)} if kind == "svg" else None
+            draw(picture).savefig(folder / f"{name}.{kind}", metadata=metadata, dpi=110)
+
+
+def described(path: Path) -> Case:
+    """Return the picture that an SVG file says it shows."""
+    found = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
+    if found is None:
+        raise ValueError(f"{path} has no description")
+    return json.loads(unescape(found.group(1)))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Draw the pictures of timing.md.")
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--kind", choices=["svg", "png"], default="svg")
+    options = parser.parse_args()
+    write(options.folder, options.kind)

@@ -1,0 +1,164 @@
+"""Suites to inherit: what holds for every node, and for every runtime."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.graph.testing.nodes import MakeNode, hash_node, mix, random_graph
+from sim2real.graph.testing.reference import Reference
+from sim2real.graph.timeline import Timeline
+
+
+def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -> StepState:
+    """Return what a node's first step gets when nothing has arrived yet.
+
+    Args:
+        nodes: The node and its senders, by name.
+        name: The node.
+        key: JAX key.
+    """
+    keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}
+    gs = GraphState()
+    for n, node in nodes.items():
+        gs = _replace(gs, params={**gs.params, n: node.init_params(keys[n][0], gs)})
+    for n, node in nodes.items():
+        gs = _replace(gs, state={**gs.state, n: node.init_state(keys[n][1], gs)})
+    inputs = {}
+    for input_name, c in nodes[name].inputs.items():
+        sender = c.output_node.name
+        output = nodes[sender].init_output(keys[sender][2], gs)
+        data = jax.tree_util.tree_map(lambda x, w=c.window: jnp.broadcast_to(x, (w, *jnp.shape(x))), output)
+        zeros = jnp.zeros(c.window, jnp.float32)
+        inputs[input_name] = InputState(jnp.full(c.window, -1, jnp.int32), zeros, zeros, data)
+    step = StepState(
+        keys[name][3], gs.state[name], gs.params[name], inputs, jnp.int32(0), jnp.int32(0), jnp.float32(0.0)
+    )
+    return jax.tree_util.tree_map(jnp.asarray, step)
+
+
+class NodeConformance(ABC):
+    """What every node keeps to. Inherit in a test module, under a name that starts with ``Test``."""
+
+    @abstractmethod
+    def graph(self) -> tuple[Mapping[str, BaseNode], str]:
+        """Return the node, connected, with its senders, by name; and its name."""
+
+    def given(self) -> tuple[BaseNode, StepState, Mapping[str, BaseNode]]:
+        """Return node, step state and all nodes."""
+        nodes, name = self.graph()
+        return nodes[name], first_step_state(nodes, name, jax.random.key(0)), nodes
+
+    def test_the_step_is_pure(self) -> None:
+        """The same step state gives the same results, and is left alone."""
+        node, given, _ = self.given()
+        before = copy.deepcopy(jax.tree_util.tree_map(np.asarray, _without_keys(given)))
+        first, second = node.step(given), node.step(given)
+        assert _equal(_without_keys(first), _without_keys(second)), f"node {node.name!r}: two calls differ"
+        assert _equal(before, _without_keys(given)), f"node {node.name!r}: step changed what it was given"
+
+    def test_the_step_keeps_structure_shapes_and_dtypes(self) -> None:
+        """State, parameters and key go out as they came in: a compiled program carries them."""
+        node, given, _ = self.given()
+        after, _ = node.step(given)
+        for field in ("state", "params", "rng"):
+            _same_form(getattr(given, field), getattr(after, field), f"node {node.name!r}: {field}")
+
+    def test_the_output_looks_like_the_default_output(self) -> None:
+        """Readers find both in one window."""
+        node, given, nodes = self.given()
+        gs = GraphState(
+            params={n: x.init_params(jax.random.key(1)) for n, x in nodes.items()}, state={node.name: given.state}
+        )
+        _same_form(node.init_output(jax.random.key(2), gs), node.step(given)[1], f"node {node.name!r}: output")
+
+    def test_what_init_makes_depends_on_the_key_alone(self) -> None:
+        """The same key gives the same parameters, state and output."""
+        node, _, nodes = self.given()
+        one, two = (first_step_state(nodes, node.name, jax.random.key(5)) for _ in range(2))
+        assert _equal(_without_keys(one), _without_keys(two)), f"node {node.name!r}: init is not reproducible"
+
+    def test_the_step_can_be_compiled(self) -> None:
+        """Unless the node says that it cannot."""
+        node, given, _ = self.given()
+        if node.jittable:
+            _same_form(jax.eval_shape(node.step, given)[1], node.step(given)[1], f"node {node.name!r}: traced output")
+
+
+class Played(NamedTuple):
+    """One episode of hash nodes, as a runtime played it.
+
+    Attributes:
+        states: Initial state of each node.
+        defaults: Default output of each node.
+        outputs: Node -> its outputs by seq, shape ``(N,)``; a runtime may leave out the last few steps.
+    """
+
+    states: Mapping[str, Any]
+    defaults: Mapping[str, Any]
+    outputs: Mapping[str, np.ndarray]
+
+
+class RuntimeConformance(ABC):
+    """What every runtime that plays timelines keeps to: every step sees the messages that the rules say."""
+
+    make: MakeNode = staticmethod(hash_node)
+    """Makes the hash nodes, in Python or in JAX."""
+    seeds: Sequence[int] = range(8)
+    """The random graphs."""
+    duration_s: float = 0.4
+
+    @abstractmethod
+    def play(self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, episode: int) -> Played:
+        """Play one episode of a timeline."""
+
+    def test_every_step_sees_what_the_rules_say(self) -> None:
+        """Hashes over all that was seen, against the rules by the letter."""
+        for seed in self.seeds:
+            nodes = random_graph(seed, make=type(self).make)
+            timeline = draw(nodes, self.duration_s, 2, seed)
+            played = self.play(nodes, "n0", timeline, seed % 2)
+            states = {n: int(x) for n, x in played.states.items()}
+            defaults = {n: int(x) for n, x in played.defaults.items()}
+            expected = Reference(nodes, timeline, seed % 2).hashes(states, defaults)
+            for name, hashes in expected.items():
+                got = [int(x) for x in played.outputs.get(name, ())]
+                assert got == [mix(h, 7) for h in hashes][: len(got)], f"seed {seed}: node {name!r} saw other messages"
+                assert len(got) >= 0.6 * len(hashes) - 3, f"seed {seed}: node {name!r} made {len(got)} steps"
+
+
+def _replace(gs: GraphState, /, **fields: Any) -> GraphState:
+    return gs.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _without_keys(tree: Any) -> Any:
+    """Return the tree with keys as the numbers they are made of."""
+
+    def one(leaf: Any) -> Any:
+        is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return jax.random.key_data(leaf) if is_key else leaf
+
+    return jax.tree_util.tree_map(one, tree)
+
+
+def _equal(a: Any, b: Any) -> bool:
+    same = jax.tree_util.tree_map(lambda x, y: np.array_equal(x, y, equal_nan=False), a, b)
+    return all(jax.tree_util.tree_leaves(same))
+
+
+def _same_form(expected: Any, got: Any, what: str) -> None:
+    trees = [jax.tree_util.tree_structure(t) for t in (expected, got)]
+    assert trees[0] == trees[1], f"{what}: {trees[1]} instead of {trees[0]}"
+    flat, _ = jax.tree_util.tree_flatten_with_path(expected)
+    for (path, old), new in zip(flat, jax.tree_util.tree_leaves(got), strict=True):
+        form = [(jnp.shape(x), jnp.result_type(x)) for x in (old, new)]
+        assert form[0] == form[1], f"{what}{jax.tree_util.keystr(path)}: {form[1]} instead of {form[0]}"

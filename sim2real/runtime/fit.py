@@ -1,0 +1,73 @@
+"""Whether nodes and a timeline make a graph that can be compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.node import BaseNode
+from sim2real.graph.timeline import NEVER, Timeline
+
+
+def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timeline) -> dict[str, BaseNode]:
+    """Return the nodes of a timeline by name.
+
+    Raises:
+        UsageError: When two have the same name, or one of the timeline's is missing.
+    """
+    found: dict[str, BaseNode] = {}
+    for node in nodes.values() if isinstance(nodes, Mapping) else nodes:
+        if node.name in found:
+            raise UsageError(f"two nodes are called {node.name!r}", hint="names are unique in a graph")
+        found[node.name] = node
+    lost = [n for n in timeline.vertices if n not in found]
+    if lost:
+        raise UsageError(f"the timeline holds node {lost[0]!r}, which was not given. Nodes: {', '.join(found)}")
+    return {n: node for n, node in found.items() if n in timeline.vertices}
+
+
+def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Sequence[str]) -> None:
+    """Check that nodes, connections and timeline fit each other, and that the nodes can be compiled.
+
+    Args:
+        nodes: The nodes of the timeline, by name.
+        timeline: What ran when.
+        given: Names of nodes whose outputs are known, so that they do not run.
+
+    Raises:
+        UsageError: When they do not.
+    """
+    for name, node in nodes.items():
+        if not node.jittable and name not in given:
+            raise UsageError(
+                f"node {name!r} steps in plain Python (jittable = False) and cannot be compiled",
+                hint="give its recorded outputs, or put a simulated node in its place",
+            )
+    unknown = [n for n in given if n not in nodes]
+    if unknown:
+        raise UsageError(
+            f"the outputs of {unknown[0]!r} are given, which is not in the graph. Nodes: {', '.join(nodes)}"
+        )
+    wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
+    for name, input_name in sorted(wanted - set(timeline.edges)):
+        raise UsageError(
+            f"the timeline has no messages for input {input_name!r} of node {name!r}",
+            hint="draw them: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
+        )
+    for name, input_name in sorted(set(timeline.edges) - wanted):
+        raise UsageError(
+            f"the timeline has messages for input {input_name!r} of node {name!r}, which has no such input"
+        )
+    for name, vertex in timeline.vertices.items():
+        if (np.diff(vertex.start, axis=1) < 0).any():
+            raise UsageError(f"the steps of node {name!r} are not in the order of time")
+    for (name, input_name), edge in timeline.edges.items():
+        consumed = np.where(edge.seq_in < 0, NEVER, edge.seq_in)
+        if edge.seq_in.shape != timeline.vertices[edge.sender].start.shape or (np.diff(consumed, axis=1) < 0).any():
+            raise UsageError(
+                f"the messages for input {input_name!r} of node {name!r} are not one for each step of {edge.sender!r}, "
+                "consumed in order",
+                hint="make timelines with draw() or Timeline.from_episode()",
+            )

@@ -1,0 +1,182 @@
+"""One row of a compiled graph: steps computed in slots, the world's ticks, and what is carried from one to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.errors import Sim2RealError
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.runtime.wiring import SlotTable, Wiring
+
+
+class Rollout(NamedTuple):
+    """What a node did in a rollout, in the order of rows.
+
+    Attributes:
+        seq: Shape ``(C,)``, int32: the node's step in each place; -1 where it made none.
+        output: Leaves ``(C, ...)``; meaningless where ``seq`` is -1.
+    """
+
+    seq: Any
+    output: Any
+
+
+class RowProgram:
+    """Traces rows: tables are constants, a graph state's ``eps`` and ``step`` say where in them it stands.
+
+    Args:
+        nodes: The nodes by name.
+        wiring: The tables.
+        given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
+    """
+
+    def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any]) -> None:
+        self.nodes, self.wiring = nodes, wiring
+        self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
+        self._tables = jax.tree_util.tree_map(jnp.asarray, [_pytree(t) for t in wiring.tables])
+        self._world = jax.tree_util.tree_map(jnp.asarray, _pytree(wiring.world_table))
+        self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
+
+    def run_slots(self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]]) -> GraphState:
+        """Run the slots ``begin`` to ``end`` of the row, adding to ``outputs``."""
+        for i in range(begin, end):
+            name = self.wiring.slots[i]
+            step_state = self.step_state(gs, i)
+            new, output = self.call(name, step_state)
+            gs = self.commit(gs, i, new, output, step_state.seq >= 0)
+            outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
+        return gs
+
+    def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]]) -> GraphState:
+        """Run the world's ticks, adding to ``outputs``, and go to the next row."""
+        name = self.wiring.world
+        if name is not None:
+            table = _at(self._world, gs)
+            for tick in range(self.wiring.ticks):
+                now = jax.tree_util.tree_map(lambda t, i=tick: t[i], table)
+                step_state = self._step_state(gs, name, now)
+                new, output = self.call(name, step_state)
+                gs = self.commit(gs, None, new, output, True)
+                outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
+        return gs.replace(step=gs.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
+        """Trace a node's step; an error in it names the node."""
+        try:
+            return self.nodes[name].step(step_state)
+        except Exception as error:
+            error.add_note(f"in the step of node {name!r}")
+            raise
+
+    def step_state(self, gs: GraphState, slot: int) -> StepState:
+        """Return what the step of a slot gets; its ``seq`` is -1 where no step is made."""
+        return self._step_state(gs, self.wiring.slots[slot], _at(self._tables[slot], gs))
+
+    def seq(self, gs: GraphState, slot: int) -> Any:
+        """Return which step a slot makes; -1 for none, and behind the last row."""
+        inside = gs.step < self.wiring.rows
+        return jnp.where(inside, self._tables[slot]["seq"][gs.eps, gs.step], -1)
+
+    def commit(self, gs: GraphState, slot: int | None, new: StepState, output: Any, ran: Any) -> GraphState:
+        """Take over a step's results: everywhere if the slot always runs, else where it ran."""
+        name = self.wiring.world if slot is None else self.wiring.slots[slot]
+        if name is None:
+            raise Sim2RealError("a graph without a world has no tick to commit")
+        always = slot is None or self._always[slot]
+
+        def merge(fresh: Any, old: Any) -> Any:
+            if fresh is old:
+                return old
+            cast = lambda a, b: jnp.asarray(a) if _is_key(b) else jnp.asarray(a, b.dtype)  # noqa: E731
+            fresh = jax.tree_util.tree_map(cast, fresh, old)
+            return fresh if always else select(ran, fresh, old)
+
+        changed: dict[str, Any] = {
+            "state": {**gs.state, name: merge(new.state, gs.state[name])},
+            "rng": {**gs.rng, name: merge(new.rng, gs.rng[name])},
+        }
+        if new.params is not gs.params[name]:
+            changed["params"] = {**gs.params, name: merge(new.params, gs.params[name])}
+        if name in gs.buffer:
+            kept = gs.buffer[name]
+            fresh = jax.tree_util.tree_map(lambda x, old: jnp.asarray(x, old.dtype), output, kept[-1])
+            pushed = (*kept[1:], fresh)
+            changed["buffer"] = {**gs.buffer, name: pushed if always else select(ran, pushed, kept)}
+        return gs.replace(**changed)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any]) -> StepState:
+        inputs = {}
+        for input_name, t in table["inputs"].items():
+            connection = self.nodes[name].inputs[input_name]
+            width, age = connection.total_window, t["age"]
+            sender = connection.output_node.name
+            if sender in self._given:
+                data = self._look_up(gs, sender, t["seq"])
+            else:
+                data = _window(gs.buffer[sender], age, width)
+            dist = gs.delays.get(name, {}).get(input_name)
+            state = InputState(t["seq"], t["sent"], t["received"], data)
+            if dist is not None:
+                period = 1.0 / self.nodes[name].rate
+                served = dist.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
+                state = served.replace(delay_dist=dist)
+            inputs[input_name] = state
+        rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
+        return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
+
+    def _look_up(self, gs: GraphState, sender: str, seq: Any) -> Any:
+        """Return recorded messages by seq; the default output where a slot is empty."""
+
+        def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
+            filled = seq.reshape(-1, *[1] * default.ndim) >= 0
+            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default.astype(recorded.dtype))
+
+        return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
+
+
+def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
+    """Return ``width`` of a node's last outputs, oldest first, that end ``age`` before its newest.
+
+    The outputs are kept one by one and chosen by selects: both fuse into one elementwise program, where a stacked ring
+    costs a GPU a concatenation, a copy and a gather a leaf.
+    """
+    spare = len(kept) - width
+    window = list(kept[spare:])
+    for a in range(1, spare + 1):
+        window = [select(age == a, kept[spare - a + i], window[i]) for i in range(width)]
+    return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
+
+
+def select(mask: Any, new: Any, old: Any) -> Any:
+    """Select ``new`` where the scalar ``mask`` is true, leaf by leaf; MJX's data knows itself which leaves to merge."""
+
+    def one(a: Any, b: Any) -> Any:
+        if a is b:
+            return b
+        return b.where(mask, a) if _is_mjx_data(b) else jnp.where(mask, a, b)
+
+    return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
+
+
+def _is_mjx_data(leaf: Any) -> bool:
+    return type(leaf).__module__.startswith("mujoco.mjx") and hasattr(leaf, "where")
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _pytree(table: SlotTable | None) -> dict[str, Any]:
+    if table is None:
+        return {}
+    inputs = {n: {f: getattr(t, f) for f in t.__dataclass_fields__} for n, t in table.inputs.items()}
+    return {"seq": table.seq, "ts": table.ts, "inputs": inputs}
+
+
+def _at(table: Any, gs: GraphState) -> Any:
+    return jax.tree_util.tree_map(lambda t: t[gs.eps, gs.step], table)

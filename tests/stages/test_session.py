@@ -1,0 +1,65 @@
+"""What a session watches for, and how it judges itself afterwards."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sim2real.errors import DeadlineExceeded, SafetyStop
+from sim2real.graph.episode import MemoryRecorder, MessageRecord, StepRecord
+from sim2real.stages import session
+
+
+def step(seq, node="sensor"):
+    return StepRecord(node, seq, 0, 0, 0, -1, 1, 0)
+
+
+@pytest.mark.parametrize("bad", [np.float64("nan"), np.array([0.0, np.nan]), float("nan"), np.float32("nan")])
+def test_a_nan_stops_the_graph_and_stands_in_the_log(bad):
+    recorder = MemoryRecorder()
+    watch = session.Watch(recorder)
+    watch.start(5, 7)
+    watch.step(step(0), {"th": np.zeros(np.shape(bad)), "count": 3})
+    watch.message(MessageRecord("agent", "sensor", 0, 0, 1, 2))
+    with pytest.raises(SafetyStop, match="node 'sensor' stopped: its output 'th' is NaN in step 1"):
+        watch.step(step(1), {"th": bad, "count": 3})
+    episode = recorder.episode()
+    assert len(episode.steps["sensor"]) == 2
+    assert len(episode.messages["agent", "sensor"]) == 1
+    assert watch.monotonic_ns == 7
+
+
+def test_infinity_and_other_types_are_none_of_its_business():
+    watch = session.Watch(MemoryRecorder())
+    watch.step(step(0), {"range_m": np.inf, "flag": True, "n": np.int64(3), "image": np.zeros((2, 2), np.uint8)})
+
+
+def node(overruns, steps=200):
+    return {"steps": steps, "overruns": overruns, "period_s": [0.02, 0.021, None], "lateness_s": [None] * 3}
+
+
+def test_deadlines():
+    session.check_deadlines({"timing": {"a": node(2), "b": node(0, 0)}})
+    with pytest.raises(DeadlineExceeded, match="b 3 of 200") as caught:
+        session.check_deadlines({"timing": {"a": node(2), "b": node(3)}})
+    assert caught.value.exit_code == 5
+    assert "a 2" not in str(caught.value)
+
+
+def test_timing_tables_have_gaps_where_a_node_never_stepped():
+    rows, headers = session.timing_rows({"timing": {"a": node(1)}})
+    assert rows == [["a", 200, 20.0, 21.0, None, None, None, None, 1]]
+    assert len(headers) == len(rows[0])
+    assert session._numbers([1.0, float("nan")]) == [1.0, None]
+    json.dumps(rows, allow_nan=False)
+
+
+def test_what_fails_on_the_way_out_becomes_a_note():
+    reason = SafetyStop("too fast")
+    with session._noted(reason):
+        raise OSError("disk full")
+    with session._noted(reason):
+        raise reason
+    assert reason.__notes__ == ["then: OSError: disk full"]
+    with pytest.raises(KeyboardInterrupt), session._noted(reason):
+        raise KeyboardInterrupt
