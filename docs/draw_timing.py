@@ -1,7 +1,7 @@
 """Draw the pictures of timing.md: `python docs/draw_timing.py` writes docs/timing/*.svg.
 
-What they show is computed by `sim2real.graph.schedule`, and stands in each file's description as well: a test compares it
-with what the code computes now.
+What they show is computed by `sim2real.graph.schedule`, and stands in each file's description as well: a test compares
+it with what the code computes now.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from sim2real.graph.schedule import derive, eligible, slot
 from sim2real.graph.timeline import NEVER, Timeline
 
 FOLDER = Path(__file__).resolve().parent / "timing"
-INK, MUTED, GRID, BAR, WAIT, MESSAGE, LATE = "#1b2430", "#5c6875", "#d9dfe6", "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
+INK, MUTED, GRID = "#1b2430", "#5c6875", "#d9dfe6"
+BAR, WAIT, MESSAGE, LATE = "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
 _BAR, _LANE = 0.30, 1.0
 
 Case = dict[str, Any]
@@ -79,12 +80,14 @@ def cases() -> Iterator[tuple[str, Case]]:
     yield "7_window", _window()
 
 
-def _derive(nodes: Sequence[BaseNode], busy: Mapping[str, Sequence[float]], travel: Mapping[Any, Any] = {}) -> Timeline:  # noqa: B006
+def _derive(
+    nodes: Sequence[BaseNode], busy: Mapping[str, Sequence[float]], travel: Mapping[Any, Any] | None = None
+) -> Timeline:
     ticks = lambda values: np.array([[to_ticks(v / 1000) for v in values]])  # noqa: E731
     return derive(
         {n.name: n for n in nodes},
         {n: ticks(b) for n, b in busy.items()},
-        {k: ticks(t) for k, t in travel.items()},
+        {k: ticks(t) for k, t in (travel or {}).items()},
         int(NEVER),
     )
 
@@ -159,7 +162,7 @@ def _end() -> Case:
         _derive([node, reader], {"sensor": [7.5, 4], "reader": [3, 3]}, {("reader", "sensor"): [2, 2]}),
     )
     picture["marks"] = [[3.0, 0, "woken"], [5.0, 0, "ts"]]
-    picture["notes"] += [[0.0, 0, "start"], [7.5, 0, "end"]]
+    picture["notes"] += [[0.0, 0, "start"], [7.1, 0, "end"]]
     return picture
 
 
@@ -190,8 +193,8 @@ def _latest() -> Case:
         {"sender": [2] * 4, "reader": [2] * 4, "skip=True": [2] * 4, "clock": [0] * 4},
         {("reader", "sender"): travel, ("skip=True", "sender"): travel, ("skip=True", "clock"): [5] * 4},
     )
-    return case("Rule 6: a message that arrives exactly at the start is read, or with skip left to the next step", nodes,
-                timeline.filter([n.name for n in nodes]))  # fmt: skip
+    title = "Rule 6: a message that arrives exactly at the start is read, or with skip left to the next step"
+    return case(title, nodes, timeline.filter([n.name for n in nodes]))
 
 
 def _buffer() -> Case:
@@ -245,17 +248,8 @@ def _window() -> Case:
     seq_in = timeline.edges[reader.name, "sender"].seq_in[0]
     for k, t in enumerate(picture["lanes"][1]["start"]):
         seen = np.flatnonzero((seq_in >= 0) & (seq_in <= k))[-3:].tolist()
-        picture["notes"].append(
-            [
-                t,
-                1,
-                "["
-                + ", ".join("–" for _ in range(3 - len(seen)))
-                + (", " if seen and len(seen) < 3 else "")
-                + ", ".join(map(str, seen))
-                + "]",
-            ]
-        )
+        shown = ["-"] * (3 - len(seen)) + [str(m) for m in seen]
+        picture["notes"].append([t + 1, 1, f"sees {', '.join(shown)}"])
     return picture
 
 
@@ -273,6 +267,7 @@ def draw(picture: Case) -> Figure:
         _draw_lane(axes, height, lane)
     for message in picture["messages"]:
         _draw_message(axes, heights, message)
+    _draw_reads(axes, heights, picture)
     for time, lane, label in picture["notes"]:
         axes.text(time, heights[lane] - 0.27, label, ha="center", va="top", fontsize=7.5, color=MUTED)
     for time, lane, label in picture.get("marks", []):
@@ -282,7 +277,7 @@ def draw(picture: Case) -> Figure:
         axes.plot(time, heights[lane] + 0.32, marker="v", ms=4.5, color=LATE, mew=0)
     axes.set_title(picture["title"], fontsize=9.5, loc="left", color=INK)
     axes.set_yticks(heights, [lane["node"] for lane in picture["lanes"]], fontsize=9, color=INK)
-    axes.set_ylim(heights[-1] - 0.6, 0.6)
+    axes.set_ylim(heights[-1] - 0.6, 0.62)
     last = max(max(lane["end"]) for lane in picture["lanes"])
     axes.set_xlim(-0.03 * last, 1.04 * last)
     axes.set_xlabel("time [ms]", fontsize=8.5, color=MUTED)
@@ -300,11 +295,26 @@ def _draw_lane(axes: Axes, height: float, lane: Mapping[str, Any]) -> None:
     for s in lane["slots"]:
         axes.plot([s, s], [height - 0.22, height + 0.22], color=MUTED, lw=1.0, ls=(0, (2, 1.5)), zorder=1)
     for k, (begin, end) in enumerate(zip(lane["start"], lane["end"], strict=True)):
-        axes.barh(height, max(end - begin, 0.15), left=begin, height=_BAR, color=BAR, alpha=0.92, zorder=2, lw=0)
+        axes.barh(height, max(end - begin, 0.15), left=begin, height=_BAR, color=BAR, zorder=2, ec="white", lw=0.8)
         if end - begin > 1.0:
             axes.text(
                 (begin + end) / 2, height, str(k), ha="center", va="center", fontsize=7.5, color="white", zorder=4
             )
+
+
+def _draw_reads(axes: Axes, heights: Sequence[float], picture: Case) -> None:
+    """Write under each step which messages it consumes, in lanes without other notes."""
+    noted = {lane for _, lane, _ in [*picture["notes"], *picture.get("marks", [])]}
+    for i, lane in enumerate(picture["lanes"]):
+        incoming = [m for m in picture["messages"] if m["to"] == i]
+        if i in noted or not incoming:
+            continue
+        above = all(m["from"] > i for m in incoming)  # the messages come from below: there is room on the other side
+        for begin, end in zip(lane["start"], lane["end"], strict=True):
+            read = [str(m["seq"]) for m in incoming if m["read"] == begin]
+            label = f"reads {', '.join(read)}" if read else "reads none"
+            y, align = (heights[i] + 0.27, "bottom") if above else (heights[i] - 0.27, "top")
+            axes.text((begin + end) / 2, y, label, ha="center", va=align, fontsize=7.0, color=MESSAGE)
 
 
 def _draw_message(axes: Axes, heights: Sequence[float], m: Mapping[str, Any]) -> None:

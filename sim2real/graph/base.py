@@ -100,13 +100,15 @@ class GraphState(Base):
 
     Attributes:
         eps: int32: which timeline is played.
-        step: int32: the position in it (a row of the compiled graph); -1 before a reset.
+        step: int32: the position in it: a row of the compiled graph, a step of the supervisor elsewhere; -1 before it
+            starts.
         rng: Keys.
         params: Parameters.
         state: States.
-        seq: int32: steps that each node has made.
+        seq: int32: steps that each node has made. In a compiled graph: the step of the supervisor that awaits its
+            caller, between ``reset`` and ``step``; empty otherwise.
         delays: Node -> input name -> trainable delay, for those connections that have one.
-        buffer: The last outputs of each node, oldest first.
+        buffer: The last outputs of each node, oldest first; compiled graphs only.
         aux: Anything that a user wants to carry along.
     """
 

@@ -12,8 +12,9 @@ import jax
 import numpy as np
 
 from sim2real.errors import Sim2RealError
-from sim2real.graph.delays import DelayDistribution, EmpiricalDist
+from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import Episode
+from sim2real.graph.fitting import resample
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
@@ -129,7 +130,7 @@ def model_values(
 def computation_delays(episode: Episode) -> dict[str, DelayDistribution]:
     """Return how long each node's steps took on the robot, thread wake-up and bus included."""
     return {
-        name: EmpiricalDist((steps.end - steps.start) / TICKS_PER_S)
+        name: resample((steps.end - steps.start) / TICKS_PER_S)
         for name, steps in episode.steps.items()
         if len(steps)
     }

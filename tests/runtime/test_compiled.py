@@ -13,6 +13,8 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.testing import HashInPython, Value, contracting_node, hash_node, jax_hash_node
 from sim2real.graph.timeline import Vertex
 from sim2real.graph.windows import bursty_episodes
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
 from sim2real.runtime.compiled import CompiledGraph
 
 KEY = jax.random.key(0)
@@ -321,6 +323,12 @@ def test_a_burst_that_the_window_does_not_hold_is_an_error():
     with pytest.raises(UsageError, match=r"input 'wave' of node 'world': messages of 'wave' come in bursts") as error:
         CompiledGraph(nodes, "sensor", timeline)
     assert "bursty_episodes" in (error.value.hint or "")
+    simulated = AsyncGraph(nodes, nodes["sensor"], Clock.SIMULATED, timeline=timeline)
+    with pytest.raises(UsageError, match="come in bursts"):
+        simulated.start(simulated.init(KEY))
+    roomy = delayed("zoh", "zoh")["world"]
+    roomy.inputs["wave"].delay_dist = TrainableDist.create(0.01, 0.0, 0.04, "zoh", burst=3)
+    assert roomy.inputs["wave"].total_window == 1 + 2 + 3
     calm = draw(delayed("zoh", "zoh"), 1.0, 2)
     assert not bursty_episodes(nodes, calm).any()
 

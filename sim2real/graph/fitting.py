@@ -1,0 +1,81 @@
+"""Delay distributions from recorded delays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.delays import EmpiricalDist, StaticDist
+
+_CONSTANT_S = 1e-7
+"""Delays that spread less than this are one number."""
+_LONGEST_BLOCK = 200
+
+
+def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> StaticDist:
+    """Fit a mixture of normal distributions: smooth, a few numbers, without memory from one delay to the next.
+
+    Args:
+        samples: Shape ``(n,)``: recorded delays [s].
+        components: At most so many; fewer where the Bayesian information criterion prefers it.
+        seed: Of the fit's start.
+
+    Returns:
+        A constant, or a ``distrax.MixtureSameFamily``, clipped at 0 when drawn from.
+
+    Raises:
+        UsageError: When there are too few samples or they are no delays.
+    """
+    x = _checked(samples)
+    if x.std() < _CONSTANT_S:
+        return StaticDist(float(x.mean()))
+    if x.size < 2 * components:
+        raise UsageError(f"{x.size} delays are too few for a mixture of up to {components} components")
+    import distrax  # 1.6 s, and scikit-learn another 1 s: only for those who fit
+    import jax.numpy as jnp
+    from sklearn.mixture import GaussianMixture
+
+    scaled = ((x - x.mean()) / x.std())[:, None]
+    fits = [GaussianMixture(k, random_state=seed, reg_covar=1e-6).fit(scaled) for k in range(1, components + 1)]
+    best = min(fits, key=lambda fit: fit.bic(scaled))
+    loc = np.asarray(best.means_)[:, 0] * x.std() + x.mean()
+    scale = np.sqrt(np.asarray(best.covariances_)[:, 0, 0]) * x.std()
+    return StaticDist(
+        distrax.MixtureSameFamily(
+            mixture_distribution=distrax.Categorical(probs=jnp.asarray(best.weights_, jnp.float32)),
+            components_distribution=distrax.Normal(jnp.asarray(loc, jnp.float32), jnp.asarray(scale, jnp.float32)),
+        )
+    )
+
+
+def resample(samples: np.ndarray) -> EmpiricalDist:
+    """Return the distribution that replays the record in blocks as long as its memory.
+
+    The block is the time over which delays stay correlated (the sum of the autocorrelation up to its first value below
+    0.1, twice over for both sides), so that independent delays are drawn one by one and runs of slow steps stay runs.
+
+    Args:
+        samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
+
+    Raises:
+        UsageError: When they are no delays.
+    """
+    x = _checked(samples)
+    spread = x - x.mean()
+    power = float(spread @ spread)
+    if power < _CONSTANT_S**2 * x.size:
+        return EmpiricalDist(x, 1)
+    block = 1.0
+    for lag in range(1, min(_LONGEST_BLOCK, x.size // 4)):
+        rho = float(spread[:-lag] @ spread[lag:]) / power
+        if rho < 0.1:
+            break
+        block += 2.0 * rho
+    return EmpiricalDist(x, round(block))
+
+
+def _checked(samples: np.ndarray) -> np.ndarray:
+    x = np.asarray(samples, np.float64)
+    if x.ndim != 1 or x.size < 2 or not np.isfinite(x).all() or (x < 0).any():
+        raise UsageError(f"recorded delays must be at least 2 finite times of at least 0 s, got shape {x.shape}")
+    return x
