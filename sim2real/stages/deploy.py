@@ -152,7 +152,7 @@ def _simulate(
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's."""
     if values is None:
         return None
-    nodes, _ = robot.training(values, {}, computation_delays(episode), True)
+    nodes, _ = robot.training(values, {}, computation_delays(episode)[0], True)
     graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, duration_s, _SIMULATIONS, 0))
     params = robot.simulation_params(values, policy)
     recorded = ("world", robot.COMMAND[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,8 @@ from sim2real.train.ppo import Progress, TrainResult, train
 
 _LONGEST_GAP = 1.25
 """Timelines with a longer pause between policy steps than this many medians are drawn again."""
+_HICCUP = 0.25
+"""Steps that took longer than this share of the policy's period on the robot are not drawn from."""
 _SPREAD = (0.02, 0.5)
 """Smallest and largest share by which copies differ in a parameter: a log may have told nothing about one."""
 
@@ -54,12 +57,14 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         note(f"warning: {log} is not the log that {path} was identified from: it has changed since")
     values, spread = model_values(robot, identified, config)
     delays = config.model == "identified"
-    computation = computation_delays(load_log(log, pipeline)) if delays else {}
+    longest_s = _HICCUP / robot.RATE_HZ
+    computation, dropped = computation_delays(load_log(log, pipeline), longest_s) if delays else ({}, {})
     nodes, task = robot.training(values, spread, computation, delays)
     with open_stage(root, pipeline.name, "train", config, {"parameters": path, "log": log}, run_dir) as stage:
         timeline, redrawn = draw_timelines(nodes, robot.SUPERVISOR, config)
-        if redrawn:
-            note(f"{redrawn} timelines with a hiccup were drawn again")
+        if dropped:
+            steps = ", ".join(f"{count} of {name!r}" for name, count in dropped.items())
+            note(f"steps longer than {1e3 * longest_s:g} ms are no part of the timing that is trained with: {steps}")
         env = GraphEnvironment(CompiledGraph(nodes, robot.SUPERVISOR, timeline), task)
         ppo = replace(config.ppo, eval_steps=env.length + 1)
         with progress(ppo.evaluations, "train (compiling)") as bar:
@@ -78,6 +83,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
                 "policy steps a second": round(result.env_steps_per_s),
                 "compile": f"{result.compile_s:.1f} s",
                 "train": f"{result.train_s:.1f} s",
+                "hiccups left out": sum(dropped.values()),
                 "timelines drawn again": redrawn,
             }
         )
@@ -127,13 +133,35 @@ def model_values(
     return values, spread
 
 
-def computation_delays(episode: Episode) -> dict[str, DelayDistribution]:
-    """Return how long each node's steps took on the robot, thread wake-up and bus included."""
-    return {
-        name: resample((steps.end - steps.start) / TICKS_PER_S)
-        for name, steps in episode.steps.items()
-        if len(steps)
-    }
+def computation_delays(
+    episode: Episode, longest_s: float = math.inf
+) -> tuple[dict[str, DelayDistribution], dict[str, int]]:
+    """Return how long each node's steps took on the robot, thread wake-up and bus included.
+
+    Args:
+        episode: The log.
+        longest_s: Longer steps are left out [s]: hiccups, which would put a pause into every timeline of a busy machine.
+
+    Returns:
+        The distributions by node, and how many steps were left out, for those nodes that had some.
+
+    Raises:
+        Sim2RealError: When that would be most steps of a node.
+    """
+    delays: dict[str, DelayDistribution] = {}
+    dropped: dict[str, int] = {}
+    for name, steps in episode.steps.items():
+        took = (steps.end - steps.start) / TICKS_PER_S
+        usual = took[took <= longest_s]
+        if usual.size < 2 or usual.size < took.size / 2:
+            raise Sim2RealError(
+                f"only {usual.size} of the {took.size} steps of node {name!r} took less than {1e3 * longest_s:g} ms",
+                hint="record on a less busy machine, or lower the rates of the pipeline",
+            )
+        delays[name] = resample(usual)
+        if usual.size < took.size:
+            dropped[name] = int(took.size - usual.size)
+    return delays, dropped
 
 
 def draw_timelines(nodes: Mapping[str, BaseNode], supervisor: str, config: TrainConfig) -> tuple[Timeline, int]:
