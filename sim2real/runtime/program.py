@@ -38,8 +38,10 @@ class RowProgram:
     def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any]) -> None:
         self.nodes, self.wiring = nodes, wiring
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
-        self._tables = jax.tree_util.tree_map(jnp.asarray, [_pytree(t) for t in wiring.tables])
-        self._world = jax.tree_util.tree_map(jnp.asarray, _pytree(wiring.world_table))
+        # (R, E, ...): what the episodes look up in one row lies side by side.
+        by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
+        self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
+        self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
 
     def run_slots(self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]]) -> GraphState:
@@ -80,7 +82,7 @@ class RowProgram:
     def seq(self, gs: GraphState, slot: int) -> Any:
         """Return which step a slot makes; -1 for none, and behind the last row."""
         inside = gs.step < self.wiring.rows
-        return jnp.where(inside, self._tables[slot]["seq"][gs.eps, gs.step], -1)
+        return jnp.where(inside, self._tables[slot]["seq"][gs.step, gs.eps], -1)
 
     def commit(self, gs: GraphState, slot: int | None, new: StepState, output: Any, ran: Any) -> GraphState:
         """Take over a step's results: everywhere if the slot always runs, else where it ran."""
@@ -179,4 +181,4 @@ def _pytree(table: SlotTable | None) -> dict[str, Any]:
 
 
 def _at(table: Any, gs: GraphState) -> Any:
-    return jax.tree_util.tree_map(lambda t: t[gs.eps, gs.step], table)
+    return jax.tree_util.tree_map(lambda t: t[gs.step, gs.eps], table)

@@ -155,7 +155,7 @@ def computation_delays(
         usual = took[took <= longest_s]
         if usual.size < 2 or usual.size < took.size / 2:
             raise Sim2RealError(
-                f"only {usual.size} of the {took.size} steps of node {name!r} took less than {1e3 * longest_s:g} ms",
+                f"only {usual.size} of {took.size} steps of node {name!r} took less than {1e3 * longest_s:g} ms",
                 hint="record on a less busy machine, or lower the rates of the pipeline",
             )
         delays[name] = resample(usual)
