@@ -1,1 +1,1 @@
-"""TITLE."""
+"""Identification: parameters, residuals, search, uncertainty."""

@@ -1,1 +1,1 @@
-"""TITLE."""
+"""The four stages, their configuration, run folders, and what a pipeline provides."""

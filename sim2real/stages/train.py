@@ -140,7 +140,7 @@ def computation_delays(
 
     Args:
         episode: The log.
-        longest_s: Longer steps are left out [s]: hiccups, which would put a pause into every timeline of a busy machine.
+        longest_s: Longer steps are left out [s]: hiccups, which would put a pause into every timeline.
 
     Returns:
         The distributions by node, and how many steps were left out, for those nodes that had some.

@@ -1,1 +1,1 @@
-"""TITLE."""
+"""Simulated worlds as nodes of a graph."""
