@@ -28,7 +28,7 @@ def table(report: dict[str, Any]) -> str:
     lines = [
         ("", f"{len(seeds)} runs of the demo, each on a robot with noise of its own"),
         ("---", "---"),
-        ("parameters", f"at most {100 * worst[name]:.1f} % off the true ones ({name}); the data sheet: up to 39 %"),
+        ("parameters", f"at most {100 * worst[name]:.1f} % off the true ones ({name})"),
         (
             "round-trip delay",
             f"at most {max(abs(s['round_trip_error_ms']) for s in seeds):.1f} ms off the true {truth:.0f} ms",

@@ -319,12 +319,18 @@ def mjx_case(device: str, copies: int, repeats: int) -> list[dict]:
     graph = CompiledGraph(graph_nodes, "actuator", draw(graph_nodes, 1.0, EPISODES, 0))
     ticks = graph.rows * graph.wiring.ticks
 
+    def start(key: Any) -> Any:
+        # Every copy from a place of its own: XLA would compute equal copies only once.
+        params = world.init_params()
+        return params.replace(qpos=params.qpos + jax.random.uniform(key, (6,), minval=-0.1, maxval=0.1))
+
     def in_graph(key: Any) -> Any:
         eps = jax.random.randint(key, (), 0, graph.episodes)
-        return graph.rollout(graph.init(key, eps=eps))[0].state["world"].qpos.sum()
+        return graph.rollout(graph.init(key, {"world": start(key)}, eps=eps))[0].state["world"].qpos.sum()
 
     def bare(key: Any) -> Any:
-        params, data = world.init_params(), world.init_state(key)
+        params = start(key)
+        data = world.init_state(key, GraphState(params={"world": params}))
 
         def step(d: Any, t: Any) -> tuple[Any, None]:
             # The same motion as in the graph: the solver's iterations depend on what the arm does.
