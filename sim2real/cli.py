@@ -80,6 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if hint:
                 print(f"\nhint: {hint[0]}", file=sys.stderr)
             return error.exit_code
+        except BrokenPipeError:  # the reader of our output has enough, such as `head`: nothing is wrong with us
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return ERROR
         except KeyboardInterrupt:
             return _ended_by(signal.SIGINT)
         except SystemExit as end:

@@ -341,3 +341,17 @@ def test_signal_handlers_are_given_back():
     before = signal.getsignal(signal.SIGTERM)
     assert cli.main(["--version"]) == 0
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    # 64 KiB fill the pipe: the command is still writing when its reader is gone.
+    code = (
+        "import sys; from sim2real import cli; cli._dispatch = lambda a: print('x' * 1_000_000); sys.exit(cli.main([]))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.read(10)
+    process.stdout.close()
+    message = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(30) == 1
+    assert message == ""

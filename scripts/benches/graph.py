@@ -196,7 +196,7 @@ def bare_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any
     return run
 
 
-def _unroll(ticks: int) -> int:
+def unroll_of(ticks: int) -> int:
     """Return how many ticks a pass of a yardstick's loop holds: as many as the graph's, of two rows on a GPU."""
     return ticks if jax.default_backend() == "cpu" else 2 * ticks
 
@@ -243,7 +243,7 @@ def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repe
         "bare": bare_program(pattern_rows, ticks, world),
         "hand": hand_program(pattern_rows, ticks, world),
         # A pattern of several policy steps is unrolled as it is; twice of it took XLA 8 times as long on an H200.
-        "unrolled": hand_program(pattern_rows, ticks, world, _unroll(1) if len(ticks) == 1 else 1),
+        "unrolled": hand_program(pattern_rows, ticks, world, unroll_of(1) if len(ticks) == 1 else 1),
         "graph": graph_program(graph),
     }
     seconds, compile_s = compare(programs, copies, repeats)
@@ -258,98 +258,17 @@ def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repe
     label = f"{name}/{copies}"
     goal = "<= 1.2" if name.count("/") == 1 else "<= 1.15 times the plain timelines"
     return [
-        _row(f"{label}/over_hand", round(over["hand"], 3), "1", "hand-written", goal),
-        _row(f"{label}/over_hand_unrolled", round(over["unrolled"], 3), "1", "hand-written, loop unrolled as ours"),
-        _row(f"{label}/over_bare", round(over["bare"], 3), "1", "physics alone"),
-        _row(f"{label}/agent_steps_per_s", round(rate), "1/s", f"{hand_rate:.3g} by hand"),
-        _row(f"{label}/compile_s", round(compile_s["graph"], 2), "s", f"{compile_s['hand']:.2f} by hand", "< 5"),
+        row(f"{label}/over_hand", round(over["hand"], 3), "1", "hand-written", goal),
+        row(f"{label}/over_hand_unrolled", round(over["unrolled"], 3), "1", "hand-written, loop unrolled as ours"),
+        row(f"{label}/over_bare", round(over["bare"], 3), "1", "physics alone"),
+        row(f"{label}/agent_steps_per_s", round(rate), "1/s", f"{hand_rate:.3g} by hand"),
+        row(f"{label}/compile_s", round(compile_s["graph"], 2), "s", f"{compile_s['hand']:.2f} by hand", "< 5"),
     ]
 
 
-def _row(name: str, value: Any, unit: str, yardstick: str, goal: str = "") -> dict[str, Any]:
+def row(name: str, value: Any, unit: str, yardstick: str, goal: str = "") -> dict[str, Any]:
+    """Return one row of a bench."""
     return {"name": name, "value": value, "unit": unit, "yardstick": yardstick, "goal": goal}
-
-
-def arm() -> tuple[Any, dict[str, BaseNode]]:
-    """Return a six-hinge arm with friction loss on MJX, and its graph with a policy at 50 Hz over a world at 100 Hz."""
-    import mujoco
-
-    from sim2real.worlds.mjx import MjxWorld
-
-    link = (
-        '<body pos="0 0 {z}"><joint name="j{i}" axis="{axis}" damping=".05" frictionloss=".02" armature=".01"/>'
-        '<geom type="capsule" fromto="0 0 0 0 0 .2" size=".02" mass=".2" contype="0" conaffinity="0"/>'
-    )
-    bodies = "".join(link.format(z=0.2 * (i > 0), i=i, axis="0 1 0" if i % 2 else "1 0 0") for i in range(6))
-    motors = "".join(f'<position joint="j{i}" kp="2"/>' for i in range(6))
-    text = (
-        '<mujoco><option timestep="0.01" iterations="4" ls_iterations="4"/><worldbody>'
-        f"{bodies}{'</body>' * 6}</worldbody><actuator>{motors}</actuator></mujoco>"
-    )
-    world = MjxWorld("world", 100.0, mujoco.MjModel.from_xml_string(text))
-    agent = ArmAgent("actuator", 50.0, delay_dist=0.002)
-    agent.connect(world, skip=True, delay_dist=0.01)
-    world.connect(agent, skip=True, delay_dist=0.012)
-    return world, {"actuator": agent, "world": world}
-
-
-class ArmAgent(BaseNode):
-    """Waves six joints."""
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the joints at zero."""
-        del rng, graph_state
-        return MODEL.Command(action=jnp.zeros(6))
-
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Return the next set points, and lean on what the joints do."""
-        return step_state, MODEL.Command(action=wave(step_state.ts, step_state.inputs["world"][-1].data.qpos))
-
-
-def wave(t: Any, q: Any) -> Any:
-    """Return the arm's set points at a time [s] and at joint angles ``(6,)`` [rad]."""
-    return 0.3 * jnp.sin(3.0 * t + jnp.arange(6.0)) - 0.1 * q
-
-
-def mjx_case(device: str, copies: int, repeats: int) -> list[dict]:
-    """Measure the arm's graph against the same number of bare ``mjx.step``."""
-    from mujoco import mjx
-
-    world, graph_nodes = arm()
-    graph = CompiledGraph(graph_nodes, "actuator", draw(graph_nodes, 1.0, EPISODES, 0))
-    ticks = graph.rows * graph.wiring.ticks
-
-    def start(key: Any) -> Any:
-        # Every copy from a place of its own: XLA would compute equal copies only once.
-        params = world.init_params()
-        return params.replace(qpos=params.qpos + jax.random.uniform(key, (6,), minval=-0.1, maxval=0.1))
-
-    def in_graph(key: Any) -> Any:
-        eps = jax.random.randint(key, (), 0, graph.episodes)
-        return graph.rollout(graph.init(key, {"world": start(key)}, eps=eps))[0].state["world"].qpos.sum()
-
-    def bare(key: Any) -> Any:
-        params = start(key)
-        data = world.init_state(key, GraphState(params={"world": params}))
-
-        def step(d: Any, t: Any) -> tuple[Any, None]:
-            # The same motion as in the graph: the solver's iterations depend on what the arm does.
-            return mjx.step(params.model, d.replace(ctrl=wave(t, d.qpos))), None
-
-        moved, _ = jax.lax.scan(step, data, jnp.arange(ticks) / world.rate, unroll=_unroll(graph.wiring.ticks))
-        return moved.qpos.sum()
-
-    seconds, compile_s = compare({"bare": bare, "graph": in_graph}, copies, repeats)
-    name = f"graph/{device}/mjx_arm/{copies}"
-    print(name, seconds, graph.report(), file=sys.stderr)
-    rate = copies * ticks / seconds["graph"]
-    bare_rate = copies * ticks / seconds["bare"]
-    over = round(seconds["graph"] / seconds["bare"], 3)
-    return [
-        _row(f"{name}/over_bare", over, "1", "bare mjx.step in the same motion", "<= 1.1"),
-        _row(f"{name}/ticks_per_s", round(rate), "1/s", f"{bare_rate:.3g} bare"),
-        _row(f"{name}/compile_s", round(compile_s["graph"], 1), "s", f"{compile_s['bare']:.1f} bare"),
-    ]
 
 
 def building() -> list[dict[str, Any]]:
@@ -396,6 +315,8 @@ def main(arguments: list[str]) -> dict[str, Any]:
             f"graph/{device}/30_over_100_hz", nodes(30.0, 100.0, 0.005), (3, 3, 4), count, options.repeats, False
         )
     if options.mjx:
+        from benches.arm import mjx_case  # MuJoCo is not needed without it
+
         rows += mjx_case(device, options.mjx, options.repeats)
     graph_nodes = nodes()
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))

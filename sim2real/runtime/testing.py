@@ -27,7 +27,7 @@ def interpret(
     defaults: Mapping[str, Any],
     given: Mapping[str, list[Any]] | None = None,
 ) -> dict[str, list[Any]]:
-    """Play one episode of a wiring.
+    """Play one episode of a wiring and return the outputs of each node, by seq.
 
     Messages are found as the compiled program finds them: by their age in a ring of the sender's last outputs. The
     tables say apart from that which messages they are, so every one is checked.
@@ -39,9 +39,6 @@ def interpret(
         step: Makes a step: node, seq, windows -> output.
         defaults: Default output of each node.
         given: Outputs of nodes that do not run.
-
-    Returns:
-        The outputs of each node, by seq.
 
     Raises:
         TableError: When a window holds another message than the table says, or a node's steps are not in order.
