@@ -1,9 +1,16 @@
 """One JAX configuration for all tests; set in the environment, before anything imports JAX."""
 
 import os
+import signal
 from pathlib import Path
 
 from hypothesis import settings
+
+# A runner in the background ignores SIGINT, one under nohup SIGHUP; so would every command that a test interrupts.
+for _number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, signal.default_int_handler if _number is signal.SIGINT else signal.SIG_DFL)
+
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
