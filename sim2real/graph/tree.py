@@ -29,16 +29,6 @@ def tree_dynamic_slice(tree: Any, start_indices: jax.Array) -> Any:
     return jax.tree_util.tree_map(one, tree)
 
 
-def tree_take(tree: Any, index: Any, axis: int = 0) -> Any:
-    """Index every leaf along one axis (out-of-range indices are clamped)."""
-    return jax.tree_util.tree_map(lambda leaf: jnp.take(leaf, index, axis=axis, mode="clip"), tree)
-
-
-def tree_where(mask: jax.Array, new: Any, old: Any) -> Any:
-    """Select ``new`` where the scalar ``mask`` is true, leaf by leaf; leaves that are no arrays come from ``new``."""
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(mask, a, b), new, old)
-
-
 def strong(tree: Any) -> Any:
     """Give every leaf a strong dtype, so that a scan's carry keeps its type."""
     return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)
