@@ -18,7 +18,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-BENCHES = {"async": "asynchronous", "demo": "demo", "graph": "graph", "train": "train"}
+BENCHES = {
+    "async": "asynchronous",
+    "demo": "demo",
+    "graph": "graph",
+    "identify": "identify",
+    "train": "train",
+}
 
 
 def machine() -> dict[str, Any]:

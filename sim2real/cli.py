@@ -7,15 +7,14 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.stages.interruption import Signals
 
 if TYPE_CHECKING:
     from sim2real.stages.pipeline import Pipeline
@@ -45,6 +44,8 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   view      open a run in the Rerun viewer, or save it as a recording
   report    write a run's report as one HTML page
   info      about the installation, a pipeline, a log or a run
+  check     judge what a recording, or a planned one, can tell about the parameters
+  import    turn files of other recorders into logs
 
 examples
   sim2real demo --seed 1
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; None takes the process's own.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    with _Signals() as signals:
+    with Signals() as signals:
         try:
             _dispatch(arguments)
             sys.stdout.flush()
@@ -233,6 +234,33 @@ def _info(command: str, arguments: list[str]) -> None:
         print(info.run(runs.find_run(parsed.runs, target)))
 
 
+def _import(command: str, arguments: list[str]) -> None:
+    """``sim2real import FILE... [flags]``."""
+    from sim2real.stages import config, flags
+
+    own, epilog = config.ImportConfig(), _epilog("sim2real import data.npz --pipeline NAME", "sim2real info LOG")
+    asked = flags.parse(own, arguments, f"sim2real {command}", _summary(own), epilog)
+    from sim2real.stages import importing  # imports JAX
+
+    importing.run(asked)
+
+
+def _check(command: str, arguments: list[str]) -> None:
+    """``sim2real check PIPELINE [flags]``."""
+    from sim2real.stages import config, flags
+
+    pipeline, rest = _pipeline_first(command, arguments)
+    prog = f"sim2real {command} {pipeline.name}"
+    own = config.CheckConfig(record=pipeline.record)
+    text = f"{_summary(own)} Ends with code 1 when something is not determined."
+    epilog = _epilog(f"{prog} --log session.mcap", f"{prog} --plan --record.duration-s 60")
+    asked = flags.parse(own, rest, prog, text, epilog)
+    from sim2real.stages import check  # imports JAX
+
+    if not check.run(pipeline, asked):
+        sys.exit(ERROR)
+
+
 COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "record": _stage,
     "identify": _stage,
@@ -243,6 +271,8 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "view": _view,
     "report": _view,
     "info": _info,
+    "import": _import,
+    "check": _check,
 }
 
 
@@ -319,56 +349,6 @@ def _save_traceback() -> str:
     with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
         file.write(traceback.format_exc())
     return file.name
-
-
-class _Signals:
-    """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
-
-    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away. One that
-    is raised where Python drops exceptions (a finaliser, a callback of the garbage collector) is sent again.
-
-    Attributes:
-        received: Number of the signal that was raised; 0 before one.
-    """
-
-    def __init__(self) -> None:
-        self.received = 0
-        self._raised: BaseException | None = None
-        self._before: dict[int, Any] = {}
-        self._hook = sys.unraisablehook
-
-    def __enter__(self) -> _Signals:
-        if threading.current_thread() is threading.main_thread():
-            numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-            # nohup and background jobs of a shell start with signals ignored; they stay ignored.
-            self._before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
-            sys.unraisablehook = self._dropped
-            for number in self._before:
-                signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        if self._before:
-            sys.unraisablehook = self._hook
-        for number, old in self._before.items():
-            signal.signal(number, old)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        if self._raised is not None:
-            os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
-            return
-        self.received = number
-        self._raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
-        raise self._raised
-
-    def _dropped(self, unraisable: Any) -> None:
-        if self._raised is None or unraisable.exc_value is not self._raised:
-            self._hook(unraisable)
-            return
-        self._raised = None
-        # A moment later: until this hook returns, it would be dropped again.
-        threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ and the rest appear only in them: the model keeps its nominal J, R and length an
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -63,12 +64,22 @@ def table(max_delay_s: float, tick_s: float) -> ParameterTable:
     ]
     # The sensor interpolates between ticks of the world: at less than a tick it would have to see the future. As only
     # the sum of both delays can be told from a log, nothing is lost.
+    delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     delays = [
-        Parameter(
-            "sensor_delay", "s", 0.0, tick_s, max_delay_s, False, "delay", "from motion to measurement's time stamp"
+        replace(
+            delay,
+            name="sensor_delay",
+            low=tick_s,
+            about="from motion to measurement's time stamp",
+            leaf="sensor.delay",
+            side="measurement",
         ),
-        Parameter(
-            "actuator_delay", "s", 0.0, 0.0, max_delay_s, False, "delay", "from command's departure to the motor"
+        replace(
+            delay,
+            name="actuator_delay",
+            about="from command's departure to the motor",
+            leaf="actuator.delay",
+            side="command",
         ),
     ]
     return ParameterTable([*dynamics, *delays])

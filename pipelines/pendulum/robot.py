@@ -12,8 +12,8 @@ import numpy as np
 from sim2real.errors import SafetyStop
 from sim2real.graph.delays import DelayDistribution, TrainableDist
 from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Channel
 from sim2real.stages.config import GateLimits
 
 from . import hardware, parameters
@@ -44,7 +44,7 @@ EXPECTED_DELAY_S = {"sensor": 0.002, "agent": 0.002, "actuator": 0.002}
 
 
 class IdentifiablePendulum:
-    """What the identify stage needs to know: see ``sim2real.identify.problem.IdentifiableModel``."""
+    """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
 
     sensor = "sensor"
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
@@ -148,7 +148,7 @@ def identifiable(max_delay_s: float) -> IdentifiablePendulum:
 
 def training(
     values: Mapping[str, float],
-    spread: Mapping[str, float],
+    draws: Mapping[str, np.ndarray],
     computation: Mapping[str, DelayDistribution],
     delays: bool,
 ) -> tuple[dict[str, BaseNode], SwingUp]:
@@ -156,7 +156,7 @@ def training(
 
     Args:
         values: Parameters by name.
-        spread: By how much the dynamics vary between episodes, as a share of each.
+        draws: Dynamics that episodes take instead, ``(K,)`` each, drawn together.
         computation: Computation delays by node.
         delays: Whether there are delays; without them every message arrives at once.
     """
@@ -170,7 +170,7 @@ def training(
         }
     nodes = simulated_nodes(computation, bounds)
     agent = cast(Agent, nodes["agent"])
-    return nodes, SwingUp(agent, values, spread, DELAY_SPREAD_S if delays else 0.0)
+    return nodes, SwingUp(agent, values, draws, DELAY_SPREAD_S if delays else 0.0)
 
 
 def simulation_params(values: Mapping[str, float], policy: Any) -> dict[str, Any]:

@@ -29,7 +29,7 @@ class SwingUp:
     Args:
         agent: The agent's node of the graph.
         values: Parameters to train on, by name.
-        spread: Standard deviation of each value between episodes, as a share of it; values not named are fixed.
+        draws: Values that episodes take instead, ``(K,)`` each, drawn together; values not named are fixed.
         delay_spread_s: Delays vary by this much either way [s].
     """
 
@@ -39,24 +39,26 @@ class SwingUp:
     action_high = np.array([LIMIT_V], np.float32)
 
     def __init__(
-        self, agent: Agent, values: Mapping[str, float], spread: Mapping[str, float], delay_spread_s: float
+        self, agent: Agent, values: Mapping[str, float], draws: Mapping[str, np.ndarray], delay_spread_s: float
     ) -> None:
         self.agent = agent
         self.values = dict(values)
-        self.spread = dict(spread)
+        self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.delay_spread_s = delay_spread_s
 
     def params(self, key: jax.Array) -> dict[str, Any]:
         """Draw dynamics, delays and the state in which an episode starts: half of them hanging, half anywhere."""
         keys = dict(zip(self.values, jax.random.split(key, len(self.values)), strict=True))
         k_state, k_where = jax.random.split(jax.random.fold_in(key, 1))
+        count = min((len(d) for d in self.draws.values()), default=1)
+        row = jax.random.randint(jax.random.fold_in(key, 2), (), 0, count)
         drawn = {}
         for name, value in self.values.items():
             if name.endswith("_delay"):
                 shift = jax.random.uniform(keys[name], minval=-self.delay_spread_s, maxval=self.delay_spread_s)
                 drawn[name] = jnp.maximum(value + shift, 0.0)
             else:
-                drawn[name] = value * jnp.exp(self.spread.get(name, 0.0) * jax.random.normal(keys[name]))
+                drawn[name] = self.draws[name][row] if name in self.draws else value
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)

@@ -1,17 +1,26 @@
-"""Parameters as data: names, units, bounds, and the map from an unbounded vector to values inside the bounds."""
+"""Parameters as data: names, units, bounds, priors, and the map from an unbounded vector to values in the bounds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.identify.leaves import set_leaf
+
+Transform = Literal["linear", "log", "logit"]
+_TRANSFORMS = {
+    # to the scale, numpy; back from it, for numpy and JAX; derivative of the value on the scale, from the value
+    "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
+    "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
+    "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),
+}
 
 
 @dataclass(frozen=True)
@@ -24,9 +33,15 @@ class Parameter:
         nominal: The data sheet's value; for a delay, what a model without delays has.
         low: Lower bound.
         high: Upper bound.
-        log: Whether the search moves on a logarithmic scale.
-        kind: ``dynamics`` or ``delay``.
+        transform: Scale on which the search moves: ``linear``, ``log`` (positive values) or ``logit`` (shares).
+        kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
+        leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model knows.
+        prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
+        per_recording: Whether each recording has a value of its own.
+        free: Whether it is identified; else it stays at ``nominal``.
+        side: Of a delay: ``command`` (before the world) or ``measurement`` (behind it). Where initial states are free,
+            time can be shifted from one to the other.
     """
 
     name: str
@@ -34,49 +49,109 @@ class Parameter:
     nominal: float
     low: float
     high: float
-    log: bool = True
-    kind: str = "dynamics"
+    transform: Transform = "log"
+    kind: Literal["dynamics", "delay", "measurement"] = "dynamics"
     about: str = ""
+    leaf: str | None = None
+    prior: Any = None
+    per_recording: bool = False
+    free: bool = True
+    side: Literal["", "command", "measurement"] = ""
 
     def __post_init__(self) -> None:
         """Check the bounds."""
+        if self.transform not in _TRANSFORMS:
+            raise UsageError(
+                f"parameter {self.name!r}: unknown transform {self.transform!r}. Available: {', '.join(_TRANSFORMS)}"
+            )
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise UsageError(f"parameter {self.name!r}: bounds [{self.low}, {self.high}] {self.unit} are no interval")
-        if self.log and self.low <= 0:
+        if self.transform == "log" and self.low <= 0:
             raise UsageError(
                 f"parameter {self.name!r}: a logarithmic scale needs a positive lower bound, got {self.low}"
             )
+        if self.transform == "logit" and not 0.0 < self.low < self.high < 1.0:
+            raise UsageError(f"parameter {self.name!r}: a logit scale needs bounds within (0, 1)")
+        if self.prior is not None and not callable(getattr(self.prior, "log_prob", None)):
+            raise UsageError(
+                f"parameter {self.name!r}: the prior {self.prior!r} has no log_prob",
+                hint="pass a distrax distribution over the value",
+            )
+        if self.prior is not None and not _has_mode(self.prior):
+            raise UsageError(
+                f"parameter {self.name!r}: the prior {type(self.prior).__name__} has no single, finite mode",
+                hint="leave the prior out for a uniform one: the bounds are that",
+            )
+
+    def to_scale(self, value: float) -> float:
+        """Return where a value stands on the parameter's scale."""
+        return float(_TRANSFORMS[self.transform][0](value))
+
+
+@dataclass(frozen=True)
+class Column:
+    """One entry of the vector that is searched: a parameter, of one recording where each has its own."""
+
+    parameter: Parameter
+    recording: int | None = None
+
+    @property
+    def label(self) -> str:
+        """The parameter's name, with ``@recording`` where each has its own."""
+        return self.parameter.name if self.recording is None else f"{self.parameter.name}@{self.recording}"
 
 
 class ParameterTable:
-    """Parameters in a fixed order, and the bijection between values and an unbounded vector ``z``.
+    """Parameters in a fixed order, and the bijection between values and an unbounded vector ``z`` of the free ones.
 
-    The bounds live in the bijection (a logistic function on a linear or logarithmic scale): evosax does not clip.
+    The bounds live in the bijection (a logistic function on each parameter's scale): evosax does not clip.
 
     Args:
         parameters: The parameters; names must differ.
+        recordings: How many recordings there are.
     """
 
-    def __init__(self, parameters: Iterator[Parameter] | list[Parameter] | tuple[Parameter, ...]) -> None:
+    def __init__(self, parameters: Iterable[Parameter], recordings: int = 1) -> None:
         self.parameters = tuple(parameters)
-        self.names = tuple(p.name for p in self.parameters)
-        if len(set(self.names)) != len(self.names):
-            raise UsageError(f"parameter names must differ: {', '.join(self.names)}")
-        scale = [math.log if p.log else float for p in self.parameters]
-        self._low = np.array([s(p.low) for s, p in zip(scale, self.parameters, strict=True)])
-        self._high = np.array([s(p.high) for s, p in zip(scale, self.parameters, strict=True)])
-        self._log = np.array([p.log for p in self.parameters])
+        self.recordings = recordings
+        names = [p.name for p in self.parameters]
+        if len(set(names)) != len(names):
+            raise UsageError(f"parameter names must differ: {', '.join(names)}")
+        self.columns = tuple(
+            Column(p, r) for p in self.parameters if p.free for r in (range(recordings) if p.per_recording else (None,))
+        )
+        self.names = tuple(c.label for c in self.columns)
+        self._low = np.array([c.parameter.to_scale(c.parameter.low) for c in self.columns])
+        self._high = np.array([c.parameter.to_scale(c.parameter.high) for c in self.columns])
 
     def __len__(self) -> int:
-        return len(self.parameters)
+        return len(self.columns)
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self.parameters)
 
     def __getitem__(self, name: str) -> Parameter:
-        if name not in self.names:
-            raise UsageError(f"unknown parameter {name!r}. Available: {', '.join(self.names)}")
-        return self.parameters[self.names.index(name)]
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        raise UsageError(f"unknown parameter {name!r}. Available: {', '.join(p.name for p in self.parameters)}")
+
+    def for_recordings(self, recordings: int) -> ParameterTable:
+        """Return the table for another number of recordings."""
+        return ParameterTable(self.parameters, recordings)
+
+    def with_fixed(self, values: Mapping[str, float]) -> ParameterTable:
+        """Return the table with some parameters held at these values."""
+        changed = {p.name: p for p in self.parameters}
+        for name, value in values.items():
+            changed[name] = replace(self[name], nominal=float(value), free=False)
+        return ParameterTable(changed.values(), self.recordings)
+
+    def with_nominal(self, values: Mapping[str, float]) -> ParameterTable:
+        """Return the table with other nominal values, from which a search starts; unknown names are ignored."""
+        return ParameterTable(
+            (replace(p, nominal=float(values.get(p.name, p.nominal))) for p in self.parameters), self.recordings
+        )
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> ParameterTable:
         """Return the table with other bounds for some parameters.
@@ -89,7 +164,7 @@ class ParameterTable:
         for name, (low, high) in bounds.items():
             own = self[name]
             p = replace(own, low=float(low), high=float(high))
-            if p.kind == "dynamics" and not p.low <= p.nominal <= p.high:
+            if p.kind != "delay" and not p.low <= p.nominal <= p.high:
                 raise UsageError(
                     f"the bounds [{low:g}, {high:g}] {p.unit} of {name!r} exclude its nominal value {p.nominal:.4g}",
                     hint="widen the bounds, or correct the nominal value in the pipeline",
@@ -100,43 +175,107 @@ class ParameterTable:
                     hint="narrow them, or allow longer delays with --max-delay-s",
                 )
             changed[name] = p
-        return ParameterTable(tuple(changed.values()))
+        return ParameterTable(changed.values(), self.recordings)
 
     def decode(self, z: Any) -> dict[str, Any]:
-        """Map an unbounded vector ``(P,)`` to values by name; differentiable."""
-        x = self._low + (self._high - self._low) * jax.nn.sigmoid(z)
-        return {p.name: jnp.exp(x[i]) if p.log else x[i] for i, p in enumerate(self.parameters)}
+        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable."""
+        x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
+        found: dict[str, list[Any]] = {}
+        for i, c in enumerate(self.columns):
+            found.setdefault(c.parameter.name, []).append(_TRANSFORMS[c.parameter.transform][1](x[i], jnp))
+        values: dict[str, Any] = {}
+        for p in self.parameters:
+            own = found.get(p.name)
+            if own is None:
+                values[p.name] = jnp.full(self.recordings, p.nominal) if p.per_recording else jnp.float32(p.nominal)
+            else:
+                values[p.name] = jnp.stack(own) if p.per_recording else own[0]
+        return values
 
-    def encode(self, values: Mapping[str, float]) -> np.ndarray:
+    def of_recording(self, values: Mapping[str, Any], recording: Any) -> dict[str, Any]:
+        """Return the values that hold in one recording, each a scalar."""
+        spread = lambda v: jnp.broadcast_to(jnp.asarray(v), (self.recordings,))  # noqa: E731 - one value holds for all
+        own = {p.name: spread(values[p.name])[recording] for p in self.parameters if p.per_recording}
+        return {p.name: own.get(p.name, values[p.name]) for p in self.parameters}
+
+    def placed(self, params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return nodes' parameters with each value at its parameter's ``leaf``."""
+        tree: Any = dict(params)
+        for p in self.parameters:
+            if p.leaf is not None:
+                tree = set_leaf(tree, p.leaf, values[p.name])
+        return tree
+
+    def encode(self, values: Mapping[str, Any]) -> np.ndarray:
         """Map values to the unbounded vector ``(P,)``; values at or outside a bound end just inside it."""
-        x = np.array([math.log(values[p.name]) if p.log else values[p.name] for p in self.parameters])
+        own = [np.ravel(np.asarray(values[c.parameter.name], np.float64)) for c in self.columns]
+        at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(own, self.columns, strict=True)]
+        inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
+        x = np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)])
         share = np.clip((x - self._low) / (self._high - self._low), 1e-3, 1 - 1e-3)
         return np.log(share / (1 - share))
 
     def start(self) -> np.ndarray:
         """Return where a search begins, ``(P,)``: the nominal value, for delays a quarter of the interval."""
-        first = {
-            p.name: p.nominal if p.kind == "dynamics" else p.low + 0.25 * (p.high - p.low) for p in self.parameters
-        }
+        first = {p.name: p.nominal if p.kind != "delay" else p.low + 0.25 * (p.high - p.low) for p in self.parameters}
         return self.encode(first)
 
+    def prior_residuals(self, z: Any) -> Any:
+        """Return ``(K,)`` residuals whose half sum of squares is the negative log prior, up to a constant."""
+        x = self.decode(z)
+        residuals = []
+        for c in self.columns:
+            prior = c.parameter.prior
+            if prior is None:
+                continue
+            value = x[c.parameter.name] if c.recording is None else x[c.parameter.name][c.recording]
+            if type(prior).__name__ == "Normal":  # exact, where the square root below has no slope at the mode
+                residuals.append((value - prior.loc) / prior.scale)
+            else:
+                mode = jnp.float32(prior.mode())
+                off = value - mode
+                # At the mode the square root has no slope, and the drop no digits: there the curvature tells.
+                curvature = -jax.grad(jax.grad(lambda v, d=prior: jnp.sum(d.log_prob(v))))(mode)
+                near = (curvature > 0.0) & (off**2 * curvature < 1e-4)
+                drop = jnp.maximum(prior.log_prob(mode) - prior.log_prob(value), 0.0)
+                far = jnp.sign(off) * jnp.sqrt(2.0 * jnp.where(near, 1.0, drop) + 1e-12)
+                residuals.append(jnp.where(near, off * jnp.sqrt(jnp.where(near, curvature, 1.0)), far))
+        return jnp.stack(residuals) if residuals else jnp.zeros(0)
+
     def scale(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return each parameter on its own scale, linear or logarithmic, and d scale / d z; both ``(P,)``."""
+        """Return each parameter on its own scale and d scale / d z; both ``(P,)``."""
         share = 1.0 / (1.0 + np.exp(-np.asarray(z, np.float64)))
-        span = self._high - self._low
-        return self._low + span * share, span * share * (1 - share)
+        return self._low + self.span * share, self.span * share * (1 - share)
 
     def unscale(self, x: np.ndarray) -> np.ndarray:
-        """Return values for points on the parameters' scales, kept within the bounds, ``(P,)``."""
+        """Return values for points on the parameters' scales ``(..., P)``, kept within the bounds."""
         inside = np.clip(x, self._low, self._high)
-        return np.where(self._log, np.exp(np.where(self._log, inside, 0.0)), inside)
+        values = [_TRANSFORMS[c.parameter.transform][1](inside[..., i], np) for i, c in enumerate(self.columns)]
+        return np.stack(values, axis=-1)
+
+    def slope(self, x: np.ndarray) -> np.ndarray:
+        """Return d value / d scale at points on the parameters' scales, ``(P,)``."""
+        values = self.unscale(x)
+        return np.array([_TRANSFORMS[c.parameter.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower bounds on the parameters' scales, ``(P,)``."""
+        return self._low
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper bounds on the parameters' scales, ``(P,)``."""
+        return self._high
 
     @property
     def span(self) -> np.ndarray:
         """Width of the bounds on the parameters' scales, ``(P,)``."""
         return self._high - self._low
 
-    @property
-    def logarithmic(self) -> np.ndarray:
-        """Which parameters have a logarithmic scale, ``(P,)``, bool."""
-        return self._log
+
+def _has_mode(prior: Any) -> bool:
+    try:
+        return bool(np.all(np.isfinite(np.asarray(prior.mode()))))
+    except (AttributeError, NotImplementedError):
+        return False

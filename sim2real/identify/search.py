@@ -1,7 +1,8 @@
-"""Search by evolution strategy: global, no gradient, bounds in the bijection."""
+"""Global search by evolution strategies: no gradient, bounds in the bijection, restarts, common random numbers."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import Sim2RealError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.tree import strong
+from sim2real.identify.config import FitConfig
+
+Losses = Callable[[Any, Any, Any], Any]
+"""``candidates (N, P), around (P,), pick (B,) or None -> losses (N,)``, traceable."""
+_STUCK = 1e-4
+_INFINITE = 1e9
 
 
 @dataclass(frozen=True)
@@ -20,82 +27,180 @@ class SearchResult:
 
     Attributes:
         z: Shape ``(P,)``: the best candidate.
-        loss: Its loss.
-        history: Shape ``(generations,)``: the best loss up to each generation.
+        loss: Its loss, on all segments.
+        history: Shape ``(generations,)``: the best loss up to each generation, of the segments it saw.
         evaluations: Candidates that were simulated.
+        finalists: Shape ``(K, P)``: the best of each run, best first.
     """
 
     z: np.ndarray
     loss: float
     history: np.ndarray
     evaluations: int
+    finalists: np.ndarray
 
 
-def cma_es(
-    losses: Callable[[Any, Any], Any],
+def strategies() -> list[str]:
+    """Return the names of the algorithms there are."""
+    import evosax.algorithms  # 2 s
+
+    return sorted(n for n, a in vars(evosax.algorithms).items() if inspect.isclass(a) and hasattr(a, "ask"))
+
+
+def search(
+    losses: Losses,
     start: np.ndarray,
-    population: int,
-    generations: int,
-    seed: int,
-    std: float = 0.7,
+    config: FitConfig,
+    segments: np.ndarray | None = None,
     on_generations: Callable[[int, float], None] | None = None,
+    programs: dict[Any, Any] | None = None,
 ) -> SearchResult:
-    """Minimise with CMA-ES; every candidate of a generation sees the same data (common random numbers).
+    """Minimise; every candidate of a generation sees the same data (common random numbers).
+
+    A run ends early once ten generations have improved the loss by less than 0.01 %. Restarts follow BIPOP: in turn
+    with a population twice as large as the last large one and, from a random place with a smaller step, with the first.
 
     Args:
-        losses: ``candidates (N, P), mean of their distribution (P,) -> (N,)``, traceable.
-        start: Shape ``(P,)``: mean of the first generation.
-        population: Candidates a generation.
-        generations: At most, above ten rounded up to tens; the search ends early once ten of them have improved the
-            loss by less than 0.01 %.
-        seed: Seed of the candidates.
-        std: Standard deviation of the first generation, in ``z``.
+        losses: See ``Losses``.
+        start: Shape ``(P,)``: middle of the first generation.
+        config: How to search.
+        segments: Shape ``(S,)``: what batches are drawn from; needed for batches alone.
         on_generations: Called with the number of generations done since the last call and the best loss.
+        programs: What an earlier call with the same losses compiled; this one adds what it compiles.
 
     Raises:
+        UsageError: When there is no such strategy, or it cannot work with this population.
         Sim2RealError: When no candidate has a finite loss.
     """
-    from evosax.algorithms import CMA_ES  # evosax takes 2 s to import
-
-    strategy = CMA_ES(population_size=population, solution=jnp.zeros(len(start)))
-    params = strategy.default_params.replace(std_init=std)
-    key = jax.random.key(seed)
-    state = strong(strategy.init(key, jnp.asarray(start, jnp.float32), params))  # else the second call compiles again
-    batch = min(10, generations)
-
-    run = _generations(strategy, params, losses, batch)
-    history: list[np.ndarray] = []
-    for index in range(-(-generations // batch)):
-        state, best = run(state, jax.random.fold_in(key, index + 1))
-        history.append(np.asarray(best))
-        if on_generations:
-            on_generations(batch, float(best[-1]))
-        if len(history) > 1 and history[-2][-1] - best[-1] < 1e-4 * abs(best[-1]):
-            break
-    best_so_far = np.concatenate(history)
-    if best_so_far[-1] >= 1e9:
+    key = jax.random.key(config.seed)
+    batch = min(10, config.generations)
+    programs = {} if programs is None else programs
+    runs, histories, evaluations, large = [], [], 0, config.population
+    for index in range(config.restarts + 1):
+        own = jax.random.fold_in(key, index)
+        middle, std, population = start, config.std, config.population
+        if index % 2:
+            large = population = 2 * large
+        elif index:
+            # Hansen's small runs draw their population, too; at 5 s of compilation a size, ours keep the first one.
+            u = float(jax.random.uniform(own))
+            middle = np.asarray(jax.random.normal(jax.random.fold_in(own, 1), start.shape)) * 1.5
+            std = config.std * 10.0 ** (-2.0 * u)
+        kind = (config.strategy, population, config.batch, config.generations, config.std)
+        if kind not in programs:
+            programs[kind] = _Run(losses, config, population, len(start), batch, segments)
+        z, history, count = programs[kind](own, middle, std, config.generations, on_generations)
+        runs.append(z)
+        histories.append(history)
+        evaluations += count
+    finalists = np.stack(runs)
+    # Each around itself: a run that ended elsewhere is not judged by what holds around the first.
+    alone = programs.setdefault("alone", jax.jit(lambda z: losses(z[None], z, None)[0]))
+    final = np.array([float(alone(jnp.asarray(z))) for z in finalists])
+    order = np.argsort(np.where(np.isfinite(final), final, _INFINITE))
+    best = float(final[order[0]])
+    if not best < _INFINITE:
         raise Sim2RealError(
             "no candidate could be simulated: every loss is infinite or no number",
             hint="check the bounds: they may admit only unstable models",
         )
-    return SearchResult(
-        np.asarray(state.best_solution), float(best_so_far[-1]), best_so_far, population * best_so_far.size
-    )
+    history = np.minimum.accumulate(np.concatenate(histories))
+    return SearchResult(finalists[order[0]], best, history, evaluations, finalists[order])
 
 
-def _generations(strategy: Any, params: Any, losses: Callable[[Any, Any], Any], count: int) -> Any:
-    """Return the program of some generations: ``(state, key) -> (state, best loss up to each)``."""
+class _Run:
+    """The program of one population size, and a run of it."""
 
-    @jax.jit
-    def run(state: Any, key: Any) -> tuple[Any, Any]:
+    def __init__(
+        self, losses: Losses, config: FitConfig, population: int, size: int, count: int, segments: Any
+    ) -> None:
+        self.name, self.population, self.count, self.losses = config.strategy, population, count, losses
+        self.strategy = _strategy(config, population, size)
+        self.by_population = "mean" not in inspect.signature(type(self.strategy).init).parameters
+        batched = 0 < config.batch < (0 if segments is None else len(segments))
+        self.pick = (
+            (lambda key: jax.random.choice(key, jnp.asarray(segments), (config.batch,), replace=False))
+            if batched
+            else (lambda key: None)
+        )
+        self.batched = batched
+        self.advance = jax.jit(self._advance)
+
+    def __call__(
+        self, key: Any, middle: np.ndarray, std: float, generations: int, told: Callable[[int, float], None] | None
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Run; return the best candidate ``(P,)``, the best loss up to each generation, and how many were simulated."""
+        params = self.strategy.default_params
+        if hasattr(params, "std_init"):
+            params = params.replace(std_init=std)
+        params = strong(params)
+        state = strong(self._first(key, jnp.asarray(middle, jnp.float32), std, params))  # else it compiles twice
+        history: list[np.ndarray] = []
+        for index in range(-(-generations // self.count)):
+            state, best = self.advance(state, params, jax.random.fold_in(key, index + 1))
+            history.append(np.asarray(best))
+            if not self.by_population and not np.isfinite(np.asarray(self._middle(state))).all():
+                raise UsageError(
+                    f"the strategy {self.name!r} breaks down: with a population of {self.population} for "
+                    f"{middle.size} parameters its candidates are no numbers",
+                    hint="try another population, or CMA_ES",
+                )
+            reached = float(np.min(history[-1]))
+            if told:
+                told(self.count, reached)
+            before = float(np.min(np.concatenate(history[:-1]))) if len(history) > 1 else np.inf
+            # Batches differ from generation to generation: their best losses say nothing about being stuck.
+            if not self.batched and np.isfinite(before) and before - reached < _STUCK * abs(reached):
+                break
+        losses = np.minimum.accumulate(np.concatenate(history))
+        z = self._middle(state) if self.batched else state.best_solution
+        return np.asarray(z), losses, self.population * losses.size
+
+    def _first(self, key: Any, middle: Any, std: float, params: Any) -> Any:
+        if not self.by_population:
+            return self.strategy.init(key, middle, params)
+        spread = std * jax.random.normal(key, (self.population, middle.size))
+        candidates = middle + spread.at[0].set(0.0)
+        return self.strategy.init(key, candidates, self._fitness(candidates, middle, key), params)
+
+    def _middle(self, state: Any) -> Any:
+        return state.best_solution if self.by_population else self.strategy.get_mean(state)
+
+    def _fitness(self, candidates: Any, around: Any, key: Any) -> Any:
+        fitness = self.losses(candidates, around, self.pick(key))
+        return jnp.where(jnp.isfinite(fitness), fitness, _INFINITE)
+
+    def _advance(self, state: Any, params: Any, key: Any) -> tuple[Any, Any]:
         def generation(state: Any, key: Any) -> tuple[Any, Any]:
-            ask, tell = jax.random.split(key)
-            candidates, state = strategy.ask(ask, state, params)
-            fitness = losses(candidates, strategy.get_mean(state))
-            fitness = jnp.where(jnp.isfinite(fitness), fitness, 1e9)
-            state, _ = strategy.tell(tell, candidates, fitness, state, params)
-            return state, state.best_fitness
+            ask, tell, pick = jax.random.split(key, 3)
+            candidates, state = self.strategy.ask(ask, state, params)
+            fitness = self._fitness(candidates, self._middle(state), pick)
+            state, _ = self.strategy.tell(tell, candidates, fitness, state, params)
+            return state, jnp.min(fitness)
 
-        return jax.lax.scan(generation, state, jax.random.split(key, count))
+        return jax.lax.scan(generation, state, jax.random.split(key, self.count))
 
-    return run
+
+def _strategy(config: FitConfig, population: int, size: int) -> Any:
+    import evosax.algorithms
+    import optax
+
+    if config.strategy not in strategies():
+        raise UsageError(f"unknown strategy {config.strategy!r}. Available: {', '.join(strategies())}")
+    algorithm = getattr(evosax.algorithms, config.strategy)
+    arguments: dict[str, Any] = {"population_size": population, "solution": jnp.zeros(size)}
+    wanted = inspect.signature(algorithm).parameters
+    missing = [n for n, p in wanted.items() if p.default is p.empty and n not in arguments]
+    if missing:
+        raise UsageError(
+            f"the strategy {config.strategy!r} needs {', '.join(missing)}, which no search here has", hint="try CMA_ES"
+        )
+    if "std_schedule" in wanted:
+        arguments["std_schedule"] = optax.exponential_decay(config.std, config.generations, 0.03)
+    try:
+        return algorithm(**arguments)
+    except (AssertionError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"the strategy {config.strategy!r} refuses a population of {population}: {error}",
+            hint="try another population, or CMA_ES",
+        ) from error

@@ -1,119 +1,180 @@
-"""How well a log determines the parameters: covariance, intervals, and what cannot be told at all."""
+"""How well the recordings determine the parameters: covariance, intervals, and what cannot be told at all."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 
-_VAGUE = 0.15
+VAGUE = 0.15
 """A standard error above this share of the bounds says little more than they do (a uniform value has 0.29)."""
 _AT_BOUND = 0.005
 """An estimate within this share of the bounds' width of a bound counts as at the bound."""
+_BLOCK_S = 1.0
+"""Residuals further apart than this count as independent in the bootstrap [s]."""
+_RESAMPLES = 500
+_LEAST_BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals and their Jacobian at a point, on the parameters' scales.
+
+    Attributes:
+        residuals: Shape ``(S, C, F)``.
+        jacobian: Shape ``(S, C, F, P)``: d residual / d scale.
+        prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
+        x: Shape ``(P,)``: the point.
+    """
+
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    prior: np.ndarray
+    x: np.ndarray
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the log leaves open.
+    """What the recordings leave open.
 
     Attributes:
         covariance: Shape ``(P, P)``, of the values, in their units.
+        scale_covariance: Shape ``(P, P)``, on the parameters' scales.
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
         verdict: One a parameter: ``accepted``, ``not identifiable`` or ``at a bound``.
         correlation: Shape ``(P, P)``.
         inflation: Factor on the variance for residuals that are correlated in time.
+        misfit: Root mean square of the scaled residuals: 1 where the model explains everything but the noise.
+        bootstrap: Shape ``(P,)``: factor by which the block bootstrap widens the linearised standard error; at least 1.
     """
 
     covariance: np.ndarray
+    scale_covariance: np.ndarray
     standard_error: np.ndarray
     low: np.ndarray
     high: np.ndarray
     verdict: tuple[str, ...]
     correlation: np.ndarray
     inflation: float
+    misfit: float
+    bootstrap: np.ndarray
 
 
-def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
+def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Return ``z (P,)`` with time shifted to the middle of what the bounds of the delays admit.
 
     The log does not tell delays on either side of the world apart; where a search happens to leave them means nothing.
     """
+    table = problem.table
     x, _ = table.scale(z)
-    shift = _time_shift(table)
+    shift = time_shift(problem)
     down, up = _shift_range(table, x, shift)
-    values = table.unscale(x + shift * (down + up) / 2)
-    return table.encode(dict(zip(table.names, values.tolist(), strict=True)))
+    moved = table.unscale(x + shift * (down + up) / 2)
+    scaled = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, moved, strict=True)])
+    share = np.clip((scaled - table.low) / table.span, 1e-6, 1 - 1e-6)
+    return np.where(shift != 0.0, np.log(share / (1 - share)), z)
+
+
+def linearise(problem: Problem, z: np.ndarray) -> Linearised:
+    """Compute residuals and Jacobian at ``z (P,)``."""
+    point = jnp.asarray(z, jnp.float32)
+    columns = jax.jit(problem.sensitivities)(point)
+    r, J = (np.asarray(a, np.float64) for a in jax.jit(problem.linearised)(point, columns))
+    x, stretch = problem.table.scale(z)
+    priors = np.asarray(jax.jacfwd(problem.table.prior_residuals)(point), np.float64) / stretch
+    prior = priors.T @ priors + np.diag(12.0 / problem.table.span**2)
+    return Linearised(r, J / stretch, prior, x)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
-    """Linearise the residuals at the estimate ``z (P,)``.
+    """Return the uncertainty of the estimate ``z (P,)``."""
+    return from_linearised(problem, linearise(problem, z))
+
+
+def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
+    """Return the uncertainty at a linearised point.
 
     On each parameter's own scale the bounds act as a weak prior, so that a direction that the log says nothing about
     gets the width of its bounds and not infinity. Residuals that are correlated in time carry less information than
     their number: the variance is scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next.
+    Where the model is wrong even that says too little: blocks of residuals are then drawn again and again, each time
+    the estimate moves by one Gauss-Newton step, and standard errors grow to the spread of that.
 
     A shift of time between the sensor's delay and the others changes nothing in a continuous model, as initial states
     are free. What the residuals seem to say about it is how well the world's ticks happen to meet the measurements, so
     the shift counts as unknown within the bounds, and the rest is computed at the shift that was found.
     """
-    point = jnp.asarray(z, jnp.float32)
-    columns = jax.jit(problem.sensitivities)(point)
-    linearise = jax.jit(lambda y, c: (problem.stacked(y, c), jax.jacfwd(problem.stacked)(y, c)))
-    r, J = (np.asarray(a, np.float64) for a in linearise(point, columns))
+    table, size = problem.table, len(at.x)
+    r, J, inside = at.residuals, at.jacobian.reshape(-1, size), at.residuals.reshape(-1) != 0.0
+    free = size + 2 * len(problem.channels) * len(r) * bool(problem.config.initial_state == "free")
+    count = int(inside.sum())
     rho = _correlation_in_time(r)
     inflation = (1 + rho) / (1 - rho)
-    table = problem.table
-    x, stretch = table.scale(z)
-    flat, J = r.reshape(-1), J.reshape(-1, len(z)) / stretch
-    variance = float(np.mean(flat[flat != 0.0] ** 2)) * inflation
-    shift = _time_shift(table)
+    variance = float(np.sum(r**2)) / max(count - free, 1) * inflation
+    shift = time_shift(problem)
     fixed = np.flatnonzero(shift > 0)[:1]  # the sensor's delay carries the shift
-    rest = np.setdiff1d(np.arange(len(z)), fixed)
-    precision = J[:, rest].T @ J[:, rest] / variance + np.diag(12.0 / table.span[rest] ** 2)
-    cov = np.zeros((len(z), len(z)))
+    rest = np.setdiff1d(np.arange(size), fixed)
+    precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
+    cov = np.zeros((size, size))
     cov[np.ix_(rest, rest)] = np.linalg.inv(precision)
-    down, up = _shift_range(table, x, shift)
-    reach = 1.96 * np.sqrt(np.diag(cov))
-    low = table.unscale(x - reach + np.minimum(down * shift, up * shift))
-    high = table.unscale(x + reach + np.maximum(down * shift, up * shift))
+    wider, blocks = np.ones(size), _blocks(problem, at)
+    if len(blocks[0]) >= _LEAST_BLOCKS:
+        spread = _bootstrap(*blocks, at.prior * variance, rest)
+        linear = np.sqrt(np.diag(cov))
+        wider[rest] = np.maximum(1.0, spread / linear[rest])
+        # Prior knowledge of the bounds is not widened: what the log leaves open stays within them.
+        wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
+    cov *= np.outer(wider, wider)
+    quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
+    down, up = _shift_range(table, at.x, shift)
+    reach = quantile * np.sqrt(np.diag(cov))
+    low = table.unscale(at.x - reach + np.minimum(down * shift, up * shift))
+    high = table.unscale(at.x + reach + np.maximum(down * shift, up * shift))
     cov += np.outer(shift, shift) * (up - down) ** 2 / 12.0
     error = np.sqrt(np.diag(cov))
-    to_value = np.where(table.logarithmic, table.unscale(x), 1.0)
-    covariance = cov * np.outer(to_value, to_value)
-    share = (
-        np.stack([x - table.scale(np.full(len(z), -50.0))[0], table.scale(np.full(len(z), 50.0))[0] - x]) / table.span
-    )
+    slope = table.slope(at.x)
+    margin = np.minimum(at.x - table.low, table.high - at.x) / table.span
     return Uncertainty(
-        covariance=covariance,
-        standard_error=np.sqrt(np.diag(covariance)),
+        covariance=cov * np.outer(slope, slope),
+        scale_covariance=cov,
+        standard_error=error * np.abs(slope),
         low=low,
         high=high,
-        verdict=tuple(_verdict(e, m) for e, m in zip(error / table.span, share.min(axis=0), strict=True)),
+        verdict=tuple(_verdict(e, m) for e, m in zip(error / table.span, margin, strict=True)),
         correlation=cov / np.outer(error, error),
         inflation=inflation,
+        misfit=float(np.sqrt(np.sum(r**2) / max(count, 1))),
+        bootstrap=wider,
     )
+
+
+def sum_of(spread: Uncertainty, columns: list[int]) -> float:
+    """Return the standard error of the sum of some values [their unit]."""
+    return float(np.sqrt(max(spread.covariance[np.ix_(columns, columns)].sum(), 0.0)))
+
+
+def time_shift(problem: Problem) -> np.ndarray:
+    """Return the direction ``(P,)`` in which only time moves, zeros if there is none: measurement up, commands down."""
+    side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in problem.table.columns]
+    direction = np.array([{"measurement": 1.0, "command": -1.0}.get(s, 0.0) for s in side])
+    free = problem.config.initial_state == "free" and {-1.0, 1.0} <= set(direction)
+    return direction if free else np.zeros_like(direction)
 
 
 def _verdict(error: float, margin: float) -> str:
     """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width."""
-    if error > _VAGUE:
+    if error > VAGUE:
         return "not identifiable"
     return "at a bound" if margin < _AT_BOUND else "accepted"
-
-
-def _time_shift(table: ParameterTable) -> np.ndarray:
-    """Return the direction ``(P,)`` in which only time moves: the sensor's delay up, the others down; else zeros."""
-    delays = np.array([p.kind == "delay" for p in table])
-    sensor = np.array([p.name.startswith("sensor") for p in table])
-    direction = np.where(delays, np.where(sensor, 1.0, -1.0), 0.0)
-    return direction if {-1.0, 1.0} <= set(direction) else np.zeros_like(direction)
 
 
 def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
@@ -121,9 +182,34 @@ def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tup
     moved = shift != 0.0
     if not moved.any():
         return 0.0, 0.0
-    low, high = (table.scale(np.full(len(x), s))[0] for s in (-50.0, 50.0))
-    room = np.stack([(low - x)[moved] / shift[moved], (high - x)[moved] / shift[moved]])
+    room = np.stack([(table.low - x)[moved] / shift[moved], (table.high - x)[moved] / shift[moved]])
     return float(room.min(axis=0).max()), float(room.max(axis=0).min())
+
+
+def _blocks(problem: Problem, at: Linearised) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradient ``(B, P)`` and information ``(B, P, P)`` of blocks of about a second."""
+    segments, places = at.residuals.shape[:2]
+    parts = max(1, round(problem.segment_s / _BLOCK_S))
+    edges = np.linspace(0, places, parts + 1).astype(int)
+    gradients, informations = [], []
+    for s in range(segments):
+        for a, b in pairwise(edges):
+            J = at.jacobian[s, a:b].reshape(-1, len(at.x))
+            gradients.append(J.T @ at.residuals[s, a:b].reshape(-1))
+            informations.append(J.T @ J)
+    return np.stack(gradients), np.stack(informations)
+
+
+def _bootstrap(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of the estimate under resampled blocks, one Gauss-Newton step each."""
+    rng = np.random.default_rng(0)
+    blocks = len(gradients)
+    weights = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), _RESAMPLES)
+    g = weights @ (gradients - gradients.mean(axis=0))[:, rest]
+    H = np.tensordot(weights, informations, axes=1)[:, rest][:, :, rest] + prior[np.ix_(rest, rest)]
+    steps = np.linalg.solve(H, g[..., None])[..., 0]
+    # A few resamples may lack what determines a parameter: half the width of the middle 68 % does not mind them.
+    return np.diff(np.quantile(steps, [0.1587, 0.8413], axis=0), axis=0)[0] / 2 * np.sqrt(blocks / (blocks - 1))
 
 
 def _correlation_in_time(r: np.ndarray) -> float:

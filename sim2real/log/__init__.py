@@ -1,5 +1,8 @@
 """Logs: one MCAP file a session, written while the robot runs and readable after any crash."""
 
+from sim2real.log.importer import import_file as import_file
+from sim2real.log.mapping import ImportMapping as ImportMapping
+from sim2real.log.mapping import load_mapping as load_mapping
 from sim2real.log.reader import TruncatedLogWarning as TruncatedLogWarning
 from sim2real.log.reader import read_attachment as read_attachment
 from sim2real.log.reader import read_log as read_log

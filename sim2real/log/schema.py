@@ -72,12 +72,13 @@ def snake(name: str) -> str:
     return result if result[:1].isalpha() else f"field_{result}".rstrip("_")
 
 
-def output_topic(node: str, example: Any) -> Topic:
+def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None) -> Topic:
     """Return the topic of a node's output.
 
     Args:
         node: The node's name.
         example: One output, such as ``init_output`` returns.
+        units: Field -> unit, where known.
 
     Raises:
         Sim2RealError: When two leaves get the same name, or one has a dtype that ROS does not know.
@@ -88,11 +89,16 @@ def output_topic(node: str, example: Any) -> Topic:
         {"name": names[original], "original": original, "dtype": a.dtype.str, "shape": list(a.shape)}
         for original, a in arrays.items()
     ]
+    for entry in described:
+        if unit := (units or {}).get(entry["original"]):
+            entry["unit"] = unit
     lines = []
     for entry in described:
         part = _field(entry)
         count = f"[{part.size}]" if part.shape else ""
-        note = f"  # {entry['original']}, shape {tuple(part.shape)}" if len(part.shape) > 1 else ""
+        notes = [f"{entry['original']}, shape {tuple(part.shape)}"] if len(part.shape) > 1 else []
+        notes += [f"[{entry['unit']}]"] if "unit" in entry else []
+        note = f"  # {' '.join(notes)}" if notes else ""
         if part.size:
             lines.append(f"{ROS_TYPES[part.dtype.str[1:]]}{count} {entry['name']}{note}\n")
     return Topic(

@@ -53,7 +53,7 @@ class SessionFile:
     """A log that is being written.
 
     Opening it writes the session's metadata and attachments and waits for the disk; the arguments are those of
-    ``McapRecorder``.
+    ``McapRecorder``, and ``units``: node -> field -> unit, for the channels' metadata.
 
     Attributes:
         counts: Topic -> messages written.
@@ -67,9 +67,10 @@ class SessionFile:
         outputs: Mapping[str, Any],
         inputs: Iterable[tuple[str, str]],
         joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
+        units: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         self.counts: dict[str, int] = {}
-        self._nodes = _nodes(outputs, joint_states)
+        self._nodes = _nodes(outputs, joint_states, units or {})
         self._inputs = _inputs(inputs, self._nodes)
         self._topics = self._all_topics()
         self._channels: dict[str, int] = {}
@@ -199,14 +200,18 @@ class SessionFile:
         self.counts[topic.name] = self.counts.get(topic.name, 0) + 1
 
 
-def _nodes(outputs: Mapping[str, Any], joint_states: Mapping[str, Mapping[str, Mapping[str, str]]]) -> dict[str, _Node]:
+def _nodes(
+    outputs: Mapping[str, Any],
+    joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
+    units: Mapping[str, Mapping[str, str]],
+) -> dict[str, _Node]:
     unique_names(outputs, "the graph", "node")
     nodes, types = {}, {}
     for name, example in outputs.items():
         leaves = list(named_leaves(example).values())
         joints = joint_source(name, example, joint_states[name]) if name in joint_states else None
         filled = [i for i, leaf in enumerate(leaves) if np.size(leaf)]
-        node = _Node(step_topic(name), output_topic(name, example), filled, len(leaves), joints)
+        node = _Node(step_topic(name), output_topic(name, example, units.get(name, {})), filled, len(leaves), joints)
         other = types.setdefault(node.output.schema, name)
         if other != name:
             raise Sim2RealError(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import UseAppendAction
+from tyro.conf import Positional, UseAppendAction, arg
 
 from sim2real.errors import UsageError
+from sim2real.identify.config import FitConfig
 from sim2real.train.config import PPOConfig
 
 
@@ -73,47 +76,53 @@ class RecordConfig:
 
 
 @dataclass(frozen=True)
-class IdentifyConfig:
-    """Identify dynamics, delays and initial states from a log."""
+class IdentifyConfig(FitConfig):
+    """Identify dynamics, delays and initial states from logs."""
 
-    log: str | None = None
-    """MCAP log to identify from; default: the newest finished recording of the pipeline."""
+    log: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """MCAP log to identify from, one flag a log; default: the newest finished recording of the pipeline."""
+    hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """MCAP log that is only predicted, one flag a log."""
     settle_s: float = 0.3
     """First part of a segment, to which the initial state is fitted where the rest is predicted [s]."""
     horizon_s: float = 1.0
     """Rest of a segment: how far ahead predictions are compared with the log [s]."""
+    spacing_s: float = 0.0
+    """Distance between the starts of fitted segments [s]; 0 puts them side by side."""
     held_out: float = 0.25
-    """Share of the log, at its end, that is only predicted."""
-    population: int = 32
-    """Candidates a generation of CMA-ES."""
-    generations: int = 80
-    """Generations of CMA-ES at most."""
-    max_delay_s: float = 0.06
-    """Upper bound of each identified delay [s]."""
+    """Share of each log, at its end, that is only predicted; 0 where whole logs are held out."""
+    free_run_s: float = 10.0
+    """Longest free run, from one initial state, of what is held out [s]."""
+    each: bool = False
+    """Identify each log by itself as well, and report the spread between them."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
-    seed: int = 0
-    """Seed of the search."""
+    fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
+    """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
     reveal: bool = True
     """Show the embedded robot's true parameters beside the estimates; the search never sees them."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before the log is read."""
-        _check_seed(self.seed)
-        if not 0.05 <= self.held_out <= 0.8:
-            raise UsageError(f"held_out must lie in [0.05, 0.8], got {self.held_out}")
-        if not (0.1 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 60.0):
+        super().__post_init__()
+        if not 0.0 <= self.held_out <= 0.8:
+            raise UsageError(f"held_out must lie in [0, 0.8], got {self.held_out}")
+        if self.held_out == 0.0 and not self.hold_out:
             raise UsageError(
-                "settle_s must lie in [0.1, 10] s and horizon_s in [0.2, 60] s, "
+                "nothing is held out: an identification that nothing checks is worth nothing",
+                hint="set --held-out to a share of the log, or name a log with --hold-out",
+            )
+        if not (0.0 <= self.settle_s <= 10.0 and 0.2 <= self.horizon_s <= 600.0):
+            raise UsageError(
+                "settle_s must lie in [0, 10] s and horizon_s in [0.2, 600] s, "
                 f"got {self.settle_s} and {self.horizon_s}"
             )
-        if self.population < 4 or self.generations < 1:
-            raise UsageError(
-                f"the search needs a population of 4 and one generation at least, got {self.population} and "
-                f"{self.generations}"
-            )
-        if not 0.0 < self.max_delay_s <= 1.0:
-            raise UsageError(f"max_delay_s must lie in (0, 1] s, got {self.max_delay_s}")
+        if self.spacing_s < 0.0:
+            raise UsageError(f"spacing_s must not be negative, got {self.spacing_s}")
+        if not 0.0 <= self.free_run_s <= 3600.0:
+            raise UsageError(f"free_run_s must lie in [0, 3600] s, got {self.free_run_s}")
+        if self.each and len(self.log) < 2:
+            raise UsageError("each needs two logs at least", hint="name them with --log, one flag a log")
 
 
 @dataclass(frozen=True)
@@ -181,3 +190,75 @@ class DeployConfig:
 def _check_seed(seed: int) -> None:
     if not 0 <= seed < 2**31:
         raise UsageError(f"seed must lie in [0, 2**31), got {seed}")
+
+
+@dataclass(frozen=True)
+class ImportConfig:
+    """Turn files of other recorders into logs, one for each file."""
+
+    files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
+    """Files of other recorders: npz, JSON, CSV, or episodes of a LeRobot data set."""
+    mapping: Path | None = None
+    """TOML file that says which signal is which field; default: import.toml in the pipeline's folder."""
+    pipeline: str | None = None
+    """Pipeline that the logs are for; default: the one that the mapping names."""
+    format: Literal["npz", "json", "csv", "lerobot"] | None = None
+    """What the files are; default: what their suffixes say."""
+    samples: Annotated[str | None, arg(metavar="A:B")] = None
+    """Take the samples from A to just before B, counted from 0; default: all."""
+    out: Path | None = None
+    """Log to write; default: one in a run folder of its own, as record makes it."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before a file is read."""
+        if self.samples is not None and not re.fullmatch(r"(-?\d+)?:(-?\d+)?", self.samples):
+            raise UsageError(
+                f"samples must be a range A:B of whole numbers, got {self.samples!r}", hint="such as 0:20000 or 500:"
+            )
+        if self.out is not None and len(self.files) > 1:
+            raise UsageError(f"out names one log, but there are {len(self.files)} files", hint="import them one by one")
+
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """The files, at least one.
+
+        Raises:
+            UsageError: When none was named.
+        """
+        if not self.files:
+            raise UsageError("import needs a file of another recorder", hint="sim2real import FILE... --pipeline NAME")
+        return self.files
+
+    @property
+    def selection(self) -> slice | None:
+        """The range of samples; None: all."""
+        if self.samples is None:
+            return None
+        return slice(*(int(end) if end else None for end in self.samples.split(":")))
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """Judge what a recording, or a planned one, can tell about the parameters, before anything is searched."""
+
+    log: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """MCAP log to judge, one flag a log; default: the newest recording, and without one the planned excitation."""
+    plan: bool = False
+    """Judge the planned excitation even where there is a recording."""
+    bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
+    """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
+    fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
+    """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
+    json: bool = False
+    """Print JSON instead of tables."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    record: RecordConfig = field(default_factory=RecordConfig)
+    """The excitation that is planned."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before a log is read."""
+        if self.plan and self.log:
+            raise UsageError("plan and log exclude each other: a plan is judged without a log")

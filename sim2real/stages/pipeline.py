@@ -46,6 +46,11 @@ class Pipeline:
     train: TrainConfig = TrainConfig()
     deploy: DeployConfig = DeployConfig()
 
+    @property
+    def folder(self) -> Path:
+        """Where the pipeline's files are."""
+        return Path(str(importlib.import_module(self.package).__file__)).parent
+
     def load(self, module: str | None = None) -> ModuleType:
         """Import a module of the pipeline's package; default: the robot's parts."""
         return importlib.import_module(f"{self.package}.{module or self.robot}")

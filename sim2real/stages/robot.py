@@ -13,7 +13,7 @@ from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.rig import ServoRig
-from sim2real.identify.problem import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel
 from sim2real.stages.config import GateLimits
 from sim2real.train.env import Task
 
@@ -25,14 +25,29 @@ class Session(AbstractContextManager["Session"], Protocol):
     embedded: EmbeddedRobot | None
 
 
-class Robot(Protocol):
+class Identifiable(Protocol):
+    """What identification alone needs of a robot.
+
+    A robot whose world is MuJoCo's may also have ``identified_mjcf(values) -> str``: its model with what was found.
+
+    Attributes:
+        UNITS: Field of a message -> its unit, for axes.
+    """
+
+    UNITS: Mapping[str, str]
+
+    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model to identify."""
+        ...
+
+
+class Robot(Identifiable, Protocol):
     """A robot's parts.
 
     Attributes:
         RATE_HZ: Rate of the supervisor [Hz].
         SUPERVISOR: Name of the node that the policy acts for.
         COMMAND: Node and field of the command that reaches the motors.
-        UNITS: Field of a message -> its unit, for axes.
         JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
         OBSERVATION: Terms of the policy's observation in order: name, units of its entries, steps of history.
         ACTION: Names of the actions, with units, in order.
@@ -41,7 +56,6 @@ class Robot(Protocol):
     RATE_HZ: float
     SUPERVISOR: str
     COMMAND: tuple[str, str]
-    UNITS: Mapping[str, str]
     JOINTS: Mapping[str, Any]
     OBSERVATION: list[tuple[str, tuple[str, ...], int]]
     ACTION: list[tuple[str, str]]
@@ -62,18 +76,14 @@ class Robot(Protocol):
         """Return the graph on hardware that runs a policy, and parameters of its nodes."""
         ...
 
-    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model to identify."""
-        ...
-
     def training(
         self,
         values: Mapping[str, float],
-        spread: Mapping[str, float],
+        draws: Mapping[str, np.ndarray],
         computation: Mapping[str, DelayDistribution],
         delays: bool,
     ) -> tuple[dict[str, BaseNode], Task]:
-        """Return the graph in simulation and the task, for parameters that vary by ``spread`` (a share of each)."""
+        """Return the graph in simulation and the task, whose copies take parameters from ``draws (K,)``."""
         ...
 
     def simulation_params(self, values: Mapping[str, float], policy: Any) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from sim2real.graph.fitting import resample
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
+from sim2real.identify.posterior import Posterior
 from sim2real.policy.bundle import save_bundle
 from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
 from sim2real.runtime.compiled import CompiledGraph
@@ -36,8 +37,9 @@ _LONGEST_GAP = 1.25
 """Timelines with a longer pause between policy steps than this many medians are drawn again."""
 _HICCUP = 0.25
 """Steps that took longer than this share of the policy's period on the robot are not drawn from."""
-_SPREAD = (0.02, 0.5)
-"""Smallest and largest share by which copies differ in a parameter: a log may have told nothing about one."""
+_LEAST_SPREAD, _MOST = 0.02, 2.0
+"""Copies differ by this share at least, and by no more than this factor: a log may have told nothing about one."""
+_DRAWS = 1024
 
 
 def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -55,11 +57,11 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     log = Path(identified["log"]["path"])
     if log.is_file() and sha256(log) != identified["log"].get("sha256"):
         note(f"warning: {log} is not the log that {path} was identified from: it has changed since")
-    values, spread = model_values(robot, identified, config)
+    values, draws = model_values(robot, identified, config)
     delays = config.model == "identified"
     longest_s = _HICCUP / robot.RATE_HZ
     computation, dropped = computation_delays(load_log(log, pipeline), longest_s) if delays else ({}, {})
-    nodes, task = robot.training(values, spread, computation, delays)
+    nodes, task = robot.training(values, draws, computation, delays)
     with open_stage(root, pipeline.name, "train", config, {"parameters": path, "log": log}, run_dir) as stage:
         timeline, redrawn = draw_timelines(nodes, robot.SUPERVISOR, config)
         if dropped:
@@ -103,6 +105,9 @@ def load_parameters(path: Path, pipeline: Pipeline) -> dict[str, Any]:
         rows = {row["name"]: row for row in document["parameters"]}
         numbers = {n: [float(row[key]) for key in ("estimate", "standard_error")] for n, row in rows.items()}
         kinds = {row["kind"] for row in rows.values()}
+        Posterior.from_json(document["posterior"])
+    except Sim2RealError as error:
+        raise Sim2RealError(f"{path} is damaged: it holds {error}", hint=hint) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise Sim2RealError(f"{path} holds no identified parameters: {reason}", hint=hint) from None
@@ -111,7 +116,7 @@ def load_parameters(path: Path, pipeline: Pipeline) -> dict[str, Any]:
     robot = cast(Robot, pipeline.load())
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
     lacking = [n for n in expected if n not in rows or not np.isfinite(numbers[n]).all()]
-    if lacking or not isinstance(log, str) or not kinds <= {"dynamics", "delay", "derived"}:
+    if lacking or not isinstance(log, str) or not kinds <= {"dynamics", "delay", "measurement", "derived"}:
         what = f"no finite estimate of {', '.join(lacking)}" if lacking else "a kind or a log that is none"
         raise Sim2RealError(f"{path} is damaged: it holds {what}", hint=hint)
     return document
@@ -119,18 +124,27 @@ def load_parameters(path: Path, pipeline: Pipeline) -> dict[str, Any]:
 
 def model_values(
     robot: Robot, identified: Mapping[str, Any], config: TrainConfig
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the parameters to train on, and by which share of each the copies differ."""
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Return the parameters to train on, and draws of the dynamics from their posterior, ``(K,)`` each.
+
+    What the log tells about combinations of parameters holds in every draw; what it tells about none is cut off.
+    """
     if config.model == "nominal":
         return robot.nominal(), {}
     rows = [p for p in identified["parameters"] if p["kind"] != "derived"]
     values = {p["name"]: float(p["estimate"]) for p in rows}
-    spread = {
-        p["name"]: float(np.clip(config.randomise * p["standard_error"] / (abs(p["estimate"]) or 1e-9), *_SPREAD))
-        for p in rows
-        if p["kind"] == "dynamics"
-    }
-    return values, spread
+    rng = np.random.default_rng(config.seed)
+    drawn = Posterior.from_json(identified["posterior"]).sample(rng, _DRAWS, config.randomise)
+    draws = {}
+    for p in rows:
+        if p["kind"] == "dynamics" and p["name"] in drawn:
+            value, error = values[p["name"]], config.randomise * float(p["standard_error"])
+            size = abs(value) or 1e-9
+            lacking = np.sqrt(max(0.0, _LEAST_SPREAD**2 - (error / size) ** 2))
+            own = drawn[p["name"]] + lacking * size * rng.standard_normal(_DRAWS)
+            low, high = sorted((value / _MOST, value * _MOST))
+            draws[p["name"]] = np.clip(own, low, high)
+    return values, draws
 
 
 def computation_delays(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 MISSING = "–"  # noqa: RUF001 - a dash, as tables have it
 
@@ -62,7 +62,32 @@ class FoldBlock:
     kind: str = "fold"
 
 
-Block = FigureBlock | TableBlock | NoteBlock | FoldBlock
+@dataclass(frozen=True)
+class ListBlock:
+    """Sentences below a heading."""
+
+    caption: str
+    items: Sequence[str]
+    kind: str = "list"
+
+
+Block = FigureBlock | TableBlock | NoteBlock | FoldBlock | ListBlock
+Tone = Literal["good", "doubt", "bad"]
+MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
+
+
+@dataclass(frozen=True)
+class Banner:
+    """A judgement, above everything else of a section: its colour says no more than its sign and its words."""
+
+    tone: Tone
+    title: str
+    reasons: Sequence[str] = ()
+
+    @property
+    def mark(self) -> str:
+        """The sign beside the title."""
+        return MARKS[self.tone]
 
 
 @dataclass(frozen=True)
@@ -83,6 +108,7 @@ class Section:
     lead: str
     tiles: Sequence[Tile] = ()
     blocks: Sequence[Block] = field(default_factory=list)
+    banner: Banner | None = None
 
 
 def number(value: Any, digits: int = 4) -> str:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.view.artifacts import Identification, read_deployment, read_identification
+from sim2real.view.artifacts import read_deployment
+from sim2real.view.identification import Identification, read_identification
 from sim2real.view.run import Artifact
 from sim2real.view.signals import Recording, Series, read_recording, unit_of
 
@@ -75,7 +76,9 @@ def tabs_of(artifacts: Mapping[str, Artifact]) -> list[Tab]:
         log = read_recording(artifact.need("log", "session.mcap"), artifact.output("truth", "truth.bin"))
         tabs.append(_episode_tab("Record", "record", log, []))
     if "identify" in artifacts:
-        tabs.append(_identify_tab(read_identification(artifacts["identify"])))
+        found = read_identification(artifacts["identify"])
+        several = len(found.recordings) > 1
+        tabs += [_identify_tab(found, r, f" {r}" if several else "") for r in found.recordings]
     if "deploy" in artifacts:
         deployed = read_deployment(artifacts["deploy"])
         for i, (log, simulated) in enumerate(zip(deployed.episodes, deployed.simulated, strict=True)):
@@ -108,23 +111,24 @@ def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series
     return Tab(title, entity, plots, motions, log.episode)
 
 
-def _identify_tab(found: Identification) -> Tab:
-    chosen = found.disjoint()
+def _identify_tab(found: Identification, recording: int, which: str) -> Tab:
+    chosen = found.disjoint() & (found.samples["recording"] == recording)
+    entity = f"identify/{recording}" if which else "identify"
     samples = {name: values[chosen] for name, values in found.samples.items()}
     t_s, segment = samples["t"], samples["segment"]
     plots, columns = {}, {}
     for quantity in found.fields:
         curves = []
-        for model in ("measured", *found.models(quantity)):
+        for model in ("measured", *(m for m in found.models(quantity) if m != "no delay")):
             values = samples[f"{quantity}_{model}"].astype(np.float64)
             columns.setdefault(model, {})[quantity] = values
             series = Series(quantity, model, *_interrupted(t_s, values, segment))
-            curves.append(_curve(f"identify/{model}", series, model, model))
+            curves.append(_curve(f"{entity}/{model}", series, model, model))
         plots[_titled(quantity, found.units)] = curves
-    motions = [Motion("identify/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
+    motions = [Motion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
     if "identified" in columns:
-        motions.append(Motion("identify/scene/identified", t_s, columns["identified"], ghost=True))
-    return Tab("Identify", "identify", plots, motions)
+        motions.append(Motion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))
+    return Tab(f"Identify{which}", entity, plots, motions)
 
 
 def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:

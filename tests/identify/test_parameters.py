@@ -1,13 +1,24 @@
-"""Parameters: the bijection, and bounds that make no sense."""
+"""Parameters: the bijection, per-recording and fixed ones, priors, leaves, and bounds that make no sense."""
 
+import distrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from flax import struct
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
+
+INVERSE = {
+    "linear": lambda x: x,
+    "log": np.exp,
+    "logit": lambda x: 1.0 / (1.0 + np.exp(-x)),
+}
+FORWARD = {"linear": lambda v: v, "log": np.log, "logit": lambda v: np.log(v / (1.0 - v))}
 
 
 @st.composite
@@ -15,56 +26,231 @@ def tables(draw):
     """A table with values strictly inside its bounds."""
     parameters, values = [], {}
     for i in range(draw(st.integers(1, 4))):
-        log = draw(st.booleans())
-        low = draw(st.floats(1e-4, 1e3)) if log else draw(st.floats(-100.0, 100.0))
-        high = low * draw(st.floats(1.1, 1e3)) if log else low + draw(st.floats(0.01, 100.0))
-        share = draw(st.floats(0.01, 0.99))
-        value = low * (high / low) ** share if log else low + share * (high - low)
-        parameters.append(Parameter(f"p{i}", "1", value, low, high, log))
+        transform = draw(st.sampled_from(["linear", "log", "logit"]))
+        if transform == "log":
+            low = draw(st.floats(1e-4, 1e3))
+            high = low * draw(st.floats(1.1, 1e3))
+        elif transform == "linear":
+            low = draw(st.floats(-100.0, 100.0))
+            high = low + draw(st.floats(0.01, 100.0))
+        else:
+            low = draw(st.floats(0.01, 0.5))
+            high = low + draw(st.floats(0.05, 0.49))
+        a, b = FORWARD[transform](low), FORWARD[transform](high)
+        value = float(INVERSE[transform](a + draw(st.floats(0.01, 0.99)) * (b - a)))
+        parameters.append(Parameter(f"p{i}", "1", value, low, high, transform))
         values[f"p{i}"] = value
     return ParameterTable(parameters), values
 
 
+@settings(max_examples=40)
 @given(tables())
 def test_encode_and_decode_are_inverse(drawn):
     table, values = drawn
     back = table.decode(table.encode(values))
     for p in table:
-        scale = abs(values[p.name]) if p.log else p.high - p.low + 1e-6 * abs(p.low)
-        assert float(back[p.name]) == pytest.approx(values[p.name], abs=2e-5 * max(scale, abs(values[p.name])))
+        room = 2e-5 * max(abs(p.low), abs(p.high)) if p.transform == "linear" else 2e-5 * abs(values[p.name])
+        # float32 holds a logarithm of several units only to some 1e-6
+        assert float(back[p.name]) == pytest.approx(values[p.name], abs=room + 1e-5 * (p.transform == "linear"))
     np.testing.assert_allclose(table.start(), table.encode(values))
 
 
+@settings(max_examples=40)
 @given(tables(), st.floats(-30.0, 30.0))
 def test_every_vector_decodes_into_the_bounds(drawn, z):
     table, _ = drawn
     for p, value in zip(table, table.decode(jnp.full(len(table), z)).values(), strict=True):
-        room = 1e-5 * max(abs(p.low), abs(p.high))
+        room = 2e-5 * max(abs(p.low), abs(p.high))
         assert p.low - room <= float(value) <= p.high + room
 
 
-def test_scales_are_linear_or_logarithmic_and_their_slope_is_the_derivative():
-    table = ParameterTable([Parameter("a", "1", 2.0, 0.5, 8.0), Parameter("b", "s", 0.0, -1.0, 3.0, log=False)])
-    z = np.array([0.7, -0.4])
-    x, slope = table.scale(z)
-    values = table.decode(jnp.asarray(z, jnp.float32))
-    np.testing.assert_allclose(x, [np.log(values["a"]), values["b"]], rtol=1e-5)
-    np.testing.assert_allclose(table.unscale(x), [values["a"], values["b"]], rtol=1e-5)
-    np.testing.assert_allclose(slope, (table.scale(z + 1e-6)[0] - table.scale(z - 1e-6)[0]) / 2e-6, rtol=1e-6)
-    np.testing.assert_allclose(table.unscale(np.array([99.0, -99.0])), [8.0, -1.0])
-    np.testing.assert_allclose(table.span, [np.log(16.0), 4.0])
-    assert table.logarithmic.tolist() == [True, False]
+@pytest.fixture
+def three():
+    """One parameter of each transform."""
+    return ParameterTable(
+        [
+            Parameter("a", "1", 2.0, 0.5, 8.0),
+            Parameter("b", "s", 0.0, -1.0, 3.0, "linear"),
+            Parameter("c", "1", 0.3, 0.1, 0.9, "logit"),
+        ]
+    )
+
+
+def test_scales_and_their_slopes_are_what_the_transforms_say(three):
+    z = np.array([0.7, -0.4, 1.1])
+    x, stretch = three.scale(z)
+    values = {n: float(v) for n, v in three.decode(jnp.asarray(z, jnp.float32)).items()}
+    np.testing.assert_allclose(
+        x, [np.log(values["a"]), values["b"], np.log(values["c"] / (1 - values["c"]))], rtol=1e-5
+    )
+    np.testing.assert_allclose(three.unscale(x), list(values.values()), rtol=1e-5)
+    np.testing.assert_allclose(stretch, (three.scale(z + 1e-6)[0] - three.scale(z - 1e-6)[0]) / 2e-6, rtol=1e-6)
+    np.testing.assert_allclose(three.slope(x), (three.unscale(x + 1e-6) - three.unscale(x - 1e-6)) / 2e-6, rtol=1e-6)
+    both = np.diag(jax.jacfwd(lambda y: jnp.stack(list(three.decode(y).values())))(jnp.asarray(z, jnp.float32)))
+    np.testing.assert_allclose(three.slope(x) * stretch, both, rtol=1e-4)
+    np.testing.assert_allclose(three.span, [np.log(16.0), 4.0, np.log(0.9 / 0.1) - np.log(0.1 / 0.9)])
+
+
+def test_points_beyond_the_bounds_are_kept_within(three):
+    np.testing.assert_allclose(three.unscale(np.array([99.0, -99.0, 99.0])), [8.0, -1.0, 0.9])
+    many = three.unscale(np.zeros((4, 5, 3)))
+    assert many.shape == (4, 5, 3)
+    np.testing.assert_allclose(many[2, 3], [1.0, 0.0, 0.5])
 
 
 def test_values_at_or_beyond_a_bound_end_just_inside():
     table = ParameterTable([Parameter("a", "1", 2.0, 1.0, 4.0)])
     for value, side in ((1.0, 1.0), (0.1, 1.0), (9.0, 4.0)):
-        assert float(table.decode(table.encode({"a": value}))["a"]) == pytest.approx(side, rel=0.01)
+        z = table.encode({"a": value})
+        assert np.isfinite(z).all()
+        assert float(table.decode(z)["a"]) == pytest.approx(side, rel=0.01)
 
 
 def test_delays_start_at_a_quarter_of_their_interval():
-    table = ParameterTable([Parameter("d", "s", 0.0, 0.01, 0.05, False, "delay")])
+    table = ParameterTable([Parameter("d", "s", 0.0, 0.01, 0.05, "linear", "delay")])
     assert float(table.decode(table.start())["d"]) == pytest.approx(0.02)
+
+
+@pytest.fixture
+def shared():
+    """One shared, one per recording, one fixed; three recordings."""
+    return ParameterTable(
+        [
+            Parameter("gain", "1", 2.0, 1.0, 4.0),
+            Parameter("offset", "rad", 0.1, -1.0, 1.0, "linear", "measurement", per_recording=True),
+            Parameter("mass", "kg", 7.0, 1.0, 9.0, free=False),
+        ],
+        recordings=3,
+    )
+
+
+def test_each_recording_has_its_column(shared):
+    assert shared.names == ("gain", "offset@0", "offset@1", "offset@2")
+    assert len(shared) == 4
+    values = {"gain": 3.0, "offset": np.array([-0.5, 0.2, 0.7]), "mass": 7.0}
+    back = shared.decode(shared.encode(values))
+    np.testing.assert_allclose(back["offset"], values["offset"], atol=1e-5)
+    for r, offset in enumerate(values["offset"]):
+        own = shared.of_recording(back, r)
+        assert {n: np.shape(v) for n, v in own.items()} == {"gain": (), "offset": (), "mass": ()}
+        assert float(own["offset"]) == pytest.approx(offset, abs=1e-5)
+        assert float(own["gain"]) == pytest.approx(3.0, rel=1e-5)
+    picked = jax.vmap(lambda r: shared.of_recording(back, r)["offset"])(jnp.array([2, 0]))
+    np.testing.assert_allclose(picked, [0.7, -0.5], atol=1e-5)
+
+
+def test_one_value_for_all_recordings_holds_in_each(shared):
+    z = shared.encode({"gain": 2.0, "offset": 0.25})
+    np.testing.assert_allclose(shared.decode(z)["offset"], 0.25, atol=1e-5)
+    nominal = {p.name: p.nominal for p in shared}
+    assert float(shared.of_recording(nominal, 2)["offset"]) == pytest.approx(0.1)
+    assert float(shared.of_recording(nominal, jnp.int32(1))["offset"]) == pytest.approx(0.1)
+
+
+def test_another_number_of_recordings(shared):
+    assert shared.for_recordings(1).names == ("gain", "offset@0")
+    np.testing.assert_allclose(shared.for_recordings(2).decode(np.zeros(3))["offset"], [0.0, 0.0], atol=1e-6)
+
+
+def test_fixed_parameters_leave_the_vector_and_stay_in_the_values(shared):
+    fixed = shared.with_fixed({"gain": 2.5, "offset": 0.4})
+    assert fixed.names == ()
+    values = fixed.decode(np.zeros(0))
+    assert {n: np.asarray(v).tolist() for n, v in values.items()} == {
+        "gain": 2.5,
+        "offset": pytest.approx([0.4] * 3),
+        "mass": 7.0,
+    }
+    assert float(shared.decode(np.zeros(4))["mass"]) == 7.0
+    assert shared["gain"].free
+    with pytest.raises(UsageError, match=r"unknown parameter 'gian'\. Available: gain, offset, mass"):
+        shared.with_fixed({"gian": 1.0})
+
+
+def test_other_nominal_values_are_where_a_search_starts(shared):
+    other = shared.with_nominal({"gain": 3.5, "nobody": 1.0})
+    assert other["gain"].nominal == 3.5
+    assert float(other.decode(other.start())["gain"]) == pytest.approx(3.5, rel=1e-4)
+    assert other["mass"].nominal == 7.0
+
+
+PRIORS = {
+    "Normal": (distrax.Normal(2.0, 0.5), stats.norm(2.0, 0.5), 2.0),
+    "Gamma": (distrax.Gamma(4.0, 2.0), stats.gamma(4.0, scale=0.5), 1.5),
+    "Laplace": (distrax.Laplace(2.0, 0.4), stats.laplace(2.0, 0.4), 2.0),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("value", [0.6, 1.45, 1.502, 2.0, 2.3, 5.0])
+def test_half_the_squared_residual_is_the_drop_of_the_log_prior(name, value):
+    prior, reference, mode = PRIORS[name]
+    table = ParameterTable([Parameter("free", "1", 1.0, 0.5, 2.0), Parameter("a", "1", 2.0, 0.1, 20.0, prior=prior)])
+    z = jnp.asarray(table.encode({"free": 1.0, "a": value}), jnp.float32)
+    residuals = np.asarray(table.prior_residuals(z))
+    assert residuals.shape == (1,)
+    drop = reference.logpdf(mode) - reference.logpdf(value)
+    assert 0.5 * float(residuals[0] ** 2) == pytest.approx(drop, rel=3e-3, abs=2e-5)
+    if abs(value - mode) > 1e-2:
+        assert np.sign(residuals[0]) == np.sign(value - mode)
+
+
+@pytest.mark.parametrize("name", ["Normal", "Gamma"])
+@pytest.mark.parametrize("off", [0.0, 1e-4, -3e-3])
+def test_a_prior_has_its_curvature_at_its_mode_too(name, off):
+    prior, reference, mode = PRIORS[name]
+    table = ParameterTable([Parameter("a", "1", 2.0, 0.1, 20.0, "linear", prior=prior)])
+    z = table.encode({"a": mode + off})
+    slope = float(jax.jacfwd(table.prior_residuals)(jnp.asarray(z, jnp.float32))[0, 0]) / table.scale(z)[1][0]
+    h = 1e-3
+    curvature = -(reference.logpdf(mode + h) - 2 * reference.logpdf(mode) + reference.logpdf(mode - h)) / h**2
+    assert slope**2 == pytest.approx(curvature, rel=0.02)
+
+
+def test_priors_count_once_for_each_recording():
+    offset = Parameter("offset", "rad", 0.0, -1.0, 1.0, "linear", per_recording=True, prior=distrax.Normal(0.0, 0.1))
+    table = ParameterTable([offset], recordings=3)
+    z = table.encode({"offset": np.array([0.1, -0.2, 0.3])})
+    np.testing.assert_allclose(table.prior_residuals(jnp.asarray(z)), [1.0, -2.0, 3.0], rtol=1e-4)
+    fixed = table.with_fixed({"offset": 0.1})
+    assert fixed.prior_residuals(jnp.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [(3.0, "has no log_prob"), (distrax.Uniform(1.0, 2.0), "no single, finite mode"),
+     (distrax.Gamma(0.5, 1.0), "no single, finite mode")],
+)  # fmt: skip
+def test_priors_that_are_none(prior, message):
+    with pytest.raises(UsageError, match=f"'a'.*{message}"):
+        Parameter("a", "1", 2.0, 1.0, 4.0, prior=prior)
+
+
+@struct.dataclass
+class WorldParams:
+    """A node's parameters."""
+
+    mass: float
+    damping: jax.Array
+
+
+def test_values_are_placed_at_their_leaves():
+    table = ParameterTable(
+        [
+            Parameter("mass", "kg", 1.0, 0.5, 2.0, leaf="world.mass"),
+            Parameter("damping", "1", 1.0, 0.5, 2.0, leaf="world.damping[1]"),
+            Parameter("delay", "s", 0.0, 0.0, 0.1, "linear", leaf="sensor.delay"),
+            Parameter("elsewhere", "1", 1.0, 0.5, 2.0),
+        ]
+    )
+    params = {"world": WorldParams(1.0, jnp.ones(3)), "sensor": {"delay": None}, "other": 5}
+    values = {"mass": 1.5, "damping": 0.7, "delay": 0.03, "elsewhere": 9.0}
+    placed = table.placed(params, values)
+    assert placed["world"].mass == 1.5
+    np.testing.assert_allclose(placed["world"].damping, [1.0, 0.7, 1.0])
+    assert placed["sensor"] == {"delay": 0.03}
+    assert placed["other"] == 5
+    assert params["world"].mass == 1.0
 
 
 @pytest.mark.parametrize(
@@ -75,6 +261,9 @@ def test_delays_start_at_a_quarter_of_their_interval():
         ((1.0, float("nan"), 1.0), "no interval"),
         ((1.0, 0.5, float("inf")), "no interval"),
         ((1.0, 0.0, 2.0), "positive lower bound"),
+        ((0.5, 0.0, 0.9, "logit"), r"within \(0, 1\)"),
+        ((0.5, 0.1, 1.0, "logit"), r"within \(0, 1\)"),
+        ((0.5, 0.1, 1.0, "cubic"), "unknown transform 'cubic'. Available: linear, log, logit"),
     ],
 )
 def test_bounds_that_are_none(arguments, message):
@@ -89,7 +278,7 @@ def test_names_must_differ():
 
 def test_other_bounds():
     table = ParameterTable(
-        [Parameter("gain", "1", 2.0, 1.0, 4.0), Parameter("delay", "s", 0.0, 0.01, 0.05, False, "delay")]
+        [Parameter("gain", "1", 2.0, 1.0, 4.0), Parameter("delay", "s", 0.0, 0.01, 0.05, "linear", "delay")]
     )
     changed = table.with_bounds({"gain": (1.5, 9.0), "delay": (0.02, 0.04)})
     assert (changed["gain"].low, changed["gain"].high) == (1.5, 9.0)

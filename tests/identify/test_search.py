@@ -1,36 +1,168 @@
-"""The search: finds what there is to find, and says when there is nothing."""
+"""The search: finds what there is to find with every strategy, and says when there is nothing."""
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.errors import Sim2RealError
-from sim2real.identify.search import cma_es
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.identify.config import FitConfig
+from sim2real.identify.search import search, strategies
+
+BOTTOM = np.array([1.0, -2.0])
+INCOMPLETE = {"RandomSearch": "sampling_fn", "SV_CMA_ES": "num_populations", "SV_Open_ES": "num_populations"}
+"""Strategies whose constructors want what a search does not know."""
+STANDARD = [
+    "CMA_ES", "Sep_CMA_ES", "SNES", "xNES", "PGPE", "Open_ES", "SimpleES", "DifferentialEvolution", "PSO", "SimpleGA",
+    "MA_ES", "CR_FM_NES", "SimulatedAnnealing",
+]  # fmt: skip
+CONFIG = FitConfig(population=16, generations=2000, std=1.0, seed=1)
 
 
-def bowl(candidates, mean):
-    del mean
-    return 1.0 + jnp.sum((candidates - jnp.array([1.0, -2.0])) ** 2 * jnp.array([1.0, 30.0]), axis=1)
+def bowl(candidates, around=None, pick=None):
+    del around, pick
+    return 1.0 + jnp.sum((candidates - BOTTOM) ** 2 * jnp.array([1.0, 30.0]), axis=1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _quick():
+    """Programs are compiled in a hurry: none runs for long."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def test_a_bowls_bottom_is_found_and_reported():
     told = []
-    found = cma_es(bowl, np.zeros(2), 16, 60, seed=1, on_generations=lambda n, best: told.append((n, best)))
-    np.testing.assert_allclose(found.z, [1.0, -2.0], atol=0.02)
+    found = search(bowl, np.zeros(2), CONFIG, on_generations=lambda n, best: told.append((n, best)))
+    np.testing.assert_allclose(found.z, BOTTOM, atol=0.02)
     assert found.loss == pytest.approx(1.0, abs=1e-3)
+    assert found.loss == pytest.approx(float(bowl(found.z[None])[0]))
+    assert len(found.history) < 500  # it ends once it is stuck
     assert np.all(np.diff(found.history) <= 0)
     assert found.evaluations == 16 * len(found.history)
     assert sum(n for n, _ in told) == len(found.history)
     assert told[-1][1] == pytest.approx(found.loss)
+    np.testing.assert_array_equal(found.finalists, found.z[None])
 
 
 def test_one_seed_one_result():
-    first, again = (cma_es(bowl, np.zeros(2), 8, 10, seed=5) for _ in range(2))
+    config = replace(CONFIG, strategy="SNES", population=8, generations=3)
+    first, again, other = (search(bowl, np.zeros(2), replace(config, seed=s)) for s in (5, 5, 6))
     np.testing.assert_array_equal(first.z, again.z)
+    np.testing.assert_array_equal(first.history, again.history)
+    assert not np.array_equal(first.z, other.z)
 
 
 def test_candidates_that_cannot_be_simulated_lose():
-    found = cma_es(lambda c, m: jnp.where(c[:, 0] > 1.0, jnp.nan, bowl(c, m)), np.zeros(2), 16, 40, seed=1)
+    hole = lambda c, around, pick: jnp.where(c[:, 0] > 0.5, jnp.nan, bowl(c))  # noqa: E731
+    found = search(hole, np.zeros(2), CONFIG)
     assert np.isfinite(found.loss)
+    assert found.loss == pytest.approx(1.25, abs=0.05)
+
+
+def test_when_nothing_can_be_simulated():
+    bad = lambda c, around, pick: jnp.where(c[:, 0] > 0.0, jnp.nan, jnp.inf)  # noqa: E731
     with pytest.raises(Sim2RealError, match="no candidate could be simulated"):
-        cma_es(lambda c, m: jnp.full(len(c), jnp.nan), np.zeros(2), 8, 10, seed=1)
+        search(bad, np.zeros(2), replace(CONFIG, strategy="SNES", generations=10))
+
+
+@pytest.mark.parametrize("strategy", strategies())
+def test_every_strategy_runs_or_says_why_not(strategy):
+    config = FitConfig(strategy=strategy, population=8, generations=10, std=0.7)
+    if strategy in INCOMPLETE:
+        with pytest.raises(UsageError, match=f"'{strategy}' needs {INCOMPLETE[strategy]}"):
+            search(bowl, np.zeros(2), config)
+    elif strategy == "LM_MA_ES":  # sound only for fewer than two candidates a parameter
+        with pytest.raises(UsageError, match="'LM_MA_ES' breaks down: with a population of 8 for 2 parameters"):
+            search(bowl, np.zeros(2), config)
+    else:
+        found = search(bowl, np.zeros(2), config)
+        assert np.isfinite(found.z).all()
+        assert found.evaluations == 80
+        start = float(bowl(np.zeros((1, 2)))[0])
+        assert found.loss < (start if strategy in STANDARD else start + 1e-3)
+        assert found.loss == pytest.approx(float(bowl(found.z[None])[0]), rel=1e-4)
+
+
+def test_a_strategy_works_where_its_population_suits_it():
+    found = search(
+        lambda c, around, pick: jnp.sum((c - 0.5) ** 2, axis=1),
+        np.zeros(8),
+        FitConfig(strategy="LM_MA_ES", population=8, generations=40),
+    )
+    assert found.loss < 1.0
+
+
+def test_unknown_strategies_and_populations_that_one_refuses():
+    with pytest.raises(UsageError, match=r"unknown strategy 'CMAES'\. Available: .*CMA_ES"):
+        search(bowl, np.zeros(2), replace(CONFIG, strategy="CMAES"))
+    with pytest.raises(UsageError, match="'Open_ES' refuses a population of 7"):
+        search(bowl, np.zeros(2), replace(CONFIG, strategy="Open_ES", population=7))
+
+
+def funnels(candidates, around, pick):
+    """Two funnels, the deeper one on the left; what is far from the middle of its generation is judged too badly."""
+    del pick
+    right = 1.0 + jnp.sum((candidates - jnp.array([2.0, 0.5])) ** 2, axis=1)
+    left = jnp.sum((candidates - jnp.array([-1.5, -0.5])) ** 2, axis=1)
+    far = jnp.maximum(jnp.sum((candidates - around) ** 2, axis=1) - 4.0, 0.0)
+    return jnp.minimum(right, left) + far
+
+
+def test_restarts_find_the_deeper_funnel():
+    populations = []
+
+    def losses(candidates, around, pick):
+        populations.append(candidates.shape[0])
+        return funnels(candidates, around, pick)
+
+    start, config = np.array([2.5, 1.0]), FitConfig(population=8, generations=40, std=0.3, seed=2)
+    several = search(losses, start, replace(config, restarts=4))
+    assert several.loss < 1e-3
+    np.testing.assert_allclose(several.z, [-1.5, -0.5], atol=0.03)
+    assert several.finalists.shape == (5, 2)
+    found = [float(funnels(z[None], z, None)[0]) for z in several.finalists]
+    assert found == sorted(found)
+    assert found[-1] == pytest.approx(1.0, abs=1e-2)
+    # The large runs double; small ones keep the first population: a program each.
+    assert sorted({n for n in populations if n > 1}) == [8, 16, 32]
+    one = search(funnels, start, config)
+    assert one.loss == pytest.approx(1.0, abs=1e-3)
+    assert several.evaluations > one.evaluations
+
+
+def test_a_generation_sees_one_batch_and_the_end_sees_all():
+    segments, offsets = np.array([1, 3, 4, 6, 7, 9]), 1000.0 * np.arange(10.0)
+    picks = []
+
+    def losses(candidates, around, pick):
+        pick = jnp.asarray(segments) if pick is None else pick
+        jax.debug.callback(lambda p: picks.append(np.asarray(p)), pick)
+        return bowl(candidates) + jnp.asarray(offsets)[pick].mean()
+
+    config = FitConfig(population=16, generations=40, std=1.0, batch=2, seed=3)
+    found = search(losses, np.zeros(2), config, segments)
+    jax.effects_barrier()
+    # A batch's offset is far larger than what candidates differ by: were batches mixed, luck would decide.
+    np.testing.assert_allclose(found.z, BOTTOM, atol=0.05)
+    assert found.loss == pytest.approx(offsets[segments].mean() + float(bowl(found.z[None])[0]), rel=1e-5)
+    batches = [p for p in picks if len(p) == 2]
+    assert len([p for p in picks if len(p) == 6]) == 1
+    assert len(batches) >= 40
+    assert all(len(set(p.tolist())) == 2 and set(p.tolist()) <= set(segments.tolist()) for p in batches)
+    assert len({tuple(sorted(p.tolist())) for p in batches}) > 5
+    assert len(found.history) == 40
+
+
+def test_a_batch_of_all_segments_is_none():
+    picked = []
+
+    def losses(candidates, around, pick):
+        picked.append(pick)
+        return bowl(candidates)
+
+    search(losses, np.zeros(2), FitConfig(strategy="SNES", population=8, generations=2, batch=3), np.arange(3))
+    assert set(picked) == {None}

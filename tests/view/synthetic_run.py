@@ -82,8 +82,18 @@ def parameters(truth: bool = True) -> dict[str, Any]:
 
     names = [EVIL, "friction", "sensor_delay"]
     return {
+        "format": 2,
         "pipeline": "pendulum",
         "log": {"path": "session.mcap", "sha256": "0" * 64},
+        "logs": [{"path": "/data/session.mcap", "sha256": "0" * 64}],
+        "verdict": {"status": "hit a bound", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
+        "check": {
+            "condition": 123.4,
+            "undetermined": [["sensor_delay", EVIL]],
+            "messages": [f"only sensor_delay + {EVIL} is determined: fix one"],
+            "standard_error_per_minute": {"friction": 0.004, "sensor_delay": 0.0002},
+        },
+        "misfit": 1.25,
         "parameters": [
             entry(EVIL, "rad/s^2/V", "dynamics", 21.0784, 0.0231, 26.96, 21.10),
             entry("friction", "rad/s^2", "dynamics", 8.507, None, 6.097, 8.482),
@@ -91,17 +101,40 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446),
         ],
         "correlation": {"names": names, "matrix": (np.eye(3) * 0.5 + 0.5).tolist()},
-        "search": {"history": [9.0, 4.0, 1.5, None, 1.0], "evaluations": 1920, "seconds": 12.3},
+        "search": {
+            "history": [9.0, 4.0, 1.5, None, 1.0], "evaluations": 1920, "seconds": 12.3,
+            "refined": [{"before": 1.0, "after": 0.9, "steps": 7}],
+        },
         "prediction": [
             {"model": m, "horizon_s": h, "held_out": o, "th_rmse": e * (1 + h), "thdot_rmse": 5 * e}
-            for m, e in (("identified", 0.0117), ("nominal", 0.29), ("hold", 0.8))
+            for m, e in (("identified", 0.0117), ("no delay", 0.1), ("nominal", 0.29), ("hold", 0.8))
             for h in (0.1, 0.5, 1.0)
             for o in (False, True)
         ],
+        "free_run": [
+            {
+                "model": m, "recording": 0, "begin_s": 3.3, "seconds": 1.7, "held_out": True, "field": f,
+                "rmse": e, "mae": 0.8 * e,
+            }
+            for m, e in (("identified", 0.0123), ("no delay", 0.15), ("hold", 0.9))
+            for f in ("th", "thdot")
+        ],
+        "aggregate": [],
         "segments": 6,
         "held_out_from_s": 3.0,
         "units": UNITS,
-    }
+    }  # fmt: skip
+
+
+def aggregate() -> list[dict[str, Any]]:
+    """Return two quantities over three recordings; the delays disagree."""
+    rows = []
+    for name, unit, scale, agree in (("friction", "rad/s^2", 8.5, True), ("round_trip_delay", "s", 0.045, False)):
+        ends = {"mean": scale, "standard_error": 0.01 * scale, "between": 0.02 * scale, "agree": agree}
+        ends |= {"low95": 0.8 * scale, "high95": 1.2 * scale}
+        each = {"estimates": [0.98 * scale, scale, 1.02 * scale], "standard_errors": [0.01 * scale] * 3}
+        rows.append({"name": name, "unit": unit, **each, **ends})
+    return rows
 
 
 def predictions() -> dict[str, np.ndarray]:
@@ -109,10 +142,36 @@ def predictions() -> dict[str, np.ndarray]:
     starts = [0.0, 1.0, 2.0, 3.0, 3.5, 4.1]
     t = np.concatenate([s + np.arange(0, 1.0, 0.02) for s in starts])
     segment = np.repeat(np.arange(len(starts)), 50)
-    values = {"t": t, "segment": segment, "held_out": segment >= 3}
+    values = {
+        "t": t, "segment": segment, "held_out": segment >= 3, "recording": np.zeros(t.shape, int),
+        "into": t - np.array(starts)[segment],
+    }  # fmt: skip
     for field, true in (("th", np.sin(t)), ("thdot", np.cos(t))):
         values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_nominal": 1.3 * true}
+        values[f"{field}_no delay"] = 1.1 * true
     return values
+
+
+def free_runs() -> dict[str, np.ndarray]:
+    """One free run over all that is held out."""
+    into = np.arange(0, 2.0, 0.02)
+    t = 3.0 + into
+    values = {
+        "t": t, "into": into, "segment": np.zeros(t.shape, int), "recording": np.zeros(t.shape, int),
+        "held_out": np.ones(t.shape, bool),
+    }  # fmt: skip
+    for field, true in (("th", np.sin(t)), ("thdot", np.cos(t))):
+        values |= {f"{field}_measured": true, f"{field}_identified": true + 0.01, f"{field}_no delay": 30 * true}
+    return values
+
+
+def three_recordings() -> dict[str, np.ndarray]:
+    """The predictions of three recordings, all of the same times."""
+    one = predictions()
+    several = {name: np.concatenate([values] * 3) for name, values in one.items()}
+    several["recording"] = np.repeat(np.arange(3), len(one["t"]))
+    several["segment"] = several["segment"] + 6 * several["recording"]
+    return several
 
 
 def history(seeds: int = 3) -> dict[str, Any]:
@@ -152,6 +211,7 @@ def write_stage(run: Path, stage: str, folder: str | None = None, status: str = 
     elif stage == "identify":
         (path / "parameters.json").write_text(json.dumps(parameters()))
         np.savez(path / "predictions.npz", **predictions())
+        np.savez(path / "free_runs.npz", **free_runs())
     elif stage == "train":
         (path / "history.json").write_text(json.dumps(history()))
     else:

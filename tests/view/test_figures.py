@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 import synthetic_run
 
-from sim2real.view import figures, intervals, timing
-from sim2real.view.artifacts import read_deployment, read_identification, read_training
+from sim2real.view import figures, identify_figures, intervals, residuals, timing
+from sim2real.view.artifacts import read_deployment, read_training
+from sim2real.view.identification import Quantity, read_identification
 from sim2real.view.run import finished
 from sim2real.view.signals import read_recording
 
 SVG = "{http://www.w3.org/2000/svg}"
+QUANTITIES = [
+    Quantity(**{**row, **{n: np.array(row[n]) for n in ("estimates", "standard_errors")}})
+    for row in synthetic_run.aggregate()
+]
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +44,13 @@ def drawn(artifacts, found, log):
     return {
         "record": figures.recording(log, "record"),
         "intervals": intervals.intervals(found.estimates, "intervals"),
-        "predictions": figures.predictions(found, "predictions"),
-        "errors": figures.prediction_errors(found, "errors"),
-        "search": figures.search(found, "search"),
-        "correlation": figures.correlation(*found.correlation, "correlation"),
+        "predictions": identify_figures.predictions(found, "predictions"),
+        "errors": identify_figures.prediction_errors(found, "errors"),
+        "free": identify_figures.free_runs(found, "free"),
+        "residuals": residuals.figure(found, "residuals"),
+        "search": identify_figures.search(found, "search"),
+        "correlation": identify_figures.correlation(*found.correlation, "correlation"),
+        "aggregate": intervals.aggregate(QUANTITIES, "aggregate"),
         "training": figures.training(training, "training"),
         "best": figures.training(replace(training, best_seed=1), "best"),
         "deployment": figures.deployment(read_deployment(artifacts["deploy"]), 1, "deployment"),
@@ -124,6 +132,59 @@ def test_overlapping_segments_are_drawn_once(found):
     t_s = found.samples["t"][found.disjoint()]
     assert np.all(np.diff(t_s) > 0)
     assert set(found.samples["segment"][found.disjoint()]) == {0, 1, 2, 3, 5}
+
+
+def test_recordings_do_not_hide_each_other(found):
+    several = replace(found, samples=synthetic_run.three_recordings(), logs=("a.mcap", "b.mcap", "c.mcap"))
+    assert several.disjoint().sum() == 3 * found.disjoint().sum()
+    labels = texts(identify_figures.predictions(several, "several"))
+    assert [labels.count(f"{n}.mcap") for n in "abc"] == [2, 2, 2]
+    assert "time, log after log [s]" in texts(residuals.figure(several, "several"))
+    assert np.all(np.diff(residuals.residuals(several, "th").t_s) > 0)
+
+
+def test_more_fields_than_panels_leave_the_last_ones_out(found):
+    many = dict(found.samples)
+    for i in range(8):
+        many |= {f"q[{i}]_measured": found.samples["t"], f"q[{i}]_identified": found.samples["t"]}
+    assert len(identify_figures.shown(replace(found, samples=many), [0])) == 6
+
+
+def test_a_free_run_says_its_errors_and_is_not_squeezed_by_one_that_runs_away(drawn):
+    assert any("identified RMSE 0.0123, MAE 0.00984 · no delay" in t for t in texts(drawn["free"]))
+    assert "20" not in texts(drawn["free"])
+
+
+def test_residuals_are_white_or_not():
+    rng = np.random.default_rng(0)
+    segment = np.repeat(np.arange(20), 60)
+    white = residuals.autocorrelation(rng.normal(size=1200), segment)
+    assert white[0] == pytest.approx(1.0)
+    assert np.abs(white[1:20]).max() < 0.15
+    slow = residuals.autocorrelation(np.sin(np.arange(1200) / 15), segment)
+    assert slow[5] > 0.8
+    np.testing.assert_array_equal(residuals.autocorrelation(np.zeros(10), np.zeros(10)), [1.0])
+
+
+def test_only_what_lies_behind_the_fitted_start_counts_as_residual(found):
+    rest = residuals.residuals(replace(found, settle_s=0.5), "th")
+    assert len(rest.every) == 3 * 24
+    np.testing.assert_allclose(rest.every, -0.01, atol=1e-9)
+
+
+def test_the_assumed_deviation_is_drawn_where_it_is_known(found):
+    told = texts(residuals.figure(replace(found, sigma={"th": 0.002}), "told"))
+    assert "assumed of the measurement" in told
+    assert any("5 times the assumed" in t for t in told)
+
+
+def test_a_parameter_that_may_be_zero_is_drawn_between_its_bounds(found):
+    zero = replace(found.estimates[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
+    assert "place between the bounds [%]" in texts(intervals.intervals([zero, *found.estimates], "zero"))
+
+
+def test_recordings_that_disagree_are_named(drawn):
+    assert {"friction", "round_trip_delay: disagree", "ms"} <= set(texts(drawn["aggregate"]))
 
 
 def test_a_sample_is_shown_when_it_was_taken_and_a_command_when_it_was_sent(log):

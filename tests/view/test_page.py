@@ -69,6 +69,57 @@ def test_the_numbers_are_there(page):
     assert {"gate.limit", "2", "ab" * 32} <= words, "configuration and hashes"
 
 
+def test_the_verdict_stands_above_everything_in_words_and_colour(page):
+    banner = next(attrs for _, attrs in page.elements if "banner" in (attrs.get("class") or ""))
+    assert banner["class"] == "banner doubt"
+    words = page.words
+    title = next(w for w in words if w.startswith("Hit a bound"))
+    assert words.index(title) < words.index("Parameters")
+    assert {"At a bound: friction.", "sensor_delay is <b>loose</b>."} <= set(words)
+
+
+@pytest.mark.parametrize(
+    ("status", "tone"),
+    [("accepted", "good"), ("not identifiable", "doubt"), ("no improvement on held-out data", "bad")],
+)
+def test_each_verdict_has_a_tone(only, status, tone):
+    run = only("identify")
+    data = {**synthetic_run.parameters(), "verdict": {"status": status, "reasons": []}}
+    (run / "identify" / "parameters.json").write_text(json.dumps(data))
+    found = Page(identify_page(run / "identify").read_text(encoding="utf-8"))
+    assert f"banner {tone}" in found.values("class")
+    assert any(w.lower().startswith(status) for w in found.words)
+
+
+def test_what_the_data_determines_is_told(page):
+    assert f"Only sensor_delay + {synthetic_run.EVIL} is determined: fix one." in page.words
+    assert "Standard error from one minute of such data" in page.words
+    assert {"1.2 times", "0.20"} <= set(page.words)
+
+
+def test_what_lies_at_a_bound_is_named(only):
+    run = only("identify")
+    data = synthetic_run.parameters()
+    data["parameters"][2] |= {"verdict": "at a bound", "estimate": 0.0599}
+    (run / "identify" / "parameters.json").write_text(json.dumps(data))
+    text = identify_page(run / "identify").read_text(encoding="utf-8")
+    assert "At a bound: sensor_delay (the upper, 60.00 ms)." in text
+
+
+def test_free_runs_and_recordings_have_blocks_only_where_there_are_any(run):
+    names = ("identify-free", "identify-aggregate")
+    text = identify_page(run / "identify").read_text(encoding="utf-8")
+    assert [f'id="{n}-' in text for n in names] == [True, False]
+    (run / "identify" / "free_runs.npz").unlink()
+    data = {**synthetic_run.parameters(), "aggregate": synthetic_run.aggregate()}
+    (run / "identify" / "parameters.json").write_text(json.dumps(data))
+    np.savez(run / "identify" / "predictions.npz", **synthetic_run.three_recordings())
+    page = identify_page(run / "identify").read_text(encoding="utf-8")
+    assert [f'id="{n}-' in page for n in names] == [False, True]
+    assert "Over 3 recordings" in page
+    assert "they differ in round_trip_delay." in page
+
+
 def test_every_stage_has_a_section_and_an_entry_in_the_contents(page):
     sections = [attrs["id"] for tag, attrs in page.elements if tag == "section"]
     assert sections == ["record", "identify", "train", "deploy"]
@@ -154,7 +205,8 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
     data = synthetic_run.parameters(truth=False)
-    del data["correlation"], data["search"]
+    for name in ("correlation", "search", "verdict", "check", "misfit", "aggregate", "free_run", "logs"):
+        del data[name]
     (run / "identify" / "parameters.json").write_text(json.dumps(data))
     words = Page(report(run).read_text(encoding="utf-8")).words
     assert "one seed" in words
@@ -171,6 +223,7 @@ MALFORMED = {
         b'{"steps":[1],"return":[[1],[2,3]],"success":[[1]],"seconds":[1]}',
         "malformed",
     ),
+    "no free run": ("identify", "free_runs.npz", b"PK", "free_runs.npz is malformed"),
     "no archive": ("identify", "predictions.npz", b"PK", "predictions.npz is malformed"),
     "no episodes": ("deploy", "result.json", b'{"episodes":[],"gap":[]}', "no episode"),
     "missing": ("deploy", "simulation.npz", None, "has no 'simulation'"),

@@ -174,3 +174,14 @@ def test_the_viewer_draws_it(saved, tmp_path):
 
     pixels = imread(picture)[..., :3]
     assert len(np.unique((pixels * 16).astype(int).reshape(-1, 3), axis=0)) > 20, "more than an empty window"
+
+
+def test_each_recording_of_an_identification_has_a_tab_of_its_own(only):
+    run = only("identify")
+    np.savez(run / "identify" / "predictions.npz", **synthetic_run.three_recordings())
+    tabs = tabs_of(finished(run))
+    assert [tab.title for tab in tabs] == ["Identify 0", "Identify 1", "Identify 2"]
+    assert len({curve.entity for tab in tabs for plot in tab.plots.values() for curve in plot}) == 3 * 2 * 3
+    for tab in tabs:
+        t_s = tab.plots["th [rad]"][0].t_s
+        assert np.all(np.diff(t_s) >= 0)

@@ -1,0 +1,139 @@
+"""The disk as a graph: voltage in, angle out. Angle 0 hangs down, as in the recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from flax import struct
+
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.worlds import friction
+from sim2real.worlds.encoder import Encoder
+from sim2real.worlds.friction import FrictionParams
+from sim2real.worlds.joint import Forces, JointState, JointWorld
+
+
+@struct.dataclass
+class Command(Base):
+    """Voltage, shape ``(1,)`` [V]."""
+
+    action: Any
+
+
+@struct.dataclass
+class Measurement(Base):
+    """Angle by the encoder [rad]."""
+
+    th: Any
+
+
+@struct.dataclass
+class DiskParams(Base):
+    """A DC motor that turns an eccentric mass, per unit of inertia.
+
+    Attributes:
+        gain: Acceleration per volt [rad/s^2/V].
+        gravity: m g l / J [rad/s^2].
+        friction: Viscous friction holds the back-EMF; ``load`` is the share of the radial load of gravity.
+        swing: What the centrifugal force adds to that load, over (rad/s)^2 [1].
+        voltage_offset: What the amplifier adds to every command [V].
+        cogging: Torque of the motor's magnets that comes twice a turn, at angle 0 [rad/s^2].
+        start: Initial angle and velocity, shape ``(2,)`` [rad, rad/s].
+    """
+
+    gain: Any
+    gravity: Any
+    friction: FrictionParams
+    swing: Any
+    voltage_offset: Any
+    cogging: Any
+    start: Any
+
+
+class DiskWorld(JointWorld):
+    """The disk, driven by the ``actuator`` input."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DiskParams:
+        """Return the parameters that the rig's simulator was published with."""
+        del rng, graph_state
+        return DiskParams(
+            gain=28.0,
+            gravity=134.0,
+            friction=FrictionParams(viscous=1.5, load=0.047),
+            swing=0.0,
+            voltage_offset=0.0,
+            cogging=0.0,
+            start=jnp.zeros(2),
+        )
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return the initial angle and velocity that the parameters name."""
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        return JointState(params.start[0], params.start[1])
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return the initial state."""
+        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the delay of the command, where the actuator's parameters set one."""
+        del rng
+        delay = getattr((graph_state or GraphState()).params.get("actuator"), "delay", None)
+        return {} if delay is None else {"actuator": delay}
+
+    def command(self, step_state: StepState) -> Any:
+        """Return the voltage during this tick [V]."""
+        return step_state.inputs["actuator"][-1].data.action[0]
+
+    def forces(self, params: DiskParams, position: Any, velocity: Any, command: Any) -> Forces:
+        """Return motor, gravity and friction."""
+        p = params
+        radial = p.gravity * jnp.cos(position) + p.swing * velocity**2
+        return Forces(
+            acceleration=p.gain * (command + p.voltage_offset)
+            - p.gravity * jnp.sin(position)
+            + p.cogging * jnp.cos(2.0 * position),
+            damping=friction.damping(p.friction, velocity),
+            dry=friction.dry(p.friction, velocity, radial),
+        )
+
+
+@struct.dataclass
+class ActuatorParams(Base):
+    """Delay from a command's time stamp to the motor, and back to the measurement's [s]."""
+
+    delay: Any = None
+
+
+class Actuator(BaseNode):
+    """What sent the recorded voltages; it is not run."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ActuatorParams:
+        """Return no delay of its own."""
+        del rng, graph_state
+        return ActuatorParams()
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
+        """Return zero voltage."""
+        del rng, graph_state
+        return Command(action=jnp.zeros(1))
+
+
+class Sensor(BaseNode):
+    """The encoder."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Encoder:
+        """Return an encoder that is mounted well."""
+        del rng, graph_state
+        return Encoder(0.0, 0.0)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+        """Return an angle."""
+        del rng, graph_state
+        return Measurement(th=jnp.float32(0.0))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
+        """Read."""
+        return step_state, Measurement(th=step_state.params.read(step_state.inputs["world"][-1].data.position))

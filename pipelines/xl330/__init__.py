@@ -1,0 +1,24 @@
+"""A recorded DYNAMIXEL XL330 that lifts a mass on an arm: identify motor, gears and friction from its motions."""
+
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.pipeline import Pipeline
+
+PIPELINE = Pipeline(
+    name="xl330",
+    summary="recorded DYNAMIXEL XL330 lifting a mass: identify motor, gears and friction",
+    package=__name__,
+    # The loss has kinks wherever the arm sticks or breaks loose: a search without derivatives, on short windows.
+    identify=IdentifyConfig(
+        initial_state="measured",
+        settle_s=0.0,
+        horizon_s=0.6,
+        spacing_s=0.3,
+        population=16,
+        generations=90,
+        refine=0,
+        jacobian="finite",
+        max_delay_s=0.01,
+        reach=1.0,
+        free_run_s=10.0,
+    ),
+)

@@ -1,0 +1,151 @@
+"""The servo and its arm as a graph: goals in, angles out. Angle 0 hangs down.
+
+The firmware is known: the PWM that it reports follows ``kp / 256`` times the error in counts within one step.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from flax import struct
+
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.worlds.joint import Forces, JointState, JointWorld
+from sim2real.worlds.servo import motor_torque, position_duty
+
+MASS_KG, LENGTH_M, GRAVITY = 0.49, 0.10, 9.81
+COUNTS_PER_RAD, FULL_PWM, KP_UNIT = 4096 / (2 * jnp.pi), 885.0, 256.0
+_OPEN = 0.05
+"""Share of the back-EMF's brake that is left when torque is off: the winding is nearly open."""
+
+
+@struct.dataclass
+class Command(Base):
+    """What the servo is told.
+
+    Attributes:
+        goal: [rad].
+        kp: Its position gain, in its own unit.
+        enabled: 1 with torque on, 0 with torque off.
+    """
+
+    goal: Any
+    kp: Any
+    enabled: Any
+
+
+@struct.dataclass
+class Measurement(Base):
+    """Angle by the encoder [rad]."""
+
+    position: Any
+
+
+@struct.dataclass
+class ServoParams(Base):
+    """Motor, gears and load.
+
+    Attributes:
+        stall: Torque at full duty and standstill, before it saturates [N m].
+        back_emf: What a speed takes off [N m s/rad].
+        softness: How early the torque saturates [1/(N m)].
+        armature: Inertia of the motor behind the gears [kg m^2].
+        viscous: [N m s/rad].
+        coulomb: [N m].
+        gears: Share of the load on the gears, the motor's torque and the weight's, that rubs while they turn [1].
+        static: What that grows by at rest [1].
+        stribeck_rad_s: Speed at which 1/e of that is left [rad/s].
+        released: Share of the gears' friction that is left when torque is off [1].
+        offset: Angle of the arm when the encoder reads 0 [rad].
+        start: Initial angle and velocity, shape ``(2,)`` [rad, rad/s].
+    """
+
+    stall: Any = 1.0
+    back_emf: Any = 0.05
+    softness: Any = 0.8
+    armature: Any = 0.0015
+    viscous: Any = 0.002
+    coulomb: Any = 0.01
+    gears: Any = 0.15
+    static: Any = 0.05
+    stribeck_rad_s: Any = 0.1
+    released: Any = 0.5
+    offset: Any = 0.0
+    start: Any = struct.field(default_factory=lambda: jnp.zeros(2))
+
+
+class ServoWorld(JointWorld):
+    """The servo with its arm, driven by the ``actuator`` input."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ServoParams:
+        """Return rough values of an XL330."""
+        del rng, graph_state
+        return ServoParams()
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return the initial angle and velocity that the parameters name."""
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        return JointState(params.start[0], params.start[1])
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return the initial state."""
+        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the delay of the goals, where the actuator's parameters set one."""
+        del rng
+        delay = getattr((graph_state or GraphState()).params.get("actuator"), "delay", None)
+        return {} if delay is None else {"actuator": delay}
+
+    def command(self, step_state: StepState) -> Command:
+        """Return what the servo is told during this tick."""
+        return step_state.inputs["actuator"][-1].data
+
+    def forces(self, params: ServoParams, position: Any, velocity: Any, command: Command) -> Forces:
+        """Return motor, weight and friction."""
+        p = params
+        on = command.enabled > 0.5
+        duty = position_duty(command.goal, position, command.kp / KP_UNIT, COUNTS_PER_RAD, FULL_PWM)
+        motor = jnp.where(on, motor_torque(duty, velocity, p.stall, p.back_emf, p.softness), 0.0)
+        weight = -MASS_KG * GRAVITY * LENGTH_M * jnp.sin(position + p.offset)
+        share = p.gears + p.static * jnp.exp(-jnp.abs(velocity) / p.stribeck_rad_s)
+        rubbing = p.coulomb + jnp.where(on, 1.0, p.released) * share * (jnp.abs(motor) + jnp.abs(weight))
+        inertia = MASS_KG * LENGTH_M**2 + p.armature
+        brake = p.viscous + jnp.where(on, 0.0, _OPEN * p.back_emf)
+        return Forces(acceleration=(motor + weight) / inertia, damping=brake / inertia, dry=rubbing / inertia)
+
+
+@struct.dataclass
+class ActuatorParams(Base):
+    """Delay from a goal's time stamp to the motor, and back to the measurement's [s]."""
+
+    delay: Any = None
+
+
+class Actuator(BaseNode):
+    """What sent the recorded goals; it is not run."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ActuatorParams:
+        """Return no delay of its own."""
+        del rng, graph_state
+        return ActuatorParams()
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
+        """Return torque off."""
+        del rng, graph_state
+        return Command(goal=jnp.float32(0.0), kp=jnp.float32(0.0), enabled=jnp.float32(0.0))
+
+
+class Sensor(BaseNode):
+    """The encoder."""
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+        """Return an angle."""
+        del rng, graph_state
+        return Measurement(position=jnp.float32(0.0))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
+        """Read."""
+        return step_state, Measurement(position=step_state.inputs["world"][-1].data.position)

@@ -1,0 +1,83 @@
+"""The real recordings that identification is judged on, read from a folder and selected by a text."""
+
+from __future__ import annotations
+
+import json
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.graph.episode import Episode
+from sim2real.log.importer import import_file
+from sim2real.log.mapping import load_mapping
+from sim2real.stages.pipeline import load_pipeline
+
+FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101": "so101"}
+SPECS = {
+    "disk": ":25000", "disk_test": "25000:30000",
+    "xl330": "kp=100,800", "xl330_test": "kp=200",
+    "so101": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
+    "so101_test": "step_response single_joint_*[0.5:1]",
+}  # fmt: skip
+PAST = 20
+"""Samples of the disk before a test part that its initial state may be estimated from."""
+
+
+def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
+    """Return the recordings of a case that a text selects, by name.
+
+    Args:
+        case: ``disk``, ``xl330`` or ``so101``.
+        data: Folder with the case's files, or with its folder.
+        spec: disk: ``[FILE@]A:B``, samples. xl330: ``kp=100,800 motion=sin_sin,up_and_down``, or ``all``. so101: names
+            of motions, with ``*``, and with ``[a:b]`` for a part, in shares of its length.
+        past: Further samples of the disk before ``A``.
+    """
+    folder = data / FOLDERS[case] if (data / FOLDERS[case]).is_dir() else data
+    found = {"disk": _disk, "xl330": _xl330, "so101": _so101}[case](folder, spec, past)
+    if not found:
+        raise SystemExit(f"{spec!r} selects nothing in {folder}")
+    return found
+
+
+def _mapping(case: str) -> Path:
+    return Path(str(load_pipeline(case).load("__init__").__file__)).with_name("import.toml")
+
+
+def _disk(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+    name, _, part = spec.rpartition("@")
+    files = sorted(folder.glob("*.npz"))
+    file = folder / name if name else files[0]
+    first, last = (int(x) if x else None for x in part.split(":"))
+    begin = max(0, (first or 0) - past)
+    return {spec: import_file(file, load_mapping(_mapping("disk")), slice(begin, last))}
+
+
+def _xl330(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+    del past
+    wanted = dict(part.split("=") for part in spec.split() if part != "all")
+    found = {}
+    for file in sorted(folder.glob("*.json")):
+        about = json.loads(file.read_text())
+        own = {"kp": str(about["kp"]), "motion": about["trajectory"], "file": file.stem}
+        if all(own[key] in values.split(",") for key, values in wanted.items()):
+            found[f"kp {own['kp']} {own['motion']} {file.stem}"] = import_file(file, load_mapping(_mapping("xl330")))
+    return found
+
+
+def _so101(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+    del past
+    found = {}
+    for part in spec.split():
+        pattern, _, share = part.partition("[")
+        a, b = (float(x) for x in share.rstrip("]").split(":")) if share else (0.0, 1.0)
+        for file in sorted(folder.glob("*.npz")):
+            if fnmatch(file.stem, pattern):
+                with np.load(file) as content:
+                    count = len(content["t_meas_s"])
+                samples = slice(round(a * count), round(b * count))
+                found[f"{file.stem}[{a:g}:{b:g}]" if share else file.stem] = import_file(
+                    file, load_mapping(_mapping("so101")), samples
+                )
+    return found

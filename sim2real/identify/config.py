@@ -1,0 +1,65 @@
+"""How to identify; every field is a flag of ``sim2real identify``. Imports no JAX, so that ``--help`` stays instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sim2real.errors import UsageError
+
+Loss = Literal["squared", "huber", "cauchy"]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """From segments of recordings to an estimate: search, then refine."""
+
+    max_delay_s: float = 0.06
+    """Upper bound of each identified delay [s]."""
+    initial_state: Literal["free", "measured", "rest"] = "free"
+    """Initial state of a segment: 'free' is estimated around the start and solved for; 'measured' is that estimate as
+    it is; 'rest' is the measured position without velocity."""
+    loss: Loss = "huber"
+    """What a residual costs; 'huber' and 'cauchy' are robust."""
+    reach: float = 5.0
+    """Where a robust loss leaves the square [deviations of the measurement]."""
+    strategy: str = "CMA_ES"
+    """Search algorithm: any name in evosax.algorithms."""
+    population: int = 32
+    """Candidates a generation."""
+    generations: int = 80
+    """Generations of a run at most; 0 leaves the search out and refines from the nominal values."""
+    restarts: int = 0
+    """Further runs of the search: BIPOP, in turn with a doubled population and from a random place."""
+    std: float = 0.7
+    """Spread of the first generation; 1 covers about half of what the bounds admit."""
+    batch: int = 0
+    """Segments that a generation sees, the same for all its candidates; 0 means all."""
+    refine: int = 3
+    """From how many of the search's best Levenberg-Marquardt refines; 0 leaves it out."""
+    refine_steps: int = 25
+    """Steps of Levenberg-Marquardt at most, each of up to three times that it is linearised anew."""
+    long_s: float = 0.0
+    """Length of the segments on which a last refinement is made [s]; 0 leaves it out."""
+    jacobian: Literal["auto", "forward", "finite"] = "auto"
+    """Derivatives: forward through the graph, or finite differences; 'auto' takes those where a node has none."""
+    seed: int = 0
+    """Seed of the search."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before a log is read."""
+        if not 0.0 < self.max_delay_s <= 1.0:
+            raise UsageError(f"max_delay_s must lie in (0, 1] s, got {self.max_delay_s}")
+        if self.population < 4 or self.generations < 0 or self.restarts < 0:
+            raise UsageError(
+                "the search needs a population of 4 at least, and no negative numbers of generations and restarts, got "
+                f"{self.population}, {self.generations} and {self.restarts}"
+            )
+        if self.generations == 0 and self.refine == 0:
+            raise UsageError("generations and refine are both 0: nothing would be identified")
+        if not (self.reach > 0.0 and self.std > 0.0):
+            raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
+        if min(self.batch, self.refine, self.refine_steps, self.long_s) < 0:
+            raise UsageError("batch, refine, refine_steps and long_s must not be negative")
+        if not 0 <= self.seed < 2**31:
+            raise UsageError(f"seed must lie in [0, 2**31), got {self.seed}")

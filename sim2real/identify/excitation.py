@@ -1,0 +1,158 @@
+"""How much a recording shows of a robot: what ranges it covers, how long it moves, and which frequencies drive it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BINS = 10
+_GAP = 2.5
+"""A pause longer than this many periods is a gap."""
+_THIN = 0.1
+"""A bin with less than this share of what an even spread would give it counts as empty."""
+_STILL = 0.05
+"""Slower than this share of the highest speed, or than three deviations of its measurement, is standing still."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """When something was sampled.
+
+    Attributes:
+        samples: How many samples there are.
+        duration_s: From the first to the last [s].
+        rate_hz: Their usual rate [Hz].
+        gaps: How many pauses are longer than two and a half periods.
+        longest_gap_s: The longest of them; 0 without any [s].
+    """
+
+    samples: int
+    duration_s: float
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Which values a signal takes.
+
+    Attributes:
+        low: Its smallest value.
+        high: Its largest value.
+        shares: Shape ``(10,)``: share of the samples in each tenth of what lies between.
+    """
+
+    low: float
+    high: float
+    shares: tuple[float, ...]
+
+    @property
+    def covered(self) -> float:
+        """Share of the tenths that are worth mentioning: with at least 1 % of the samples."""
+        return sum(s >= _THIN / BINS for s in self.shares) / len(self.shares)
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is more than one value."""
+        return self.high > self.low
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a joint moves.
+
+    Attributes:
+        moving: Share of the time in which it does.
+        forward: Share of that in which it moves upwards.
+        reversals: How often it turns around.
+    """
+
+    moving: float
+    forward: float
+    reversals: int
+
+
+@dataclass(frozen=True)
+class Band:
+    """Where a signal's power lies: 95 % of it between ``low_hz`` and ``high_hz``, half each beyond."""
+
+    low_hz: float
+    high_hz: float
+
+
+def sampling(t_s: np.ndarray) -> Sampling:
+    """Return how regularly times ``(N,)`` [s] follow each other."""
+    steps = np.diff(np.asarray(t_s, np.float64))
+    if not steps.size:
+        return Sampling(len(t_s), 0.0, 0.0, 0, 0.0)
+    period = float(np.median(steps))
+    gaps = steps[steps > _GAP * period]
+    rate_hz = 1.0 / period if period > 0 else 0.0
+    return Sampling(len(t_s), float(t_s[-1] - t_s[0]), rate_hz, int(gaps.size), float(gaps.max(initial=0.0)))
+
+
+def spread(values: np.ndarray) -> Spread:
+    """Return how values ``(N,)`` spread over their own range."""
+    values = np.asarray(values, np.float64)
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return Spread(low, high, (1.0, *([0.0] * (BINS - 1))))
+    counts, _ = np.histogram(values, BINS, (low, high))
+    return Spread(low, high, tuple((counts / values.size).tolist()))
+
+
+def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the rate of a sampled position ``(N,)``, by differences; zero where there are too few samples."""
+    if len(position) < 3:
+        return np.zeros(len(position))
+    times = np.asarray(t_s, np.float64)
+    steps = np.maximum(np.diff(times), 1e-9)  # equal stamps must not make it infinite
+    return np.gradient(np.asarray(position, np.float64), times[0] + np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
+    """Return how a joint moves.
+
+    Args:
+        velocity: Shape ``(N,)``.
+        sigma: Deviation of a measured velocity.
+    """
+    velocity = np.asarray(velocity, np.float64)
+    # A rare spike must not make everything else count as standing still.
+    still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * sigma)
+    fast = np.abs(velocity) > still
+    if not fast.any():
+        return Motion(0.0, 0.0, 0)
+    signs = np.sign(velocity[fast])
+    return Motion(float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum()))
+
+
+def band(t_s: np.ndarray, values: np.ndarray, share: float = 0.95) -> Band | None:
+    """Return the band that holds a share of the power of a signal held between its samples, without its mean.
+
+    Args:
+        t_s: Shape ``(N,)``: when each value begins to hold [s].
+        values: Shape ``(N,)``.
+        share: Share of the power inside; the rest lies in equal parts below and above.
+
+    Returns:
+        The band; None for a signal that does not change.
+    """
+    t_s, values = np.asarray(t_s, np.float64), np.asarray(values, np.float64)
+    if len(values) < 8 or np.ptp(values) == 0.0 or t_s[-1] <= t_s[0]:
+        return None
+    period = float(np.median(np.diff(t_s)))
+    if period <= 0.0:
+        return None
+    even = np.arange(t_s[0], t_s[-1] + 0.5 * period, period)
+    held = values[np.clip(np.searchsorted(t_s, even + 1e-9, side="right") - 1, 0, None)]
+    held = (held - held.mean()) * np.hanning(len(held))
+    power = np.abs(np.fft.rfft(held)) ** 2
+    hz = np.fft.rfftfreq(len(held), period)
+    below = np.cumsum(power[1:])
+    if not below.size or below[-1] <= 0.0:
+        return None
+    low, high = np.searchsorted(below / below[-1], [(1 - share) / 2, (1 + share) / 2])
+    return Band(float(hz[1:][low]), float(hz[1:][min(high, len(hz) - 2)]))

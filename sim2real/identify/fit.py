@@ -1,0 +1,132 @@
+"""From recordings to an estimate: search on windows, refine, refine on longer stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.episode import Episode
+from sim2real.identify.config import FitConfig
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem import Problem
+from sim2real.identify.refine import Refined, refine
+from sim2real.identify.search import SearchResult, search
+from sim2real.identify.segments import Span
+from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
+
+_OFF_BOUNDS = 3.0
+"""A search begins within the middle 90 % of what the bounds admit."""
+Told = Callable[[str, float, float], None]
+"""Called with what is done (``search`` or ``refine``), the share of it since the last call, and the best loss."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An estimate.
+
+    Attributes:
+        problem: The residuals that decided last: windows, or longer stretches.
+        z: Shape ``(P,)``: the estimate.
+        loss: Its loss there.
+        search: What the search found; None where it was left out.
+        refined: How each refinement ended, in order.
+    """
+
+    problem: Problem
+    z: np.ndarray
+    loss: float
+    search: SearchResult | None
+    refined: tuple[Refined, ...]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The estimate by name: a number, or a list of one for each recording."""
+        return as_numbers(self.problem.table, self.z)
+
+    def uncertainty(self) -> Uncertainty:
+        """Return what the recordings leave open."""
+        return uncertainty(self.problem, self.z)
+
+
+def as_numbers(table: ParameterTable, z: np.ndarray) -> dict[str, Any]:
+    """Return values by name as Python numbers, lists where each recording has its own."""
+    return {n: np.asarray(v, np.float64).tolist() for n, v in table.decode(jnp.asarray(z, jnp.float32)).items()}
+
+
+def fit(
+    model: IdentifiableModel,
+    recordings: Sequence[Episode],
+    spans: Sequence[Span],
+    length_s: float,
+    config: FitConfig,
+    table: ParameterTable | None = None,
+    long_spans: Sequence[Span] = (),
+    told: Told | None = None,
+    start: Mapping[str, float] | None = None,
+) -> Fit:
+    """Identify a model.
+
+    Args:
+        model: The model.
+        recordings: The logs.
+        spans: Segments to search and refine on.
+        length_s: Their length [s].
+        config: How.
+        table: The parameters; default: the model's.
+        long_spans: Segments of ``config.long_s`` for the last refinement.
+        told: Progress.
+        start: Values to start from; default: nominal ones, delays at a quarter of their bounds.
+    """
+    problem = Problem(model, recordings, spans, length_s, config, table)
+    first = problem.table.start() if start is None else problem.table.encode(start)
+    starts, found = first[None], None
+    if config.generations:
+        found = run_search(problem, starts[0], told)
+        starts = found.finalists
+    refined = []
+    z, loss = starts[0], found.loss if found else float("nan")
+    if config.refine:
+        refined.append(_refine(problem, starts[: config.refine], told))
+        z, loss = refined[-1].z, refined[-1].loss
+    if config.refine and config.long_s and long_spans:
+        problem = Problem(model, recordings, long_spans, config.long_s, config, table)
+        refined.append(_refine(problem, z[None], told))
+        z, loss = refined[-1].z, refined[-1].loss
+    return Fit(problem, centred(problem, z), loss, found, tuple(refined))
+
+
+def refit(problem: Problem, table: ParameterTable, near: np.ndarray, told: Told | None = None) -> np.ndarray:
+    """Return the estimate ``(P,)`` of a table with fewer free parameters, from the values at ``near`` and the start."""
+    other = problem.with_table(table)
+    values = as_numbers(problem.table, near)
+    starts = np.stack([other.table.encode(values), other.table.start()])
+    return _refine(other, starts, told).z
+
+
+def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
+    """Search from a start ``(P,)``, as the problem's configuration says."""
+    total = problem.config.generations * (1 + problem.config.restarts)
+    # At a bound the bijection is flat, and a search that begins there does not get away.
+    start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
+
+    def advance(generations: int, best: float) -> None:
+        if told:
+            told("search", generations / total, best)
+
+    return search(problem.losses, start, problem.config, problem.train, advance, problem.programs)
+
+
+def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
+    rounds = 3
+    total = rounds * len(starts)
+
+    def advance(best: float) -> None:
+        if told:
+            told("refine", 1 / total, best)
+
+    return refine(problem, starts, problem.config.refine_steps, rounds, advance)

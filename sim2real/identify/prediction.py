@@ -1,0 +1,138 @@
+"""How well a model predicts: N steps ahead, and free runs over whole stretches, beside what takes no model at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.identify.problem import Problem
+
+Values = Mapping[str, Any]
+
+
+def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> dict[str, np.ndarray]:
+    """Simulate all segments with each model; what is held out from an initial state that knows only its past.
+
+    Args:
+        problem: The segments.
+        models: Values of all parameters by model.
+        settle_s: The first part of a segment, to which the initial state is fitted where it is held out [s].
+
+    Returns:
+        Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each channel's field
+        what was ``measured`` and what each model says, as ``FIELD_measured``, ``FIELD_MODEL``.
+    """
+    held_out = ~np.isin(np.arange(problem.segments), problem.train)
+    fit_s = jnp.asarray(np.where(held_out, settle_s, problem.segment_s), jnp.float32)
+    predict = jax.jit(lambda v: jax.vmap(lambda e, f: problem.predict(v, e, f))(jnp.arange(problem.segments), fit_s))
+    columns: dict[str, np.ndarray] = {}
+    for name, values in models.items():
+        residuals, ts = (np.asarray(x, np.float64) for x in predict({k: jnp.float32(v) for k, v in values.items()}))
+        at = np.nonzero(ts >= 0)
+        if not columns:
+            segment, into = at[0], ts[at]
+            columns = {
+                "t": problem.begins_s[segment] + into,
+                "segment": segment,
+                "recording": problem.recording[segment],
+                "held_out": held_out[segment],
+                "into": into,
+            }
+            for i, label in enumerate(labels(problem)):
+                columns[f"{label}_measured"] = problem.measured(i)[at]
+        for i, (label, (_, sigma, _)) in enumerate(zip(labels(problem), problem.fields, strict=True)):
+            columns[f"{label}_{name}"] = columns[f"{label}_measured"] + residuals[..., i][at] * sigma
+    return columns
+
+
+def labels(problem: Problem) -> list[str]:
+    """Return a name for each column of the residuals: the field, with the channel's index where it is a vector."""
+    return [f if c.index is None else f"{f}[{c.index}]" for c in problem.channels for f, _ in c.fields]
+
+
+def errors(
+    problem: Problem,
+    columns: Mapping[str, np.ndarray],
+    models: Sequence[str],
+    settle_s: float,
+    horizons: Sequence[float],
+) -> list[dict[str, Any]]:
+    """Return each model's error over each horizon, on fitted and on held-out segments, and that of holding still.
+
+    Returns:
+        Rows with ``model``, ``horizon_s``, ``held_out``, ``rmse`` and ``mae`` of the first channel's position, and
+        ``FIELD_rmse`` of each field; None where there are no samples.
+    """
+    ahead = columns["into"] - settle_s
+    names = labels(problem)
+    rows = []
+    for model in (*models, "hold"):
+        for horizon_s in horizons:
+            for held_out in (False, True):
+                pick = (columns["held_out"] == held_out) & (ahead > 0) & (ahead <= horizon_s)
+                off = {n: (_predicted(columns, n, model, ahead) - columns[f"{n}_measured"])[pick] for n in names}
+                rmse = {n: float(np.sqrt(np.mean(e**2))) if e.size else None for n, e in off.items()}
+                first = off[names[0]]
+                rows.append(
+                    {
+                        "model": model,
+                        "horizon_s": horizon_s,
+                        "held_out": held_out,
+                        "rmse": rmse[names[0]],
+                        "mae": float(np.mean(np.abs(first))) if first.size else None,
+                        **{f"{n}_rmse": v for n, v in rmse.items()},
+                    }
+                )
+    return rows
+
+
+def free_runs(
+    columns: Mapping[str, np.ndarray], names: Sequence[str], models: Sequence[str], settle_s: float
+) -> list[dict[str, Any]]:
+    """Return the errors of whole segments, each by itself.
+
+    Returns:
+        Rows with ``model``, ``recording``, ``begin_s``, ``seconds``, ``held_out``, ``field``, ``rmse``, ``mae``.
+    """
+    rows = []
+    ahead = columns["into"] - settle_s
+    for segment in np.unique(columns["segment"]):
+        pick = (columns["segment"] == segment) & (ahead > 0)
+        if not pick.any():
+            continue
+        t = columns["t"][pick]
+        about = {
+            "recording": int(columns["recording"][pick][0]),
+            "begin_s": float(t[0]),
+            "seconds": float(t[-1] - t[0]),
+            "held_out": bool(columns["held_out"][pick][0]),
+        }
+        for model in (*models, "hold"):
+            for name in names:
+                off = (_predicted(columns, name, model, ahead) - columns[f"{name}_measured"])[pick]
+                rows.append(
+                    {
+                        "model": model,
+                        **about,
+                        "field": name,
+                        "rmse": float(np.sqrt(np.mean(off**2))),
+                        "mae": float(np.mean(np.abs(off))),
+                    }
+                )
+    return rows
+
+
+def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray:
+    """Return a model's prediction; ``hold`` says that nothing changes after the last measurement before the horizon."""
+    if model != "hold":
+        return columns[f"{field}_{model}"]
+    predicted = np.zeros_like(ahead)
+    for segment in np.unique(columns["segment"]):
+        rows = np.flatnonzero(columns["segment"] == segment)
+        past = rows[ahead[rows] <= 0]
+        predicted[rows] = columns[f"{field}_measured"][past[-1] if past.size else rows[0]]
+    return predicted

@@ -1,0 +1,30 @@
+"""Losses that a few large residuals cannot decide."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from sim2real.identify.config import Loss
+
+
+def tamed(residual: Any, loss: Loss, reach: float) -> Any:
+    """Return a residual whose half square is the robust loss of the given one: least squares stays least squares.
+
+    ``huber`` is the pseudo-Huber loss: squared below ``reach``, linear far above it. ``cauchy`` grows
+    with the logarithm.
+
+    Args:
+        residual: Any shape, in deviations.
+        loss: The kind.
+        reach: Where the loss leaves the square, in deviations.
+    """
+    if loss == "squared":
+        return residual
+    if loss == "huber":  # not by the square: an overflow would make the worst residual the best
+        return residual * jnp.sqrt(2.0 / (jnp.hypot(1.0, residual / reach) + 1.0))
+    square = (residual / reach) ** 2
+    small = square < 1e-6
+    safe = jnp.where(small, 1.0, square)  # log(1 + s) / s, without dividing by zero on the branch not taken
+    return residual * jnp.sqrt(jnp.where(small, 1.0 - square / 2.0, jnp.log1p(safe) / safe))

@@ -1,0 +1,165 @@
+"""Recordings cut into segments: the timing, the commands and the measurements of each, padded to one width."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
+from sim2real.graph.timeline import Timeline
+from sim2real.identify.model import IdentifiableModel
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part of a recording.
+
+    Attributes:
+        recording: Which recording.
+        begin_s: Where it starts [s].
+        fitted: Whether the loss is made of it; else it is held out.
+    """
+
+    recording: int
+    begin_s: float
+    fitted: bool = True
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Spans of one length, side by side.
+
+    Attributes:
+        spans: E of them.
+        length_s: Their length [s].
+        timeline: The recorded timing of sensor and given nodes, E episodes.
+        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        measured: Field -> ``(E, N, ...)``.
+        ts: Shape ``(E, N)``: when each measurement was made [s from the segment's start]; 0 behind the last.
+        starts: Shape ``(E, channels, 4)``: a cubic in time through each channel's measurements around the start.
+    """
+
+    spans: tuple[Span, ...]
+    length_s: float
+    timeline: Timeline
+    given: Mapping[str, Any]
+    measured: Mapping[str, np.ndarray]
+    ts: np.ndarray
+    starts: np.ndarray
+
+
+def cut(
+    model: IdentifiableModel,
+    nodes: Mapping[str, BaseNode],
+    recordings: Sequence[Episode],
+    spans: Sequence[Span],
+    length_s: float,
+    lead_s: float,
+) -> Segments:
+    """Cut recordings into segments.
+
+    Args:
+        model: Says which nodes and fields matter.
+        nodes: Its nodes.
+        recordings: The logs.
+        spans: Which parts, recording by recording.
+        length_s: Length of each [s].
+        lead_s: How long before a segment commands are kept: they still act in it [s].
+
+    Raises:
+        Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
+        UsageError: When there are too few measurements around the start of a segment.
+    """
+    if not spans:
+        raise UsageError("there is no segment to identify from")
+    timelines, firsts, ordered = [], [], []
+    for r, episode in enumerate(recordings):
+        own = [s for s in spans if s.recording == r]
+        if not own:
+            continue
+        check_log(episode, model)
+        recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
+        lead = {n: to_ticks(lead_s) for n in model.given}
+        parts, first = recorded.cut([to_ticks(s.begin_s) for s in own], to_ticks(length_s), lead)
+        timelines.append(parts)
+        firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(own))]
+        ordered += own
+    timeline = Timeline.stack(timelines)
+
+    def rows(node: str, field: str) -> np.ndarray:
+        width = timeline.vertices[node].start.shape[1]
+        return np.stack([_rows(recordings[r].outputs[node][field], f[node], width) for r, f in firsts])
+
+    fields = {f for c in model.channels for f, _ in c.fields}
+    start = timeline.vertices[model.sensor].start / TICKS_PER_S
+    return Segments(
+        spans=tuple(ordered),
+        length_s=length_s,
+        timeline=timeline,
+        given={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
+        measured={f: rows(model.sensor, f) for f in sorted(fields)},
+        ts=np.where(start < length_s, start, 0.0),
+        starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
+    )
+
+
+def check_log(episode: Episode, model: IdentifiableModel) -> None:
+    """Raise unless the log holds the sensor's channels and the commands, as numbers."""
+    hint = "identify from a log of this pipeline's record stage, or one imported with its mapping"
+    for name in (model.sensor, *model.given):
+        if name not in episode.steps or not len(episode.steps[name]):
+            raise Sim2RealError(
+                f"the log has no steps of node {name!r}. Available: {', '.join(episode.steps) or 'none'}", hint=hint
+            )
+    wanted = [(model.sensor, f) for c in model.channels for f, _ in c.fields]
+    wanted += [(node, f) for node, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    for node, field in wanted:
+        data = episode.outputs[node].get(field)
+        if data is None:
+            raise Sim2RealError(
+                f"node {node!r} has no field {field!r} in this log. Available: {', '.join(episode.outputs[node])}",
+                hint=hint,
+            )
+        finite = np.isfinite(data.reshape(len(data), -1)).all(axis=1)
+        if not finite.all():
+            raise Sim2RealError(
+                f"field {field!r} of node {node!r} holds values that are no numbers, the first in step "
+                f"{int(np.argmin(finite))}",
+                hint="record again: a NaN cannot be identified from",
+            )
+
+
+def measured_times(episode: Episode, node: str) -> np.ndarray:
+    """Return when a node's samples were taken, ``(N,)`` [s]."""
+    steps = episode.steps[node]
+    return np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) / TICKS_PER_S
+
+
+def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
+    """Return ``width`` recorded rows from ``first`` on; what is missing repeats the last."""
+    return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
+
+
+def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
+    """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
+    t = measured_times(episode, model.sensor)
+    period = float(np.median(np.diff(t)))
+    near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
+    near = near[np.abs(t[near] - begin_s) < 12 * period]
+    if near.size < 4:
+        raise UsageError(f"the log has {near.size} measurements around {begin_s:.3f} s, too few to start a segment")
+    x = (t[near] - begin_s)[:, None]
+    powers = x ** np.arange(4)
+    slopes = np.concatenate([np.zeros_like(x), np.ones_like(x), 2 * x, 3 * x**2], axis=1)
+    fits = []
+    for c in model.channels:
+        data = [c.of(episode.outputs[model.sensor][f][near]) / s for f, s in c.fields]
+        rows = [p / s for p, (_, s) in zip((powers, slopes), c.fields, strict=False)]
+        fits.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate(data), rcond=None)[0])
+    return np.stack(fits)

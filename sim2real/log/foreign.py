@@ -1,0 +1,293 @@
+"""Files of other recorders: npz, JSON, CSV, and the episodes of LeRobot data sets; their signals by name."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import json
+import re
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import UsageError
+
+SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"}
+"""Suffix -> format, where none is named."""
+_COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
+# What libraries raise at bytes that make no sense, once the file itself is open.
+_DAMAGED = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_WHOLE = "check that the file is complete, and of the format that its name or --format says"
+
+
+@dataclass(frozen=True)
+class ForeignFile:
+    """An open file of another recorder.
+
+    Attributes:
+        path: The file.
+        format: One of the values of ``SUFFIXES``.
+        keys: What it holds, by name.
+        load: Name -> value; raises KeyError where there is none.
+    """
+
+    path: Path
+    format: str
+    keys: Sequence[str]
+    load: Callable[[str], Any]
+
+    def signal(self, source: str, column: int | None = None) -> np.ndarray:
+        """Return a signal.
+
+        Args:
+            source: Its name; for JSON the path to it (``meta.kp``, ``entries[].position``); with ``[:,0]`` or
+                ``[:,1:3]`` behind it for columns of it.
+            column: Column of a two-dimensional signal; None: all of it.
+
+        Returns:
+            Shape ``(N,)`` or ``(N, ...)``, or ``()`` for a number: float64, float32 or, for whole numbers, int64.
+
+        Raises:
+            UsageError: When there is no such signal or column, or it holds no numbers.
+        """
+        chosen: int | slice | None = column
+        match = None if source in self.keys else _COLUMNS.fullmatch(source)
+        name = source
+        if match is not None:
+            name, chosen = match[1], _index(match[2])
+        try:
+            raw = self.load(name)
+        except KeyError:
+            close = difflib.get_close_matches(name, self.keys, n=1)
+            raise UsageError(
+                f"{self.path} has no {name!r}. Available: {', '.join(self.keys) or 'nothing'}",
+                hint=f"did you mean {close[0]}?" if close else "correct the source in the mapping",
+            ) from None
+        except UsageError:
+            raise
+        except _DAMAGED as error:
+            raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=_WHOLE) from None
+        values = _numbers(raw, f"{name!r} in {self.path}")
+        if chosen is None:
+            return values
+        try:
+            return values[:, chosen]
+        except IndexError:
+            raise UsageError(
+                f"{name!r} in {self.path} has the shape {values.shape}, which has no column {chosen}",
+                hint="columns are counted from 0",
+            ) from None
+
+
+def open_foreign(path: Path, format: str | None = None) -> ForeignFile:
+    """Open a file of another recorder.
+
+    Args:
+        path: The file.
+        format: One of the values of ``SUFFIXES``; None: by the file's suffix.
+
+    Raises:
+        UsageError: When there is no such file, it is empty, or it is not of this format.
+    """
+    formats = ", ".join(_READERS)
+    if format is None:
+        format = SUFFIXES.get(path.suffix.lower())
+        if format is None:
+            raise UsageError(
+                f"the format of {path} is unknown: no suffix {path.suffix!r}. Available: {', '.join(SUFFIXES)}",
+                hint=f"name it with --format: {formats}",
+            )
+    if format not in _READERS:
+        raise UsageError(f"unknown format {format!r}. Available: {formats}", hint="save the file as one of these")
+    if path.is_dir():
+        hint = "name the files in it; of a LeRobot data set: DIR/data/chunk-*/episode_*.parquet"
+        raise UsageError(f"{path} is a folder, not a file", hint=hint)
+    try:
+        if path.stat().st_size == 0:
+            raise UsageError(f"{path} is empty", hint=_WHOLE)
+        return _READERS[format](path)
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror or error}", hint="check its name") from None
+
+
+def _read_npz(path: Path) -> ForeignFile:
+    # Anything else than a ZIP archive makes numpy look for a pickle.
+    if not zipfile.is_zipfile(path):
+        raise UsageError(f"{path} is no npz file, or is cut off", hint=_WHOLE)
+
+    def load(name: str) -> Any:
+        # Opened for each signal: one that holds Python objects must not keep the others from being read.
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                return data[name]
+        except ValueError as error:
+            if "pickle" not in str(error):
+                raise
+            raise UsageError(
+                f"{name!r} in {path} holds Python objects, which could run any code when loaded",
+                hint="save it again as an array of numbers",
+            ) from None
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            keys = [name.removesuffix(".npy") for name in archive.namelist()]
+    except _DAMAGED as error:
+        raise UsageError(f"{path} is no npz file, or is damaged: {error}", hint=_WHOLE) from None
+    return ForeignFile(path, "npz", keys, load)
+
+
+def _read_json(path: Path) -> ForeignFile:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
+        raise UsageError(f"{path} is no JSON, or is cut off: {error}", hint=_WHOLE) from None
+    if not isinstance(document, dict | list):
+        raise UsageError(f"{path} holds a single value, no signals", hint=_WHOLE)
+
+    def load(name: str) -> Any:
+        if isinstance(document, dict) and name in document:
+            return document[name]
+        return _walk(document, [p for p in re.split(r"\.|(?=\[\])", name) if p], path)
+
+    return ForeignFile(path, "json", _paths(document), load)
+
+
+def _read_csv(path: Path) -> ForeignFile:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        first = text.partition("\n")[0]
+        lines = csv.reader(text.splitlines(), delimiter=max(",;\t", key=first.count), skipinitialspace=True)
+        rows = [(lines.line_num, row) for row in lines if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{path} is no CSV: {error}", hint=_WHOLE) from None
+    if not rows:
+        raise UsageError(f"{path} is empty", hint=_WHOLE)
+    header = [name.strip() for name in rows.pop(0)[1]]
+    if twice := {name for name in header if header.count(name) > 1}:
+        raise UsageError(f"{path} has more than one column {sorted(twice)[0]!r}", hint="rename one of them")
+    if all(_is_number(name) for name in header):
+        raise UsageError(f"the first line of {path} holds numbers, not names", hint="put the columns' names there")
+    for number, row in rows:
+        if len(row) != len(header):
+            raise UsageError(f"line {number} of {path} has {len(row)} cells, the first has {len(header)}", hint=_WHOLE)
+
+    def load(name: str) -> Any:
+        if name not in header:
+            raise KeyError(name)
+        index = header.index(name)
+        try:
+            return np.array([int(row[index]) for _, row in rows], np.int64)
+        except (ValueError, OverflowError):
+            return np.array([_cell(row[index], f"line {n} of {path}, column {name!r}") for n, row in rows])
+
+    return ForeignFile(path, "csv", header, load)
+
+
+def _read_lerobot(path: Path) -> ForeignFile:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise UsageError(f"{path} is a Parquet file, which needs pyarrow", hint="pip install pyarrow") from None
+    try:
+        file = pyarrow.parquet.ParquetFile(path)
+    except (pyarrow.ArrowException, *_DAMAGED) as error:
+        raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
+    columns = list(file.schema_arrow.names)
+    # data/chunk-000/episode_000000.parquet lies beside meta/info.json, which has what is the same for all episodes.
+    infos = [folder / "meta" / "info.json" for folder in path.absolute().parents[2:3]]
+    facts = [_read_json(info) for info in infos if info.is_file()]
+
+    def load(name: str) -> Any:
+        if name not in columns:
+            if not facts:
+                raise KeyError(name)
+            return facts[0].load(name)
+        return file.read(columns=[name]).column(0).to_pylist()
+
+    found = ForeignFile(path, "lerobot", [*columns, *(["fps"] if facts else [])], load)
+    if "episode_index" in columns and len(np.unique(found.signal("episode_index"))) > 1:
+        raise UsageError(
+            f"{path} holds more than one episode", hint="import data sets of LeRobot v2, where a file is an episode"
+        )
+    return found
+
+
+_READERS: dict[str, Callable[[Path], ForeignFile]] = {
+    "npz": _read_npz,
+    "json": _read_json,
+    "csv": _read_csv,
+    "lerobot": _read_lerobot,
+}
+
+
+def _numbers(raw: Any, what: str) -> np.ndarray:
+    """Return a value as an array of float64, float32 or int64."""
+    try:
+        values = np.asarray(raw)
+        if values.dtype == object:  # None is what JSON and Parquet have for a value that is missing: it becomes a NaN
+            values = np.asarray(raw, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
+    if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
+        return values.astype(np.int64)
+    if values.dtype.kind not in "fiub":
+        raise UsageError(f"{what} holds no numbers, but {values.dtype}", hint="name another source in the mapping")
+    return values if values.dtype == np.float32 else values.astype(np.float64)
+
+
+def _index(text: str) -> int | slice:
+    if ":" not in text:
+        return int(text)
+    return slice(*(int(part) if part.strip() else None for part in text.split(":")))
+
+
+def _walk(value: Any, parts: Sequence[str], path: Path) -> Any:
+    """Follow a path into a JSON document; ``[]`` goes through all elements of a list."""
+    if not parts:
+        return value
+    head, rest = parts[0], parts[1:]
+    if head == "[]" and isinstance(value, list):
+        found = []
+        for i, item in enumerate(value):
+            try:
+                found.append(_walk(item, rest, path))
+            except KeyError:
+                if not i:
+                    raise
+                raise UsageError(
+                    f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=_WHOLE
+                ) from None
+        return found
+    if isinstance(value, dict) and head in value:
+        return _walk(value[head], rest, path)
+    raise KeyError(head)
+
+
+def _paths(value: Any, trail: str = "") -> list[str]:
+    """Return the paths to all values of a JSON document; of a list of tables by its first one."""
+    if isinstance(value, dict):
+        return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."))]
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return _paths(value[0], f"{trail}[]")
+    return [trail] if trail else []
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _cell(text: str, where: str) -> float:
+    """Return a cell's number; NaN where it is empty."""
+    if text.strip() and not _is_number(text):
+        raise UsageError(f"{where} holds {text!r}, no number", hint="name another source in the mapping")
+    return float(text) if text.strip() else float("nan")

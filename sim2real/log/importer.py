@@ -1,0 +1,289 @@
+"""Importing the files of other recorders: their signals become steps and outputs of nodes, and those a log."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import OK, UsageError
+from sim2real.graph.episode import Episode, StepRecord, Steps
+from sim2real.log.foreign import ForeignFile, open_foreign
+from sim2real.log.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
+from sim2real.log.session_file import SessionFile
+
+RECORDED, GENERATED = "recorded", "generated"
+_MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in float64
+# Stamps after September 2001 [us] come from a wall clock; a clock that starts with the machine never gets there.
+_WALL_CLOCK = 10**15
+# A first stamp up to here is the recorder's own start; a later one counts from somewhere else [us].
+_OWN_START = 1_000_000
+
+
+@dataclass(frozen=True)
+class _Signals:
+    """The signals of one node: fields and stamps of shape ``(N, ...)``, or ``()`` for a constant."""
+
+    fields: Mapping[str, np.ndarray]
+    stamps: np.ndarray | None
+    count: int
+    rate_hz: float | None
+
+
+def import_file(
+    path: str | Path, mapping: ImportMapping | str | Path, samples: slice | None = None, format: str | None = None
+) -> Episode:
+    """Read a file of another recorder as an episode, in memory.
+
+    Each sample is a step that starts and ends at its stamp. Stamps that were recorded are kept, to the microsecond:
+    time 0 is the file's own where the first stamp lies within a second after it, else the first sample. Other stamps
+    are generated from the rate. The metadata says which (``stamps``: node -> ``recorded`` or ``generated``) and has
+    ``pipeline``, ``source``, ``units``, ``graph`` and ``mapping``.
+
+    Args:
+        path: The file.
+        mapping: Which signal is which field; or the mapping file.
+        samples: Which samples to take, of every node alike; None: all.
+        format: ``npz``, ``json``, ``csv`` or ``lerobot``; None: by the file's suffix.
+
+    Raises:
+        UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
+            differ in length, a sample is no finite number, or stamps do not increase.
+    """
+    if not isinstance(mapping, ImportMapping):
+        mapping = load_mapping(mapping)
+    file = open_foreign(Path(path), format)
+    signals = {name: _signals(file, name, node) for name, node in mapping.nodes.items()}
+    first, stop = _range(file, {name: s.count for name, s in signals.items()}, samples)
+    ticks, outputs, stamps = {}, {}, {}
+    for name, node in mapping.nodes.items():
+        found, last = signals[name], signals[name].count if stop is None else stop
+        outputs[name] = {
+            field: _samples(file, f"{name}.{field}", found.fields[field], how, first, last)
+            for field, how in node.fields.items()
+        }
+        ticks[name] = _ticks(file, name, node, found, first, last)
+        stamps[name] = GENERATED if found.stamps is None else RECORDED
+    zero = _time_zero([ticks[name] for name, kind in stamps.items() if kind == RECORDED], first)
+    for name, kind in stamps.items():
+        ticks[name] -= zero if kind == RECORDED else 0
+    source = {
+        "file": file.path.name,
+        "format": file.format,
+        "sha256": hashlib.sha256(file.path.read_bytes()).hexdigest(),
+        "first_sample": first,
+        "time_zero_us": zero,
+    }
+    return Episode(
+        steps={name: _steps(t) for name, t in ticks.items()},
+        messages={},
+        outputs=outputs,
+        metadata={
+            "pipeline": mapping.pipeline,
+            "source": source,
+            "stamps": stamps,
+            "units": _shared_units(mapping),
+            "graph": {name: {"rate_hz": _rate_hz(t), "inputs": {}} for name, t in ticks.items()},
+            "mapping": {name: asdict(node) for name, node in mapping.nodes.items()},
+            "versions": {"sim2real": metadata.version("sim2real")},
+        },
+    )
+
+
+def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> None:
+    """Write an imported episode as a log.
+
+    Nodes with the same stamp stand in it in the mapping's order. The log's epoch is 1970 unless the file's stamps come
+    from a wall clock.
+
+    Args:
+        path: The log; it must not exist.
+        episode: What ``import_file`` returned.
+        mapping: What it was imported with.
+
+    Raises:
+        Sim2RealError: When the log exists or cannot be written, or names collide.
+    """
+    names = list(episode.steps)
+    examples = {node: {f: v[0] for f, v in fields.items()} for node, fields in episode.outputs.items()}
+    file = SessionFile(Path(path), episode.metadata, {}, examples, [], {}, mapping.units)
+    try:
+        zero = episode.metadata["source"]["time_zero_us"]
+        file.start(1000 * zero if zero >= _WALL_CLOCK else 0, 0)
+        counts = [len(episode.steps[n]) for n in names]
+        seq = np.concatenate([np.arange(n) for n in counts])
+        node = np.repeat(np.arange(len(names)), counts)
+        order = np.repeat([mapping.nodes[n].order for n in names], counts)
+        ticks = np.concatenate([episode.steps[n].start for n in names])
+        for row in np.lexsort((node, order, ticks)).tolist():
+            name, k, tick = names[node[row]], int(seq[row]), int(ticks[row])
+            record = StepRecord(name, k, tick, tick, tick, -1, tick, 0)
+            file.step(record, [values[k] for values in episode.outputs[name].values()])
+        file.finish({"status": "finished", "exit_code": OK, "messages": file.counts})
+    except BaseException:
+        # Unlike a recording, what is there of an import is worth nothing.
+        file.abandon()
+        Path(path).unlink(missing_ok=True)
+        raise
+
+
+def facts(episode: Episode) -> dict[str, Any]:
+    """Return what an import came to, for the table at its end."""
+    kinds = episode.metadata["stamps"]
+    return {
+        "source": episode.metadata["source"]["file"],
+        "seconds": episode.duration_s,
+        "samples": {name: len(steps) for name, steps in episode.steps.items()},
+        "rate [Hz]": {name: node["rate_hz"] for name, node in episode.metadata["graph"].items()},
+        "stamps": kinds,
+    }
+
+
+def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
+    """Read a node's signals, all of the same length."""
+    fields = {field: _field(file, f"{name}.{field}", how) for field, how in node.fields.items()}
+    stamps = None if node.stamps is None else file.signal(node.stamps)
+    if stamps is not None and stamps.ndim != 1:
+        raise UsageError(
+            f"stamps {node.stamps!r} in {file.path} have the shape {stamps.shape}, expected (N,)",
+            hint=f'choose a column, such as stamps = "{node.stamps}[:,0]"',
+        )
+    rate_hz = node.rate_hz
+    if isinstance(rate_hz, str):
+        rate = file.signal(rate_hz)
+        if rate.ndim:
+            raise UsageError(
+                f"rate_hz of node {name!r} is {rate_hz!r}, which has the shape {rate.shape}",
+                hint="if these are its stamps, say stamps instead of rate_hz",
+            )
+        rate_hz = positive(float(rate), f"{rate_hz!r} in {file.path}")
+    lengths = {field: len(values) for field, values in fields.items() if values.ndim}
+    if stamps is not None:
+        lengths[f"stamps {node.stamps!r}"] = len(stamps)
+    if not lengths:
+        raise UsageError(
+            f"node {name!r} gets only constants from {file.path}", hint="name its stamps: then there are samples"
+        )
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
+        raise UsageError(
+            f"the signals of node {name!r} differ in length: {listed}",
+            hint="what has other stamps belongs into another node",
+        )
+    count = next(iter(lengths.values()))
+    if not count:
+        raise UsageError(f"node {name!r} has no samples in {file.path}", hint="check that the file is complete")
+    return _Signals(fields, stamps, count, rate_hz)
+
+
+def _field(file: ForeignFile, where: str, how: FieldMapping) -> np.ndarray:
+    """Read a field's signal, as it is in the file; more than one are stacked."""
+    parts = [file.signal(source, how.column) for source in how.source]
+    if len(parts) == 1:
+        return parts[0]
+    try:
+        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+    except ValueError:
+        shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.source, parts, strict=True))
+        raise UsageError(
+            f"the sources of field {where} differ in shape: {shapes}", hint="stack signals of one length"
+        ) from None
+
+
+def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) -> tuple[int, int | None]:
+    """Return the first sample to take and the one behind the last; None: all."""
+    if samples is None:
+        return 0, None
+    if samples.step not in (None, 1):
+        raise UsageError(f"samples are taken one by one, not every {samples.step}", hint="leave the step out")
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise UsageError(
+            f"the nodes differ in their number of samples, so a range of samples is no range of time: {listed}",
+            hint="import all samples, and cut the file itself",
+        )
+    count = next(iter(counts.values()))
+    first, stop, _ = samples.indices(count)
+    beyond = [n for n in (samples.start, samples.stop) if n is not None and not -count <= n <= count]
+    if beyond or first >= stop:
+        asked = ":".join("" if n is None else str(n) for n in (samples.start, samples.stop))
+        raise UsageError(f"samples {asked} are not in {file.path}: it has {count}", hint=f"choose from 0:{count}")
+    return first, stop
+
+
+def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, first: int, stop: int) -> np.ndarray:
+    """Return a field of the samples from ``first`` on, ``(N, ...)``: a constant for each, scaled and in its shape."""
+    values = values[first:stop] if values.ndim else np.broadcast_to(values, (stop - first,))
+    _check_finite(file, f"field {where}", values, first)
+    dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
+    scaled = (how.scale * values.astype(np.float64) + how.offset).astype(dtype)
+    shape = scaled.shape[1:] if how.shape is None else how.shape
+    if np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
+        raise UsageError(
+            f"a sample of field {where} has the shape {scaled.shape[1:]} in {file.path}, the mapping says {shape}",
+            hint="correct the shape, or choose columns of the source",
+        )
+    return np.ascontiguousarray(scaled.reshape(len(scaled), *shape))
+
+
+def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
+    """Return the stamps of the samples from ``first`` on, shape ``(N,)``, int64 [us]."""
+    if signals.stamps is None:
+        # The grid that the timing rules give to a node of this rate.
+        return np.floor(np.arange(stop - first) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
+    stamps = signals.stamps[first:stop]
+    what = f"stamps {node.stamps!r} of node {name!r}"
+    hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
+    _check_finite(file, what, stamps, first)
+    nanoseconds = STAMP_UNITS[node.stamp_unit]
+    if np.abs(stamps * (nanoseconds / 1000)).max() >= _MAX_TICKS:
+        raise UsageError(f"{what} in {file.path} are centuries away: {stamps[0]} {node.stamp_unit}", hint=hint)
+    if stamps.dtype.kind == "i":
+        ticks = (stamps + 500) // 1000 if nanoseconds < 1000 else stamps * (nanoseconds // 1000)
+    else:
+        ticks = np.rint(stamps.astype(np.float64) * (nanoseconds / 1000)).astype(np.int64)
+    if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
+        k = int(wrong[0])
+        raise UsageError(
+            f"{what} in {file.path} do not increase: sample {first + k} at {stamps[k]} {node.stamp_unit}, "
+            f"sample {first + k + 1} at {stamps[k + 1]} {node.stamp_unit}",
+            hint=f"samples must be a microsecond apart at least; {hint}",
+        )
+    return ticks
+
+
+def _check_finite(file: ForeignFile, what: str, values: np.ndarray, first: int) -> None:
+    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    if not finite.all():
+        k = int(np.argmin(finite))
+        raise UsageError(
+            f"{what} is no finite number in sample {first + k} of {file.path}: {values[k]}",
+            hint="cut it off with --samples A:B, or repair the file",
+        )
+
+
+def _time_zero(ticks: list[np.ndarray], first: int) -> int:
+    """Return what the file's clock shows at the episode's time 0 [us]."""
+    begin = min((int(t[0]) for t in ticks), default=0)
+    return 0 if 0 <= begin <= _OWN_START and not first else begin
+
+
+def _steps(ticks: np.ndarray) -> Steps:
+    never, zeros = np.full_like(ticks, -1), np.zeros_like(ticks)
+    return Steps(scheduled=ticks, start=ticks, woken=ticks, ts_overwrite=never, end=ticks, drift=zeros)
+
+
+def _rate_hz(ticks: np.ndarray) -> float | None:
+    return round(1e6 / float(np.median(np.diff(ticks))), 3) if len(ticks) > 1 else None
+
+
+def _shared_units(mapping: ImportMapping) -> dict[str, str]:
+    """Return field -> unit as recorded logs have it, without fields that have another unit in another node."""
+    pairs = {(field, how.unit) for node in mapping.nodes.values() for field, how in node.fields.items()}
+    fields = [field for field, _ in pairs]
+    return {field: unit for field, unit in sorted(pairs) if unit and fields.count(field) == 1}

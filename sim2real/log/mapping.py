@@ -1,0 +1,232 @@
+"""Mapping files: which signal of somebody else's file is which field of which node, in TOML."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sim2real.errors import UsageError
+
+STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+"""Nanoseconds in each unit that stamps may have."""
+MAPPING = "import.toml"
+"""The mapping file in a pipeline's folder."""
+_COMMANDING = "actuator"
+_HINT = "the guide 'Import' has a mapping file with every key"
+
+
+@dataclass(frozen=True)
+class FieldMapping:
+    """Where a field of a node's output comes from.
+
+    Attributes:
+        source: Name of a signal in the file, with the path to it and a column where needed; several are stacked.
+        unit: Unit of the field, after scaling.
+        scale: The field is ``scale * signal + offset``.
+        offset: See ``scale``; in the field's unit.
+        shape: Shape of one sample; None: as it is in the file.
+        column: Column of a two-dimensional signal; None: all of it.
+    """
+
+    source: tuple[str, ...]
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    shape: tuple[int, ...] | None = None
+    column: int | None = None
+
+
+@dataclass(frozen=True)
+class NodeMapping:
+    """Where a node's messages come from.
+
+    Attributes:
+        fields: Field -> where it comes from.
+        rate_hz: Rate from which stamps are generated [Hz], or the name of a number in the file; None: ``stamps``.
+        stamps: Signal with the stamps that were recorded; None: ``rate_hz``.
+        stamp_unit: One of ``STAMP_UNITS``.
+        order: Of nodes with the same stamp the one with the lower number acted first.
+    """
+
+    fields: Mapping[str, FieldMapping]
+    rate_hz: float | str | None = None
+    stamps: str | None = None
+    stamp_unit: str = "s"
+    order: int = 0
+
+
+@dataclass(frozen=True)
+class ImportMapping:
+    """How a foreign file becomes a log.
+
+    Attributes:
+        pipeline: The pipeline that the log is for.
+        nodes: Node -> where its messages come from.
+        path: The mapping file; None where the mapping was made by ``from_dict``.
+    """
+
+    pipeline: str
+    nodes: Mapping[str, NodeMapping]
+    path: Path | None = None
+
+    @property
+    def units(self) -> dict[str, dict[str, str]]:
+        """Node -> field -> unit, for the fields that have one."""
+        return {n: {f: m.unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
+
+    def inputs(self, file: Path) -> dict[str, Path]:
+        """Return what an import of a file reads, by name, for its manifest."""
+        return {"source": file} | ({} if self.path is None else {"mapping": self.path})
+
+    @staticmethod
+    def from_dict(tables: Mapping[str, Any], pipeline: str | None = None, path: Path | None = None) -> ImportMapping:
+        """Return the mapping of a parsed TOML document.
+
+        Args:
+            tables: The document.
+            pipeline: The pipeline that the log is for; None takes the document's.
+            path: Where the document was read, for messages.
+
+        Raises:
+            UsageError: When a key is unknown, missing or of the wrong kind.
+        """
+        where = "the mapping" if path is None else str(path)
+        _known(tables, ("pipeline", "nodes"), where)
+        own = _value(tables, "pipeline", str, where)
+        if own is None and pipeline is None:
+            raise UsageError(f"{where} does not say which pipeline the log is for", hint='add pipeline = "NAME"')
+        if own is not None and pipeline not in (None, own):
+            raise UsageError(
+                f"{where} is for pipeline {own!r}, not for {pipeline!r}", hint="name the mapping with --mapping FILE"
+            )
+        nodes = _value(tables, "nodes", dict, where) or {}
+        if not nodes:
+            raise UsageError(f"{where} has no nodes", hint="add a table [nodes.NAME] for each node; " + _HINT)
+        found = {name: _node(name, _table(node, f"{where}: nodes.{name}"), where) for name, node in nodes.items()}
+        return ImportMapping(str(own or pipeline), found, path)
+
+
+def load_mapping(path: str | Path | None, pipeline: str | None = None, package: str | None = None) -> ImportMapping:
+    """Read a mapping file.
+
+    Args:
+        path: The file; None takes the one in the pipeline's package.
+        pipeline: The pipeline that the log is for; None takes the file's.
+        package: The pipeline's package, which has been imported.
+
+    Raises:
+        UsageError: When there is no such file, it is no TOML, or it makes no sense.
+    """
+    if path is None and package is not None:
+        path = Path(str(sys.modules[package].__file__)).with_name(MAPPING)
+    if path is None:
+        raise UsageError(
+            "nothing says which signal is which", hint="name the robot with --pipeline NAME, or a --mapping FILE.toml"
+        )
+    path = Path(path)
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"there is no mapping file {path}", hint=f"write one, or name another; {_HINT}") from None
+    except OSError as error:
+        raise UsageError(f"the mapping file {path} cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is no TOML: {error}", hint=_HINT) from None
+    return ImportMapping.from_dict(tables, pipeline, path)
+
+
+def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
+    where = f"{document}: nodes.{name}"
+    _known(table, ("fields", "rate_hz", "stamps", "stamp_unit", "order"), where)
+    fields = _value(table, "fields", dict, where) or {}
+    if not fields:
+        raise UsageError(f"{where} has no fields", hint=f'add fields.NAME = {{ source = "..." }}; {_HINT}')
+    rate_hz = _value(table, "rate_hz", (int, float, str), where)
+    stamps = _value(table, "stamps", str, where)
+    if (rate_hz is None) == (stamps is None):
+        raise UsageError(
+            f"{where} needs either 'stamps' or 'rate_hz'" + (", not both" if stamps is not None else ""),
+            hint="stamps that were recorded are kept; from rate_hz they are generated, and marked so",
+        )
+    if isinstance(rate_hz, int | float):
+        rate_hz = positive(float(rate_hz), f"{where}: rate_hz")
+    unit = _value(table, "stamp_unit", str, where) or "s"
+    if unit not in STAMP_UNITS:
+        raise UsageError(f"{where}: unknown stamp_unit {unit!r}. Available: {', '.join(STAMP_UNITS)}", hint=_HINT)
+    # A command is computed from the sample that it shares a stamp with, so it was sent after that.
+    order = _value(table, "order", int, where)
+    return NodeMapping(
+        fields={f: _field(_table(v, f"{where}.fields.{f}"), f"{where}.fields.{f}") for f, v in fields.items()},
+        rate_hz=rate_hz,
+        stamps=stamps,
+        stamp_unit=unit,
+        order=int(name == _COMMANDING) if order is None else order,
+    )
+
+
+def positive(value: float, where: str) -> float:
+    """Return a rate that is a finite number above 0.
+
+    Raises:
+        UsageError: When it is not.
+    """
+    if not 0.0 < value < math.inf:
+        raise UsageError(f"{where} must be above 0, got {value}", hint="it is in samples per second")
+    return value
+
+
+def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
+    _known(table, ("source", "unit", "scale", "offset", "shape", "column"), where)
+    source = _value(table, "source", (str, list), where)
+    sources = [source] if isinstance(source, str) else source or []
+    if not sources or not all(isinstance(s, str) and s for s in sources):
+        raise UsageError(f"{where} needs a source: the name of a signal, or a list of names", hint=_HINT)
+    numbers = {key: _value(table, key, (int, float), where) for key in ("scale", "offset")}
+    for key, number in numbers.items():
+        if number is not None and not math.isfinite(number):
+            raise UsageError(f"{where}: {key} must be a finite number, got {number}", hint=_HINT)
+    shape = _value(table, "shape", list, where)
+    if shape is not None and not all(type(n) is int and n > 0 for n in shape):
+        raise UsageError(f"{where}: shape must be a list of whole numbers above 0, got {shape}", hint=_HINT)
+    unit = _value(table, "unit", str, where) or ""
+    if not unit.isprintable():
+        raise UsageError(f"{where}: a unit stands on one line, got {unit!r}", hint=_HINT)
+    return FieldMapping(
+        source=tuple(sources),
+        unit=unit,
+        scale=1.0 if numbers["scale"] is None else float(numbers["scale"]),
+        offset=float(numbers["offset"] or 0.0),
+        shape=None if shape is None else tuple(shape),
+        column=_value(table, "column", int, where),
+    )
+
+
+def _table(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UsageError(f"{where} must be a table, got {value!r}", hint=_HINT)
+    return value
+
+
+def _value(table: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
+    """Return a key's value, or None without the key."""
+    value = table.get(key)
+    # TOML's truth values are whole numbers to Python.
+    if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
+        raise UsageError(f"{where}: {key} has the wrong kind: {value!r}", hint=_HINT)
+    return value
+
+
+def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+    for key in table:
+        if key not in keys:
+            close = difflib.get_close_matches(key, keys, n=1)
+            raise UsageError(
+                f"{where} has an unknown key {key!r}. Available: {', '.join(keys)}",
+                hint=f"did you mean {close[0]}?" if close else _HINT,
+            )

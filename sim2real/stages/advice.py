@@ -1,0 +1,74 @@
+"""What to do about a recording, in plain words, from what a check found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+_GOAL = 0.01
+"""The standard error to aim at, as a share of the nominal value."""
+_SHORT_S = 12.0
+_MOVING, _COVERED, _ONE_SIDED = 0.3, 0.5, 0.2
+
+
+def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
+    """Return sentences: what is wrong with the data first, then what to do next.
+
+    Args:
+        found: What ``check.judge`` returned.
+        pipeline: The pipeline's name.
+    """
+    planned = found["source"] != "log"
+    said = [sentence for r in found["recordings"] for sentence in _about(r, len(found["recordings"]) > 1)]
+    enough = _enough(found)
+    if not found["determined"]:
+        names = ", ".join(dict.fromkeys(n for group in found["undetermined"] for n in group))
+        said.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
+    if found["only_sum_of_delays"]:
+        said.append("of delays on either side of the world only the sum can be told: that is as it should be")
+    if enough:
+        said.append(enough)
+    if found["determined"]:
+        said.append(f"next: sim2real {'record' if planned else 'identify'} {pipeline}")
+    return said
+
+
+def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
+    """Yield what is wrong with one recording."""
+    which = f"{recording['name']}: " if several else ""
+    s = recording["sampling"]
+    if s["duration_s"] < _SHORT_S:
+        yield f"{which}only {s['duration_s']:.1f} s: too little to fit one part and check on another"
+    if s["gaps"]:
+        yield f"{which}{s['gaps']} gaps in the measurements, the longest {s['longest_gap_s']:.3g} s"
+    for j in recording["joints"]:
+        if not j["moving"]:
+            yield f"{which}{j['name']} does not move at all: nothing about it can be told"
+            continue
+        if j["moving"] < _MOVING:
+            yield f"{which}{j['name']} moves {j['moving']:.0%} of the time: excite it more, or for longer"
+        if not _ONE_SIDED < j["forward"] < 1 - _ONE_SIDED:
+            yield f"{which}{j['name']} moves almost only one way: friction and an offset then look alike"
+        if j["position"]["covered"] < _COVERED:
+            share = j["position"]["covered"]
+            yield f"{which}{j['name']} stays in {share:.0%} of its range: vary the level of the excitation"
+    if recording["commands"] and all(c["low_hz"] is None for c in recording["commands"]):
+        yield f"{which}no command changes: gains and delays of the actuator cannot be told"
+
+
+def _enough(found: Mapping[str, Any]) -> str:
+    """Return for how long to record, judged by the parameter that is known worst."""
+    known = [p for p in found["parameters"] if p["percent_of_nominal"] is not None and p["determined"] == "alone"]
+    if not known:
+        return ""
+    worst = max(known, key=lambda p: p["percent_of_nominal"])
+    seconds = 60.0 * (worst["percent_of_nominal"] / (100 * _GOAL)) ** 2
+    have = sum(r["sampling"]["duration_s"] for r in found["recordings"])
+    about = f"{worst['name']} is known worst: {worst['percent_of_nominal']:.2g} % of nominal from a minute"
+    if seconds <= have:
+        return f"{about}; {have:.0f} s are enough for {_GOAL:.0%}, if the model is right"
+    return f"{about}; {_GOAL:.0%} takes {_time(seconds)} of such data, or a better excitation"
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else "hours"

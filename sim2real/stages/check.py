@@ -1,0 +1,375 @@
+"""Judge what a recording, or a planned one, can tell about the parameters, before anything is searched."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode, Steps, named_leaves
+from sim2real.graph.schedule import draw
+from sim2real.graph.timeline import Vertex
+from sim2real.identify import excitation, identifiability, uncertainty
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span, check_log, measured_times
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages import advice
+from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
+from sim2real.stages.console import note, pairs, shown, table
+from sim2real.stages.excitation import excitation as command_signal
+from sim2real.stages.identified import ROUND_TRIP
+from sim2real.stages.identify import load_log
+from sim2real.stages.manifest import plain
+from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.robot import Identifiable
+from sim2real.stages.runs import newest
+
+PLANNED = "planned excitation"
+_EDGES_S = (0.3, 0.2)
+"""What is left out at either end of a log where initial states are estimated [s]."""
+_LEAST_S = 0.3
+_SURE_S = 0.005
+"""A round trip with a larger standard error is not determined [s]; the same holds for what identify finds."""
+_MOST_SEGMENTS = 120
+"""More than this many segments say nothing new: of a longer log so many are taken, evenly."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is judged: recordings, or one that was simulated."""
+
+    names: list[str]
+    episodes: list[Episode]
+    planned: bool
+
+
+def run(pipeline: Pipeline, config: CheckConfig) -> bool:
+    """Judge and print.
+
+    Args:
+        pipeline: The robot.
+        config: What to judge.
+
+    Returns:
+        Whether everything is determined, up to the time shift between delays.
+    """
+    robot = cast(Identifiable, pipeline.load())
+    # A robust loss would let what is wrong with the nominal model hide what the data tells.
+    fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
+    model = robot.identifiable(fitting.max_delay_s)
+    parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
+    source = find_source(pipeline, config, model, parameters, fitting)
+    found = judge(model, source, fitting, parameters, dict(robot.UNITS))
+    found = {"pipeline": pipeline.name, **found}
+    found["recommendation"] = advice.recommend(found, pipeline.name)
+    if config.json:
+        print(json.dumps(plain(found), indent=1))
+    else:
+        show(found)
+    return found["determined"]
+
+
+def find_source(
+    pipeline: Pipeline,
+    config: CheckConfig,
+    model: IdentifiableModel,
+    parameters: ParameterTable,
+    fitting: IdentifyConfig,
+) -> Source:
+    """Return the logs that were named, the newest recording, or what recording would give.
+
+    Raises:
+        UsageError: When there is neither a recording nor an excitation to plan one with.
+    """
+    paths = [Path(p) for p in config.log]
+    if not paths and not config.plan:
+        try:
+            recorded = newest(config.runs, pipeline.name, "record")
+        except Sim2RealError as error:
+            if not _plannable(pipeline):
+                raise UsageError(
+                    f"there is no recording of {pipeline.name!r} in {shown(config.runs)}, and the pipeline has no "
+                    "excitation to plan one with",
+                    hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {pipeline.name}`",
+                ) from error
+            note(f"no recording of {pipeline.name} in {shown(config.runs)}: the planned excitation is simulated")
+        else:
+            paths = [recorded.output("log")]
+    if paths:
+        return Source([shown(p) for p in paths], [load_log(p, pipeline) for p in paths], False)
+    if not _plannable(pipeline):
+        raise UsageError(
+            f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
+            hint="name a log with --log FILE",
+        )
+    robot: Any = pipeline.load()
+    return Source([PLANNED], [simulate(model, robot, config.record, parameters, fitting)], True)
+
+
+def judge(
+    model: IdentifiableModel,
+    source: Source,
+    config: IdentifyConfig,
+    parameters: ParameterTable,
+    units: dict[str, str],
+) -> dict[str, Any]:
+    """Return what the recordings show, and what they determine at the nominal values, as JSON takes it."""
+    for episode in source.episodes:
+        check_log(episode, model)
+    spans, length_s = cut(source.episodes, config)
+    problem = Problem(model, source.episodes, spans, length_s, config, parameters)
+    z = problem.table.start()
+    at = uncertainty.linearise(problem, z)
+    check = identifiability.from_linearised(problem, at)
+    delays = [c.label for c in problem.table.columns if c.parameter.kind == "delay"]
+    rows, total = _parameters(problem, at, check), _round_trip(problem, at, check)
+    messages = list(check.messages)
+    # Only the sum of the delays can be told where initial states are free: then that is all that must be.
+    harmless = [g for g in check.undetermined if total and set(g) <= set(delays)]
+    open_groups = [list(g) for g in check.undetermined if g not in harmless]
+    if total and total["determined"] == "no":
+        open_groups.append(delays)
+        messages.append(f"not even the sum of {' and '.join(delays)} is determined: let the commands change more")
+    return {
+        "source": PLANNED if source.planned else "log",
+        "recordings": [
+            {"name": n, **coverage(e, model, units)} for n, e in zip(source.names, source.episodes, strict=True)
+        ],
+        "segments": len(spans),
+        "segment_s": length_s,
+        "condition": check.condition,
+        "determined": not open_groups,
+        "undetermined": open_groups,
+        "only_sum_of_delays": bool(harmless) and delays not in open_groups,
+        "messages": messages,
+        "parameters": [*rows, *([total] if total else [])],
+    }
+
+
+def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) -> dict[str, Any]:
+    """Return when a recording was sampled, what its joints did, and what drove them."""
+    t_s = measured_times(episode, model.sensor)
+    outputs = episode.outputs[model.sensor]
+    joints = []
+    for c in model.channels:
+        position = np.asarray(c.of(outputs[c.position]), np.float64)
+        velocity = excitation.speed(t_s, position) if c.velocity is None else np.asarray(c.of(outputs[c.velocity]))
+        own = {"position": excitation.spread(position), "velocity": excitation.spread(velocity)}
+        joints.append(
+            {
+                "name": c.name,
+                "unit": units.get(c.position, ""),
+                **{k: _as_json(v) for k, v in own.items()},
+                **asdict(excitation.motion(velocity, c.velocity_sigma)),
+            }
+        )
+    commands = []
+    for node, tree in model.given.items():
+        sent_s = episode.steps[node].end / 1e6
+        for field in jax.tree_util.tree_leaves(tree):
+            rows = np.asarray(episode.outputs[node][field], np.float64).reshape(len(sent_s), -1)
+            for i, values in enumerate(rows.T):
+                band = excitation.band(sent_s, values)
+                name = f"{node}.{field}" + (f"[{i}]" if rows.shape[1] > 1 else "")
+                commands.append(
+                    {
+                        "name": name,
+                        "unit": units.get(field, ""),
+                        **_as_json(excitation.spread(values)),
+                        **(asdict(band) if band else {"low_hz": None, "high_hz": None}),
+                    }
+                )
+    return {"sampling": asdict(excitation.sampling(t_s)), "joints": joints, "commands": commands}
+
+
+def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
+    """Return segments side by side, all of them fitted, and their length [s].
+
+    Raises:
+        UsageError: When the shortest recording holds none.
+    """
+    first, last = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
+    reach = [(first, e.duration_s - last) for e in episodes]
+    shortest = min(end - begin for begin, end in reach)
+    length_s = min(config.settle_s + config.horizon_s, shortest)
+    if length_s < _LEAST_S:
+        raise UsageError(
+            f"the shortest recording lasts {min(e.duration_s for e in episodes):.2f} s: too short for a segment",
+            hint="record for at least 12 s",
+        )
+    spans = [
+        Span(r, float(b))
+        for r, (begin, end) in enumerate(reach)
+        for b in np.arange(begin, end - length_s + 1e-6, length_s)
+    ]
+    if len(spans) > _MOST_SEGMENTS:
+        spans = [spans[i] for i in np.linspace(0, len(spans) - 1, _MOST_SEGMENTS).round().astype(int)]
+    return spans, length_s
+
+
+def simulate(
+    model: IdentifiableModel, robot: Any, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
+) -> Episode:
+    """Return what the model at its nominal values would be recorded to do under the planned excitation."""
+    nodes = model.nodes(config.max_delay_s)
+    node, field = robot.COMMAND
+    signal = command_signal(record, robot.RATE_HZ)
+    timeline = draw(nodes, record.duration_s, rng=record.seed)
+    given, outputs = {}, {}
+    for name in model.given:
+        message = nodes[name].init_output(jax.random.key(0), None)
+        count = timeline.vertices[name].start.shape[1]
+        rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
+        if name == node:
+            played = signal[np.minimum(np.arange(count), len(signal) - 1)]
+            rows[field] = np.broadcast_to(played.reshape(count, *[1] * (rows[field].ndim - 1)), rows[field].shape)
+        leaves, kind = jax.tree_util.tree_flatten(message)
+        given[name] = kind.unflatten(
+            [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
+        )
+        outputs[name] = rows
+    graph = CompiledGraph(nodes, model.sensor, timeline, given)
+    parameters = parameters.for_recordings(1)
+    values = parameters.of_recording(parameters.decode(parameters.start()), 0)
+    rest = named_leaves(nodes[model.sensor].init_output(jax.random.key(0), None))
+    start = [float(c.of(np.asarray(rest[c.position]))) for c in model.channels]
+    params = model.params(values, jnp.array([*start, *[0.0] * len(start)], jnp.float32))
+    gs = graph.init(jax.random.key(0), params=params, eps=0)
+    _, records = jax.jit(lambda state: graph.rollout(state, record=(model.sensor,)))(gs)
+    found = records[model.sensor]
+    seq = np.asarray(found.seq)
+    made = np.flatnonzero(seq >= 0)[np.argsort(seq[seq >= 0], kind="stable")]
+    outputs[model.sensor] = {n: np.asarray(v)[made] for n, v in named_leaves(found.output).items()}
+    steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values())))) for n in outputs}
+    return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
+
+
+def show(found: dict[str, Any]) -> None:
+    """Print what was found, for people."""
+    for r in found["recordings"]:
+        s = r["sampling"]
+        gaps = f"{s['gaps']}, the longest {s['longest_gap_s']:.3g} s" if s["gaps"] else "none"
+        print(
+            pairs(
+                {r["name"]: f"{s['samples']} samples in {s['duration_s']:.1f} s, {s['rate_hz']:.4g} Hz, gaps: {gaps}"}
+            )
+        )
+        print()
+        print(table(*_signal_rows(r)))
+        print()
+        print(table(*_motion_rows(r["joints"])))
+        print()
+        for c in r["commands"]:
+            said = "it is constant" if c["low_hz"] is None else f"{c['low_hz']:.2g} to {c['high_hz']:.2g} Hz"
+            print(f"95 % of the power of {c['name']}: {said}")
+        print()
+    rows = [
+        [
+            p["name"],
+            p["nominal"],
+            p["standard_error_per_minute"],
+            p["unit"],
+            None if p["percent_of_nominal"] is None else f"{p['percent_of_nominal']:.2g} %",
+            p["determined"],
+        ]
+        for p in found["parameters"]
+    ]
+    heads = ["parameter", "nominal", "s.e. from a minute", "unit", "of nominal", "determined"]
+    print(table(rows, heads))
+    print()
+    about = {"condition number": f"{found['condition']:.2g}", "directions left open": len(found["undetermined"])}
+    print(pairs(about))
+    for message in [*found["messages"], *found["recommendation"]]:
+        print(f"- {message}")
+
+
+def _parameters(problem: Problem, at: uncertainty.Linearised, check: identifiability.Check) -> list[dict[str, Any]]:
+    """Return the error to expect of each parameter from one minute of such data."""
+    loose = {n for group in check.undetermined for n in group}
+    rows = []
+    for c, error in zip(problem.table.columns, check.per_minute, strict=True):
+        p = c.parameter
+        share = 100 * float(error) / abs(p.nominal) if p.nominal else None
+        rows.append(
+            {
+                "name": c.label,
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "standard_error_per_minute": float(error),
+                "percent_of_nominal": share,
+                "determined": "alone" if c.label not in loose else "in a group",
+            }
+        )
+    return rows
+
+
+def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiability.Check) -> dict[str, Any] | None:
+    """Return the error to expect of the sum of the delays, where only that can be told."""
+    shift = uncertainty.time_shift(problem)
+    if not shift.any():
+        return None
+    # With the sensor's delay held, the others move as their sum does.
+    rest = np.flatnonzero(~(shift > 0))
+    J = at.jacobian.reshape(-1, len(at.x))[:, rest]
+    behind = [int(np.flatnonzero(rest == i)[0]) for i in np.flatnonzero(shift < 0)]
+
+    def error(seconds: float) -> float:
+        information = J.T @ J * seconds / check.duration_s + at.prior[np.ix_(rest, rest)]
+        return float(np.sqrt(np.linalg.inv(information)[np.ix_(behind, behind)].sum()))
+
+    return {
+        "name": ROUND_TRIP,
+        "unit": "s",
+        "nominal": None,
+        "standard_error_per_minute": error(60.0),
+        "percent_of_nominal": None,
+        "determined": "alone" if error(check.duration_s) < _SURE_S else "no",
+    }
+
+
+def _signal_rows(recording: dict[str, Any]) -> tuple[list[list[Any]], list[str]]:
+    """Return a row for each position, velocity and command: its range, and how it is spread over it."""
+    signals = [(c["name"], c["unit"], c) for c in recording["commands"]]
+    for j in reversed(recording["joints"]):
+        rate = f"{j['unit']}/s" if j["unit"] else ""
+        signals[:0] = [(j["name"], j["unit"], j["position"]), (f"speed of {j['name']}", rate, j["velocity"])]
+    rows = [
+        [
+            name,
+            f"{s['low']:.3g} to {s['high']:.3g} {unit}".rstrip(),
+            f"{s['covered']:.0%}",
+            " ".join(f"{100 * share:3.0f}" for share in s["shares"]),
+        ]
+        for name, unit, s in signals
+    ]
+    return rows, ["signal", "range", "covered", "samples in each tenth of the range [%]"]
+
+
+def _motion_rows(joints: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], list[str]]:
+    rows = [[j["name"], f"{j['moving']:.0%}", f"{j['forward']:.0%}", j["reversals"]] for j in joints]
+    return rows, ["joint", "time in motion", "of it upwards", "reversals"]
+
+
+def _as_json(found: excitation.Spread) -> dict[str, Any]:
+    return {**asdict(found), "covered": found.covered}
+
+
+def _steps(vertex: Vertex, count: int) -> Steps:
+    """Return the steps of one drawn node, as a log has them."""
+    start, end = vertex.start[0, :count], vertex.end[0, :count]
+    return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))
+
+
+def _plannable(pipeline: Pipeline) -> bool:
+    """Return whether the robot can be excited by us: one that is only known from recordings cannot."""
+    robot = pipeline.load()
+    return hasattr(robot, "COMMAND") and hasattr(robot, "RATE_HZ")

@@ -1,0 +1,60 @@
+"""Ending a command by a signal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from types import FrameType
+from typing import Any
+
+
+class Signals:
+    """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
+
+    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away. One that
+    is raised where Python drops exceptions (a finaliser, a callback of the garbage collector) is sent again.
+
+    Attributes:
+        received: Number of the signal that was raised; 0 before one.
+    """
+
+    def __init__(self) -> None:
+        self.received = 0
+        self._raised: BaseException | None = None
+        self._before: dict[int, Any] = {}
+        self._hook = sys.unraisablehook
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            # nohup and background jobs of a shell start with signals ignored; they stay ignored.
+            self._before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
+            sys.unraisablehook = self._dropped
+            for number in self._before:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._before:
+            sys.unraisablehook = self._hook
+        for number, old in self._before.items():
+            signal.signal(number, old)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self._raised is not None:
+            os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
+            return
+        self.received = number
+        self._raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+        raise self._raised
+
+    def _dropped(self, unraisable: Any) -> None:
+        if self._raised is None or unraisable.exc_value is not self._raised:
+            self._hook(unraisable)
+            return
+        self._raised = None
+        # A moment later: until this hook returns, it would be dropped again.
+        threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()

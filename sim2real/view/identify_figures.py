@@ -1,0 +1,212 @@
+"""Figures of an identification: how well it predicts, how it was searched, and what hangs together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from sim2real.view import style
+from sim2real.view.identification import FreeRun, Identification
+from sim2real.view.panels import Line, Panel, over_time, with_gaps, with_unit
+from sim2real.view.style import BLUE, GREEN, INK, MUTED, ORANGE, new_figure, styled, to_svg
+
+MOST_PANELS = 6
+_VOICES = {
+    "measured": "measured",
+    "identified": "identified model",
+    "no delay": "the same, fitted without delays",
+    "nominal": "nominal model",
+}
+
+
+def predictions(found: Identification, name: str) -> str:
+    """Draw measured against predicted, segment by segment; what was held out is shaded and shown closer."""
+    panels = []
+    for recording, quantity in shown(found, found.recordings):
+        own = found.samples["recording"] == recording
+        rows = found.disjoint() & own
+        t_s, segment = found.samples["t"][rows], found.samples["segment"][rows]
+        lines = [Line(*_measured(found, quantity, own), _VOICES["measured"], "measured")]
+        for model in found.models(quantity):
+            if model != "no delay":  # it would lie between the other two: the free run shows it
+                values = found.samples[f"{quantity}_{model}"][rows]
+                lines.append(Line(*with_gaps(t_s, values, segment), _VOICES[model], model))
+        ordered = np.flatnonzero(own)[np.argsort(found.samples["t"][own], kind="stable")]
+        spans = _spans(found.samples["t"][ordered], found.samples["held_out"][ordered].astype(bool))
+        begin = spans[0][0] if spans else float(t_s[0])
+        zoom = (round(begin, 1), round(min(begin + 4.0, float(t_s[-1])), 1))
+        panels.append(
+            Panel(
+                with_unit(quantity, found.units),
+                lines,
+                title_of(found, recording),
+                spans,
+                zoom if zoom[1] > zoom[0] else None,
+                ("measured", "identified"),
+            )
+        )
+    label = f"Measured {', '.join(found.fields)} against predictions of the identified and the nominal model"
+    return over_time(panels, name, label)
+
+
+def free_runs(found: Identification, name: str) -> str:
+    """Draw what is held out of each recording against one simulation of all of it, with its errors."""
+    panels = []
+    for recording, quantity in shown(found, np.unique(found.free["recording"]).tolist()):
+        rows = found.free["recording"] == recording
+        segments, counts = np.unique(found.free["segment"][rows], return_counts=True)
+        rows &= found.free["segment"] == segments[counts.argmax()]  # the longest, of equal ones the first
+        t_s = found.free["t"][rows]
+        models = [m for m in ("measured", "no delay", "identified") if f"{quantity}_{m}" in found.free]
+        lines = [Line(t_s, found.free[f"{quantity}_{m}"][rows].astype(float), _VOICES[m], m) for m in models]
+        settled = t_s[found.free["into"][rows] <= found.settle_s]
+        spans = [(float(settled[0]), float(settled[-1]))] if len(settled) else []
+        said = _errors_of(found, recording, quantity)
+        title = ": ".join(filter(None, [title_of(found, recording), said]))
+        panels.append(Panel(with_unit(quantity, found.units), lines, title, spans, framed=("measured", "identified")))
+    label = "What is held out of each recording, measured and simulated from one initial state"
+    return over_time(panels, name, label, shade="initial state fitted here")
+
+
+def title_of(found: Identification, recording: int) -> str:
+    """Return what a recording is called; empty where there is but one."""
+    if len(found.recordings) < 2:
+        return ""
+    return found.logs[recording] if recording < len(found.logs) else f"recording {recording}"
+
+
+def shown(found: Identification, recordings: Sequence[int]) -> list[tuple[int, str]]:
+    """Return recording and field of the panels that a figure has room for: first fields first."""
+    pairs = [(r, quantity) for quantity in found.fields for r in recordings][:MOST_PANELS]
+    return sorted(pairs, key=lambda pair: (pair[0], found.fields.index(pair[1])))
+
+
+def prediction_errors(found: Identification, name: str) -> str:
+    """Draw each model's error over the horizon: a row for each field, held-out data beside the fitted."""
+    told = {f for row in found.prediction for f in row.rmse if np.isfinite(row.rmse[f])}
+    fields = [*[f for f in found.fields if f in told], *sorted(told - set(found.fields))][:MOST_PANELS]
+    models = list(dict.fromkeys(row.model for row in found.prediction))
+    kinds = [k for k in (True, False) if any(row.held_out == k for row in found.prediction)]
+    with styled():
+        figure = new_figure(0.9 + 1.75 * len(fields), min(style.WIDTH_IN, 4.9 * len(kinds)))
+        grid = figure.subplots(len(fields), len(kinds), squeeze=False, sharex=True, sharey="row")
+        for quantity, row in zip(fields, grid, strict=True):
+            for axes, held_out in zip(row, kinds, strict=True):
+                for number, model in enumerate(models):
+                    _error_line(axes, found, quantity, model, held_out, _model_look(model, number))
+                axes.set_yscale("log")
+                axes.margins(x=0.05)
+            style.plain_log(row[0].yaxis)
+            row[0].set_ylabel(f"RMSE of {with_unit(quantity, found.units)}")
+        for axes, held_out in zip(grid[0], kinds, strict=True):
+            axes.set_title("held-out data" if held_out else "fitted data")
+        for axes in grid[-1]:
+            axes.set_xlabel("horizon [s]")
+        entries = []
+        for number, model in enumerate(models):
+            color, dash, mark = _model_look(model, number)
+            label = {"hold": "hold: nothing changes"}.get(model, model)
+            entries.append(Line2D([], [], color=color, ls=dash, marker=mark, ms=5, label=label))
+        style.legend_above(figure, entries)
+        return to_svg(figure, name, f"Prediction error of {', '.join(models)} over the horizon")
+
+
+def search(found: Identification, name: str) -> str:
+    """Draw the best loss of each generation, and where the refinement ended."""
+    refined = [float(r["after"]) for r in found.search.get("refined", []) if r.get("after") is not None]
+    with styled():
+        figure = new_figure(2.6, 4.4)
+        axes = figure.subplots()
+        axes.plot(np.arange(1, len(found.history) + 1), found.history, color=BLUE)
+        if refined:
+            axes.axhline(refined[-1], color=GREEN, ls=style.DASHES[1], lw=1.2)
+            entries = [
+                Line2D([], [], color=BLUE, label="search"),
+                Line2D([], [], color=GREEN, ls=style.DASHES[1], lw=1.2, label="refined"),
+            ]
+            style.legend_above(figure, entries)
+        if np.nanmin([*found.history, *refined]) > 0:
+            axes.set_yscale("log")
+            style.plain_log(axes.yaxis)
+        axes.set(xlabel="generation", ylabel="best loss")
+        return to_svg(figure, name, f"Best loss over {len(found.history)} generations")
+
+
+def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
+    """Draw a correlation matrix; the numbers stand in the cells, where they fit."""
+    count = len(names)
+    size = 0.62 if count <= 14 else max(0.3, 8.4 / count)
+    with styled():
+        figure = new_figure(1.3 + 0.68 * size * count, min(style.WIDTH_IN, 2.1 + size * count))
+        axes = figure.subplots()
+        axes.pcolormesh(np.nan_to_num(matrix), cmap="RdBu_r", vmin=-1, vmax=1, edgecolor="white", lw=1)
+        for i in range(count if count <= 24 else 0):
+            for j in range(count):
+                color = "#ffffff" if abs(matrix[i, j]) > 0.6 else "#000000"
+                text = f"{matrix[i, j]:.2f}".replace("-0.00", "0.00").replace("-", "\u2212")
+                axes.text(j + 0.5, i + 0.5, text, ha="center", va="center", color=color, fontsize=min(8, 13 * size))
+        ticks = np.arange(count) + 0.5
+        axes.set_xticks(ticks, names, rotation=30, ha="right", rotation_mode="anchor")
+        axes.set_yticks(ticks, names)
+        axes.invert_yaxis()
+        axes.grid(False)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        return to_svg(figure, name, f"Correlations between the estimates of {', '.join(names)}")
+
+
+def _errors_of(found: Identification, recording: int, quantity: str) -> str:
+    """Return the errors of a free run beside those of holding still."""
+    rows = [r for r in found.free_runs if r.recording == recording and r.field == quantity and r.held_out]
+    best: dict[str, FreeRun] = {}
+    for row in sorted(rows, key=lambda r: -r.seconds):
+        best.setdefault(row.model, row)
+    said = [
+        f"{m} RMSE {best[m].rmse:.3g}, MAE {best[m].mae:.3g}" for m in ("identified", "no delay", "hold") if m in best
+    ]
+    return " · ".join(said)
+
+
+def _measured(found: Identification, quantity: str, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a measurement wherever there is one, in order of time: segments may overlap, and repeat it."""
+    t_s, first = np.unique(found.samples["t"][own], return_index=True)
+    pieces = np.cumsum(np.diff(t_s, prepend=t_s[:1]) > 3 * np.median(np.diff(t_s)))
+    return with_gaps(t_s, found.samples[f"{quantity}_measured"][own][first], pieces)
+
+
+def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
+    """Return the intervals over which ``chosen`` holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
+    return [(float(t_s[b]), float(t_s[e - 1])) for b, e in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _model_look(model: str, number: int) -> tuple[str, Any, str]:
+    """Return colour, dash and mark of a model; those of the overlay where it is one of them."""
+    known = {
+        "identified": (BLUE, style.DASHES[0], "o"),
+        "no delay": (INK, style.DASHES[3], "D"),
+        "nominal": (ORANGE, style.DASHES[1], "s"),
+        "hold": (MUTED, style.DASHES[2], "^"),
+    }
+    return known.get(model, ((GREEN, style.PURPLE)[number % 2], style.DASHES[1], "v"))
+
+
+def _error_line(
+    axes: Axes, found: Identification, quantity: str, model: str, held_out: bool, look: tuple[str, Any, str]
+) -> None:
+    color, dash, mark = look
+    rows = [r for r in found.prediction if r.model == model and r.held_out == held_out and quantity in r.rmse]
+    rows.sort(key=lambda r: r.horizon_s)
+    axes.plot(
+        [r.horizon_s for r in rows],
+        [r.rmse[quantity] for r in rows],
+        color=color,
+        ls=dash,
+        marker=mark,
+        ms=5,
+        mfc=color if held_out else "none",
+    )

@@ -1,0 +1,312 @@
+"""The section of an identification: its verdict first, then parameters, predictions, and what is left unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sim2real.view import identify_figures, intervals, residuals
+from sim2real.view.about import about
+from sim2real.view.blocks import (
+    MISSING,
+    Banner,
+    Block,
+    FigureBlock,
+    ListBlock,
+    Section,
+    TableBlock,
+    Tile,
+    Tone,
+    decimals_for,
+    fixed,
+    interval,
+    number,
+    pretty_unit,
+)
+from sim2real.view.identification import (
+    Estimate,
+    Identification,
+    Prediction,
+    Quantity,
+    in_readable_unit,
+    read_identification,
+)
+from sim2real.view.run import Artifact
+from sim2real.view.signals import unit_of
+
+_TITLES: dict[str, tuple[Tone, str]] = {
+    "accepted": ("good", "Accepted"),
+    "hit a bound": ("doubt", "Hit a bound: an estimate lies where the search was not allowed to go further"),
+    "not identifiable": ("doubt", "Not identifiable: the data leaves a direction open"),
+    "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
+}
+_STRONG = 0.9
+
+
+def identify_section(artifact: Artifact) -> Section:
+    """Return the verdict, the parameters and how sure they are, and how well the model predicts."""
+    found = read_identification(artifact)
+    blocks = [
+        *_parameters(found),
+        *_aggregate(found),
+        *_predictions(found),
+        *_residuals(found),
+        *_correlation(found),
+    ]
+    if np.isfinite(found.history).any():
+        refined = found.search.get("refined") or []
+        gain = f" Dashed: refined in {sum(int(r['steps']) for r in refined)} steps." if refined else ""
+        blocks.append(
+            FigureBlock(
+                identify_figures.search(found, "identify-search"), f"The best loss of the search.{gain}", narrow=True
+            )
+        )
+    lead = "Dynamics and delays from the log, with how far each can be trusted."
+    tiles = list(_tiles(found))
+    return Section("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
+
+
+def _banner(found: Identification) -> Banner | None:
+    if not found.status:
+        return None
+    tone, title = _TITLES.get(found.status, ("doubt", found.status[:1].upper() + found.status[1:]))
+    return Banner(tone, title, [_sentence(r) for r in found.reasons])
+
+
+def _sentence(text: str) -> str:
+    """Write a message as a sentence; a name at its beginning stays as it is."""
+    first = text.split(" ", 1)[0]
+    return (text if "_" in first else text[:1].upper() + text[1:]).rstrip(".") + "."
+
+
+def _parameters(found: Identification) -> list[Block]:
+    """Return table and figure of the parameters, what lies at a bound, and what the data determines."""
+    bounded = [e for e in found.estimates if e.verdict == "at a bound"]
+    active = (
+        f"At a bound: {', '.join(_at_bound(e) for e in bounded)}."
+        if bounded
+        else "No estimate lies at a bound: none is active."
+    )
+    blocks: list[Block] = [
+        _parameter_table(found.estimates),
+        FigureBlock(
+            intervals.intervals(found.estimates, "identify-intervals"),
+            f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; what "
+            "lies inside the shaded 95 % band agrees with the estimate. Arrows point to marks beyond the edge.",
+        ),
+    ]
+    if found.determined:
+        known = found.determined
+        items = [_sentence(m) for m in known.messages] or ["Every parameter is determined by itself."]
+        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(known.condition, 2)}.")
+        blocks.append(ListBlock("What the data determines", items))
+        rows = [_minute(e, known.per_minute[e.name]) for e in found.estimates if e.name in known.per_minute]
+        if rows:
+            caption = "Standard error from one minute of such data"
+            heads = ("parameter", "standard error", "unit", "share of the estimate")
+            blocks.append(TableBlock(caption, heads, rows, (2,), folded=True))
+    return blocks
+
+
+def _minute(e: Estimate, error: float) -> list[str]:
+    scale, unit = (1e3, "ms") if e.unit == "s" else (1.0, pretty_unit(e.unit))
+    share = f"{100 * error / abs(e.estimate):.2g} %" if e.estimate else MISSING
+    return [e.name, number(scale * error, 2), unit, share]
+
+
+def _at_bound(e: Estimate) -> str:
+    if e.lower is None or e.upper is None:
+        return e.name
+    upper = abs(e.upper - e.estimate) < abs(e.estimate - e.lower)
+    readable = in_readable_unit(e)
+    bound = readable.upper if upper else readable.lower
+    return f"{e.name} (the {'upper' if upper else 'lower'}, {number(bound)} {pretty_unit(readable.unit)})"
+
+
+def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
+    with_truth = any(e.truth is not None for e in estimates)
+    columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
+    columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
+    rows = []
+    for e in map(in_readable_unit, estimates):
+        places = decimals_for(e.standard_error, e.estimate)
+        ends = MISSING if e.low95 is None else f"{fixed(e.low95, places)} to {fixed(e.high95, places)}"
+        row = [e.name, fixed(e.estimate, places), fixed(e.standard_error, places), ends, pretty_unit(e.unit)]
+        if e.verdict == "fixed":
+            row[2:4] = [MISSING, MISSING]
+        row += [number(e.nominal), interval(e.lower, e.upper)]
+        if with_truth:
+            row += [fixed(e.truth, places), _error(e)]
+        rows.append([*row, e.verdict or MISSING])
+    remarks = [pretty_unit(e.about) if e.about else "" for e in estimates]
+    return TableBlock("Parameters", columns, rows, text_columns=(4, len(columns) - 1), remarks=remarks)
+
+
+def _error(e: Estimate) -> str:
+    if e.truth is None:
+        return MISSING
+    if not e.truth:
+        return number(e.estimate - e.truth, 2)
+    return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
+
+
+def _aggregate(found: Identification) -> list[Block]:
+    quantities: Sequence[Quantity] = found.aggregate
+    if not quantities:
+        return []
+    count = len(quantities[0].estimates)
+    logs = "".join(f" {i}: {log}." for i, log in enumerate(found.logs[:count])) if count <= len(found.logs) else ""
+    rows = []
+    for q in quantities:
+        scale, unit = (1e3, "ms") if q.unit == "s" else (1.0, pretty_unit(q.unit))
+        places = decimals_for(scale * q.standard_error, scale * q.mean)
+        numbers = [fixed(scale * v, places) for v in (q.mean, q.standard_error, q.between)]
+        ends = f"{fixed(scale * q.low95, places)} to {fixed(scale * q.high95, places)}"
+        rows.append([q.name, *numbers, ends, unit, "yes" if q.agree else "no"])
+    heads = ("quantity", "mean", "s.e. of the mean", "spread", "95 % for a further recording", "unit", "agree")
+    loose = ", ".join(q.name for q in quantities if not q.agree)
+    said = f" More than their errors explain they differ in {loose}." if loose else " They agree in everything."
+    return [
+        FigureBlock(
+            intervals.aggregate(quantities, "identify-aggregate"),
+            f"Each recording identified by itself.{said} The shaded interval is what to expect of a further one; "
+            f"with few recordings it is wide.{logs}",
+        ),
+        TableBlock(f"Over {count} recordings", heads, rows, text_columns=(5, 6)),
+    ]
+
+
+def _predictions(found: Identification) -> list[Block]:
+    """Return curves of errors, free runs, and the segments."""
+    blocks: list[Block] = []
+    if found.prediction:
+        blocks.append(
+            FigureBlock(
+                identify_figures.prediction_errors(found, "identify-errors"),
+                "How the error grows with the horizon, from states that know only their past. What has been identified "
+                "must stay below all others on held-out data.",
+            )
+        )
+        blocks.append(_prediction_table(found))
+    if found.free:
+        recordings = np.unique(found.free["recording"]).tolist()
+        blocks.append(
+            FigureBlock(
+                identify_figures.free_runs(found, "identify-free"),
+                "One simulation of what is held out, from one initial state, with the recorded commands and timing."
+                f"{_left_out(found, recordings)}",
+            )
+        )
+        if found.free_runs:
+            blocks.append(_free_run_table(found))
+    blocks.append(
+        FigureBlock(
+            identify_figures.predictions(found, "identify-predictions"),
+            "Every segment is simulated freely from its own initial state. What is shaded took no part in the fit."
+            f"{_left_out(found, found.recordings)}",
+        )
+    )
+    return blocks
+
+
+def _left_out(found: Identification, recordings: Sequence[int]) -> str:
+    left = len(found.fields) * len(recordings) - len(identify_figures.shown(found, recordings))
+    return f" {left} further panels are left out." if left else ""
+
+
+def _residuals(found: Identification) -> list[Block]:
+    s = found.samples
+    there = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
+    if not there.any() or not any("identified" in found.models(f) for f in found.fields):
+        return []
+    assumed = " Orange: what the measurement was assumed to add." if found.sigma else ""
+    return [
+        FigureBlock(
+            residuals.figure(found, "identify-residuals"),
+            f"What the identified model leaves unexplained on held-out data.{assumed} A slow wave, or an "
+            "autocorrelation that lasts, is something the model lacks; what stays inside the shaded band is noise.",
+        )
+    ]
+
+
+def _correlation(found: Identification) -> list[Block]:
+    if not found.correlation:
+        return []
+    names, matrix = found.correlation
+    pairs = [
+        (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
+    ]
+    pairs.sort(key=lambda pair: -abs(pair[2]))
+    said = "; ".join(f"{b} and {a} {v:+.2f}".replace("-", "\u2212") for a, b, v in pairs[:6])
+    strong = f" Beyond ±{_STRONG:g}: {said}." if said else f" None is beyond ±{_STRONG:g}."
+    return [
+        FigureBlock(
+            identify_figures.correlation(names, matrix, "identify-correlation"),
+            f"Correlations of the estimates. Of a pair near ±1 only a combination can be told.{strong}",
+            narrow=True,
+        )
+    ]
+
+
+def _prediction_table(found: Identification) -> TableBlock:
+    fields = list(dict.fromkeys(f for row in found.prediction for f in row.rmse))
+    heads = [f"RMSE of {f}" + (f" [{unit}]" if (unit := unit_of(f, found.units)) else "") for f in fields]
+    rows = [
+        [
+            r.model,
+            number(r.horizon_s, 3),
+            "held out" if r.held_out else "fitted",
+            *[number(r.rmse.get(f)) for f in fields],
+        ]
+        for r in found.prediction
+    ]
+    return TableBlock("Prediction errors", ("model", "horizon [s]", "data", *heads), rows, (2,), folded=True)
+
+
+def _free_run_table(found: Identification) -> TableBlock:
+    several = len(found.recordings) > 1
+    rows = [
+        [
+            r.model,
+            *([identify_figures.title_of(found, r.recording)] if several else []),
+            r.field,
+            number(r.seconds, 3),
+            number(r.rmse),
+            number(r.mae),
+            unit_of(r.field, found.units) or MISSING,
+        ]
+        for r in found.free_runs
+    ]
+    heads = ["model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit"]
+    text = (1, 2, 6) if several else (1, 5)
+    return TableBlock("Free runs", heads, rows, text, folded=True)
+
+
+def _tiles(found: Identification) -> Iterator[Tile]:
+    best = _farthest(found, "identified")
+    if best and best.rmse:
+        name = next((f for f in found.fields if f in best.rmse), next(iter(best.rmse)))
+        unit = unit_of(name, found.units)
+        others = [(m, o.rmse.get(name)) for m in ("no delay", "hold", "nominal") if (o := _farthest(found, m))]
+        note = ", ".join(f"{m} {number(e, 3)}" for m, e in others)
+        kind = "held-out " if best.held_out else ""
+        yield Tile(
+            f"{kind}RMSE of {name} after {best.horizon_s:g} s", f"{number(best.rmse[name], 3)} {unit}".strip(), note
+        )
+    for e in found.estimates:
+        if e.kind == "derived" and e.unit == "s":
+            error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
+            truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
+            yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
+    if found.misfit is not None:
+        yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the deviation assumed of a measurement")
+    seconds, evaluations = found.search.get("seconds"), found.search.get("evaluations")
+    if seconds is not None:
+        yield Tile("search", f"{float(seconds):.0f} s", f"{number(evaluations)} evaluations" if evaluations else "")
+
+
+def _farthest(found: Identification, model: str) -> Prediction | None:
+    """Return a model's error at the longest horizon, on held-out data if there are any."""
+    rows = [r for r in found.prediction if r.model == model]
+    return max(rows, key=lambda r: (r.held_out, r.horizon_s), default=None)

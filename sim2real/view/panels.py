@@ -1,0 +1,136 @@
+"""Panels above each other on an axis of time: what most figures consist of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from sim2real.view import style
+from sim2real.view.signals import unit_of
+from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, to_svg
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a panel; ``role`` is a name in ``style.ROLES`` and says how it looks."""
+
+    t_s: np.ndarray
+    values: np.ndarray
+    label: str
+    role: str
+    held: bool = False
+    """Whether the value holds until the next one: a command."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes over time.
+
+    Attributes:
+        label: Of the vertical axis.
+        lines: What is drawn.
+        title: Above it, if anything.
+        spans: Intervals [s] that are shaded.
+        zoom: An interval [s] that a second column shows closer.
+        framed: Roles of the lines that the vertical axis makes room for; what is beyond is cut. Empty: all.
+    """
+
+    label: str
+    lines: Sequence[Line]
+    title: str = ""
+    spans: Sequence[tuple[float, float]] = ()
+    zoom: tuple[float, float] | None = None
+    framed: Sequence[str] = ()
+
+
+def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held out") -> str:
+    """Draw panels above each other; those that show the same time share its axis.
+
+    Args:
+        panels: What to draw.
+        name: Name of the figure, unique on its page.
+        label: What it shows, in words.
+        shade: What the legend calls the shaded intervals.
+    """
+    zooms = {panel.zoom for panel in panels}
+    closer = zooms != {None}
+    titled = sum(bool(panel.title) for panel in panels)
+    with styled():
+        figure = new_figure(0.7 + 1.45 * len(panels) + 0.22 * titled)
+        grid = figure.subplots(
+            len(panels),
+            1 + closer,
+            sharex="col" if len(zooms) == 1 and not titled else "none",
+            sharey="row",
+            squeeze=False,
+            width_ratios=[2.1, 1][: 1 + closer],
+        )
+        for panel, row in zip(panels, grid, strict=True):
+            for axes in row:
+                _fill(axes, panel)
+            row[0].set_ylabel(panel.label)
+            if panel.title:
+                row[0].set_title(panel.title, fontweight="normal", fontsize=8.5)
+            if panel.zoom:
+                row[1].set_xlim(*panel.zoom)
+                row[1].xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        for axes in grid[-1]:
+            axes.set_xlabel("time [s]")
+        zoom = panels[0].zoom
+        if zoom and len(zooms) == 1:
+            grid[0, 1].set_title(f"{zoom[0]:g} to {zoom[1]:g} s", fontweight="normal", color=MUTED)
+        seen = {line.label: line for panel in panels for line in panel.lines}
+        entries: list[Any] = [_legend_entry(line) for line in seen.values()]
+        entries += [Patch(facecolor=SHADE, edgecolor=GRID, label=shade)] if any(p.spans for p in panels) else []
+        style.legend_above(figure, entries)
+        return to_svg(figure, name, label)
+
+
+def with_unit(label: str, units: Mapping[str, str], field: str | None = None) -> str:
+    """Return an axis's label: what it shows, and its unit if that is known."""
+    unit = unit_of(field or label, units)
+    return f"{label} [{unit}]" if unit else label
+
+
+def with_gaps(t_s: np.ndarray, values: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Break a line where one piece ends and the next begins."""
+    cuts = np.flatnonzero(np.diff(piece)) + 1
+    return np.insert(t_s.astype(float), cuts, np.nan), np.insert(values.astype(float), cuts, np.nan)
+
+
+def _fill(axes: Axes, panel: Panel) -> None:
+    for line in panel.lines:
+        _draw(axes, line)
+    for begin, end in panel.spans:
+        axes.axvspan(begin, end, color=SHADE, lw=0, zorder=0)
+    framed = [line.values[np.isfinite(line.values)] for line in panel.lines if line.role in panel.framed]
+    inside = np.concatenate(framed) if framed else np.empty(0)
+    if inside.size:
+        low, high = float(inside.min()), float(inside.max())
+        room = 0.08 * (high - low) or 1.0
+        axes.set_ylim(low - room, high + room)
+
+
+def _draw(axes: Axes, line: Line) -> None:
+    look = ROLES[line.role]
+    axes.plot(
+        line.t_s,
+        line.values,
+        color=look.color,
+        ls=look.dash,
+        lw=look.width,
+        zorder=look.order,
+        drawstyle="steps-post" if line.held else "default",
+    )
+
+
+def _legend_entry(line: Line) -> Line2D:
+    look = ROLES[line.role]
+    return Line2D([], [], color=look.color, ls=look.dash, lw=look.width, label=line.label)

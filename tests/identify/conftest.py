@@ -1,0 +1,87 @@
+"""A synthetic log of the pendulum whose truth is known to the last digit, and its identification."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.problem import Problem
+from sim2real.identify.search import search
+from sim2real.identify.segments import Span
+from sim2real.identify.uncertainty import uncertainty
+from sim2real.stages.config import RecordConfig
+from sim2real.stages.excitation import excitation
+from sim2real.stages.pipeline import load_pipeline
+
+SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
+DURATION_S, RATE_HZ, SEGMENT_S = 20.0, 50.0, 1.3
+
+
+def columns(start, stamp, end):
+    none = np.zeros_like(start)
+    return Steps(scheduled=start, start=start, woken=start, ts_overwrite=stamp, end=end, drift=none)
+
+
+def synthetic_log(rng):
+    """Simulate the embedded robot's plant: commands held from an actuator's end plus its delay, samples read late.
+
+    Sensor and actuator run at times of their own, off any grid.
+    """
+    plant = load_pipeline("pendulum").load("plant").PendulumPlant()
+    count, step_s = round(DURATION_S * RATE_HZ), plant.model.opt.timestep
+    slots = np.arange(count) * 20_000
+    sensor = slots + rng.integers(0, 900, count)
+    stamp = sensor + 200 + rng.integers(0, 300, count)
+    actuator = slots + 2300 + rng.integers(0, 1500, count)
+    done = actuator + 700 + rng.integers(0, 300, count)
+    voltage = excitation(RecordConfig(duration_s=DURATION_S, amplitude=2.0, low_hz=0.7, high_hz=2.0, seed=3), RATE_HZ)
+    effect = np.round((done * 1e-6 + ACTUATOR_DELAY_S) / step_s).astype(int)
+    steps = round((DURATION_S + 0.1) / step_s)
+    states = np.empty((steps, 2))
+    plant.command(1, 16, 0.0)
+    k = 0
+    for i in range(steps):
+        while k < count and effect[k] <= i:
+            plant.command(1, 16, voltage[k] / 5.0)
+            k += 1
+        states[i] = plant.data.qpos[0], plant.data.qvel[0]
+        plant.advance((i + 1) * step_s)
+    sampled = np.maximum(stamp * 1e-6 - SENSOR_DELAY_S, 0.0)
+    th, thdot = (np.interp(sampled, np.arange(steps) * step_s, states[:, i]) for i in range(2))
+    count_rad = 2 * np.pi / 4096
+    outputs = {
+        "sensor": {"th": np.round(th / count_rad) * count_rad, "thdot": np.round(thdot / 0.024) * 0.024},
+        "actuator": {"action": voltage[:, None]},
+    }
+    log = {"sensor": columns(sensor, stamp, stamp + 1000), "actuator": columns(actuator, np.full(count, -1), done)}
+    return Episode(steps=log, messages={}, outputs=outputs), plant.truth()
+
+
+def make_problem(episode):
+    model = load_pipeline("pendulum").load().identifiable(MAX_DELAY_S)
+    begins = np.arange(0.3, DURATION_S - SEGMENT_S - 0.2, SEGMENT_S)
+    spans = [Span(0, float(b), i < len(begins) - 3) for i, b in enumerate(begins)]
+    return Problem(model, [episode], spans, SEGMENT_S, FitConfig(max_delay_s=MAX_DELAY_S))
+
+
+@pytest.fixture(scope="session")
+def fitted():
+    """One synthetic log, identified: the only problem of its size, as it takes long to compile."""
+    episode, truth = synthetic_log(np.random.default_rng(0))
+    problem = make_problem(episode)
+    found = search(problem.losses, problem.table.start(), FitConfig())
+    values = {n: float(v) for n, v in problem.table.decode(jnp.asarray(found.z)).items()}
+    return SimpleNamespace(
+        episode=episode,
+        truth={**truth, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": ACTUATOR_DELAY_S},
+        problem=problem,
+        found=found,
+        values=values,
+        spread=uncertainty(problem, found.z),
+        loss=jax.jit(lambda z: problem.losses(z[None], z, None)[0]),
+        make_problem=make_problem,
+    )

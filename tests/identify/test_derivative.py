@@ -1,0 +1,87 @@
+"""Derivatives that are not traced: finite differences, and a Jacobian that is kept."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.identify.derivative import by_jacobian, finite_differences
+
+POINT = jnp.array([0.4, -0.7, 1.1])
+
+
+def smooth(x):
+    return jnp.stack([jnp.sin(x[0]) * x[1], jnp.exp(0.5 * x[2]), x[0] * x[1] * x[2], jnp.sum(x**2)])
+
+
+def outside(x):
+    """Return the same, computed by numpy."""
+
+    def host(v):
+        a, b, c = np.moveaxis(np.asarray(v, np.float64), -1, 0)
+        return np.stack([np.sin(a) * b, np.exp(0.5 * c), a * b * c, a**2 + b**2 + c**2], axis=-1).astype(np.float32)
+
+    shape = jax.ShapeDtypeStruct((4,), jnp.float32)
+    return jax.pure_callback(host, shape, x, vmap_method="broadcast_all")
+
+
+def test_finite_differences_are_the_derivative():
+    np.testing.assert_array_equal(finite_differences(smooth)(POINT), smooth(POINT))
+    np.testing.assert_allclose(
+        jax.jacfwd(finite_differences(smooth))(POINT), jax.jacfwd(smooth)(POINT), rtol=2e-3, atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("length", [1e-4, 1.0, 100.0])
+def test_the_tangents_length_does_not_matter(length):
+    direction = length * jnp.array([0.3, -1.0, 0.2])
+    exact = jax.jvp(smooth, (POINT,), (direction,))[1]
+    found = jax.jvp(finite_differences(smooth), (POINT,), (direction,))[1]
+    np.testing.assert_allclose(found, exact, rtol=3e-3, atol=1e-3 * length)
+
+
+def test_no_tangent_no_change():
+    found = jax.jvp(finite_differences(smooth), (POINT,), (jnp.zeros(3),))[1]
+    np.testing.assert_array_equal(found, np.zeros(4))
+
+
+def test_a_callback_has_a_derivative_in_compiled_and_batched_programs():
+    with pytest.raises(ValueError, match="JVP"):
+        jax.jacfwd(outside)(POINT)
+    jacobian = jax.jacfwd(finite_differences(outside))
+    exact = jax.jacfwd(smooth)
+    np.testing.assert_allclose(jax.jit(jacobian)(POINT), exact(POINT), rtol=2e-3, atol=1e-3)
+    points = jnp.stack([POINT, 2 * POINT, -POINT])
+    np.testing.assert_allclose(jax.jit(jax.vmap(jacobian))(points), jax.vmap(exact)(points), rtol=2e-3, atol=2e-3)
+    push = jax.linearize(finite_differences(outside), POINT)[1]
+    np.testing.assert_allclose(jax.vmap(push)(jnp.eye(3)).T, exact(POINT), rtol=2e-3, atol=1e-3)
+
+
+def test_a_callback_can_be_differentiated_by_what_is_closed_over():
+    """The residuals' sensitivities close over traced parameters and batched segments."""
+
+    def slope(scale):
+        return jax.jacfwd(finite_differences(lambda x: outside(x * scale)))(POINT)
+
+    found = jax.jit(jax.vmap(slope))(jnp.array([1.0, 0.5]))
+    exact = jnp.stack([jax.jacfwd(lambda x, s=s: smooth(x * s))(POINT) for s in (1.0, 0.5)])
+    np.testing.assert_allclose(found, exact, rtol=2e-3, atol=1e-3)
+
+
+def test_the_kept_jacobian_is_the_linearisation():
+    value, push = jax.linearize(by_jacobian(smooth), POINT)
+    expected, exact = jax.linearize(smooth, POINT)
+    np.testing.assert_allclose(value, expected, rtol=1e-6)
+    for direction in (*np.eye(3, dtype=np.float32), np.float32([2.0, -1.0, 0.5])):
+        np.testing.assert_allclose(push(direction), exact(direction), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        jax.linear_transpose(push, POINT)(jnp.ones(4))[0], jax.vjp(smooth, POINT)[1](jnp.ones(4))[0], rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(by_jacobian(smooth)))(POINT), jax.jacfwd(smooth)(POINT), rtol=1e-5, atol=1e-6
+    )
+
+
+def test_the_kept_jacobian_of_finite_differences():
+    found = jax.jacfwd(by_jacobian(finite_differences(outside)))(POINT)
+    np.testing.assert_allclose(found, jax.jacfwd(smooth)(POINT), rtol=2e-3, atol=1e-3)

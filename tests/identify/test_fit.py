@@ -1,0 +1,204 @@
+"""From recordings to an estimate, of a world that JAX cannot differentiate: it calls back to numpy."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base
+from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import fit
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+
+TICK_S, PERIOD_S, DURATION_S = 0.01, 0.02, 8.0
+GAIN, TIME_CONSTANT_S = 1.7, 0.13
+NOISE = 0.002
+
+
+@struct.dataclass
+class Level(Base):
+    """A world's state, and what a sensor measures."""
+
+    y: jax.Array
+
+
+@struct.dataclass
+class Command(Base):
+    """What drives it."""
+
+    u: jax.Array
+
+
+@struct.dataclass
+class LagParams(Base):
+    """A first-order lag."""
+
+    gain: jax.Array
+    tau: jax.Array
+    start: jax.Array
+
+
+def lag(y, u, gain, tau):
+    """Return the level a tick later, in numpy."""
+    return (gain * u + (y - gain * u) * np.exp(-TICK_S / tau)).astype(np.float32)
+
+
+class Lag(BaseWorld):
+    """The exact solution over a tick, outside JAX or in it."""
+
+    def __init__(self, outside):
+        super().__init__("world", 1 / TICK_S)
+        self.outside = outside
+
+    def init_params(self, rng=None, graph_state=None):
+        return LagParams(jnp.float32(1.0), jnp.float32(0.1), jnp.float32(0.0))
+
+    def init_state(self, rng=None, graph_state=None):
+        return Level(y=jnp.asarray(graph_state.params["world"].start, jnp.float32))
+
+    def init_output(self, rng=None, graph_state=None):
+        return graph_state.state["world"]
+
+    def step(self, step_state):
+        p, y, u = step_state.params, step_state.state.y, step_state.inputs["actuator"][-1].data.u
+        if self.outside:
+            shape = jax.ShapeDtypeStruct((), jnp.float32)
+            new = jax.pure_callback(lag, shape, y, u, p.gain, p.tau, vmap_method="broadcast_all")
+        else:
+            new = p.gain * u + (y - p.gain * u) * jnp.exp(-TICK_S / p.tau)
+        return step_state.replace(state=Level(y=new)), Level(y=new)
+
+
+class Sensor(BaseNode):
+    """Passes the level on."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Level(y=jnp.float32(0.0))
+
+    def step(self, step_state):
+        return step_state, step_state.inputs["world"][-1].data
+
+
+class Actuator(BaseNode):
+    """Plays what was recorded."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Command(u=jnp.float32(0.0))
+
+
+class Model:
+    """What a pipeline provides."""
+
+    sensor = "sensor"
+    given = {"actuator": Command(u="u")}  # noqa: RUF012
+    channels = (Channel("y", None, position_sigma=NOISE, velocity_sigma=0.1),)
+
+    def __init__(self, outside=True):
+        self.outside = outside
+        self.parameters = ParameterTable(
+            [
+                Parameter("gain", "1", 1.0, 0.25, 4.0),
+                Parameter("tau", "s", 0.1, 0.02, 0.5),
+                Parameter("offset", "1", 0.0, -1.0, 1.0, "linear", "measurement", free=False),
+            ]
+        )
+
+    def nodes(self, max_delay_s):
+        world, sensor, actuator = Lag(self.outside), Sensor("sensor", 1 / PERIOD_S), Actuator("actuator", 1 / PERIOD_S)
+        world.connect(actuator, skip=True)
+        sensor.connect(world)
+        return {n.name: n for n in (sensor, actuator, world)}
+
+    def params(self, values, start):
+        return {"world": LagParams(values["gain"], values["tau"], start[0])}
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """A lag's log: commands hold from one sample to the next, and act from the sample on."""
+    rng = np.random.default_rng(0)
+    count = round(DURATION_S / PERIOD_S)
+    u = np.repeat(rng.uniform(-1, 1, count // 5), 5)
+    y = np.zeros(count)
+    for k in range(1, count):
+        steady = GAIN * u[k - 1]
+        y[k] = steady + (y[k - 1] - steady) * np.exp(-PERIOD_S / TIME_CONSTANT_S)
+    slots = np.arange(count) * round(PERIOD_S * 1e6)
+    none = np.zeros_like(slots)
+
+    def steps(start, end):
+        return Steps(scheduled=slots, start=start, woken=start, ts_overwrite=none - 1, end=end, drift=none)
+
+    return Episode(
+        # A command leaves just before the tick that it is to act in.
+        steps={
+            "sensor": steps(slots, slots + 10),
+            "actuator": steps(slots - 20 * (slots > 0), slots - 5 * (slots > 0)),
+        },
+        messages={},
+        outputs={"sensor": {"y": y + NOISE * rng.normal(size=count)}, "actuator": {"u": u}},
+    )
+
+
+LENGTH_S = 1.0
+SPANS = [Span(0, b) for b in np.arange(0.4, DURATION_S - LENGTH_S - 0.3, LENGTH_S)]
+CONFIG = FitConfig(max_delay_s=0.02, generations=6, population=4, refine_steps=8, strategy="SNES")
+
+
+@pytest.fixture(scope="module")
+def found(episode):
+    """The lag, searched for briefly and refined."""
+    told = []
+    return SimpleNamespace(
+        fit=fit(Model(), [episode], SPANS, LENGTH_S, CONFIG, told=lambda *what: told.append(what)), told=told
+    )
+
+
+def test_a_world_without_derivative_is_identified(found):
+    result = found.fit
+    assert not result.problem.forward
+    assert result.values["gain"] == pytest.approx(GAIN, rel=0.01)
+    assert result.values["tau"] == pytest.approx(TIME_CONSTANT_S, rel=0.02)
+    assert result.values["offset"] == 0.0
+    assert result.refined[0].accepted
+    assert result.loss <= result.search.loss
+
+
+def test_progress_adds_up_to_at_most_one(found):
+    for stage in ("search", "refine"):
+        shares = [share for name, share, _ in found.told if name == stage]
+        assert shares
+        assert sum(shares) <= 1.0 + 1e-6
+    losses = [loss for *_, loss in found.told]
+    assert losses[-1] == pytest.approx(found.fit.loss)
+
+
+def test_its_uncertainty_covers_the_truth(found):
+    spread = found.fit.uncertainty()
+    assert spread.verdict == ("accepted", "accepted")
+    assert spread.misfit == pytest.approx(1.0, abs=0.15)
+    for i, truth in enumerate((GAIN, TIME_CONSTANT_S)):
+        error = spread.standard_error[i]
+        assert abs(found.fit.values[("gain", "tau")[i]] - truth) < 4 * error
+        assert error < 0.01 * truth
+
+
+def test_auto_takes_the_derivative_where_there_is_one(episode):
+    assert Problem(Model(outside=False), [episode], SPANS, LENGTH_S, CONFIG).forward
+    assert not Problem(Model(outside=False), [episode], SPANS, LENGTH_S, replace(CONFIG, jacobian="finite")).forward
+    assert Problem(Model(outside=True), [episode], SPANS, LENGTH_S, replace(CONFIG, jacobian="forward")).forward
+
+
+def test_no_span_is_an_error(episode):
+    with pytest.raises(UsageError, match="there is no segment"):
+        Problem(Model(), [episode], [], LENGTH_S, CONFIG)

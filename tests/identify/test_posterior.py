@@ -1,0 +1,88 @@
+"""The posterior: what is drawn from it, and what its file takes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sim2real.errors import Sim2RealError
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.posterior import Posterior
+
+
+@pytest.fixture
+def posterior():
+    """Three parameters, one a transform, correlated."""
+    table = ParameterTable(
+        [
+            Parameter("gain", "1", 2.0, 0.1, 40.0),
+            Parameter("offset", "rad", 0.0, -3.0, 3.0, "linear"),
+            Parameter("share", "1", 0.4, 0.01, 0.99, "logit"),
+        ]
+    )
+    root = np.array([[0.2, 0.0, 0.0], [-0.15, 0.1, 0.0], [0.05, 0.1, 0.3]])
+    z = table.encode({"gain": 3.0, "offset": 0.5, "share": 0.3})
+    return Posterior.of(table, z, root @ root.T)
+
+
+def on_scales(values):
+    share = values["share"]
+    return np.stack([np.log(values["gain"]), values["offset"], np.log(share / (1 - share))])
+
+
+def test_draws_have_its_mean_and_covariance(posterior):
+    drawn = on_scales(posterior.sample(np.random.default_rng(0), 40_000))
+    np.testing.assert_allclose(drawn.mean(axis=1), [np.log(3.0), 0.5, np.log(0.3 / 0.7)], atol=0.01)
+    np.testing.assert_allclose(np.cov(drawn), posterior.covariance, atol=0.003)
+    wide = on_scales(posterior.sample(np.random.default_rng(0), 40_000, widen=2.0))
+    np.testing.assert_allclose(np.cov(wide), 4.0 * posterior.covariance, atol=0.012)
+
+
+def test_draws_stay_within_the_bounds(posterior):
+    drawn = posterior.sample(np.random.default_rng(1), 5000, widen=30.0)
+    for name, low, high in (("gain", 0.1, 40.0), ("offset", -3.0, 3.0), ("share", 0.01, 0.99)):
+        assert drawn[name].shape == (5000,)
+        assert drawn[name].min() == pytest.approx(low)
+        assert drawn[name].max() == pytest.approx(high)
+
+
+def test_a_direction_without_spread_is_no_problem(posterior):
+    flat = Posterior(
+        posterior.names, posterior.transform, posterior.mean, np.diag([0.0, 0.04, 0.0]), posterior.low, posterior.high
+    )
+    drawn = flat.sample(np.random.default_rng(0), 100)
+    np.testing.assert_allclose(drawn["gain"], 3.0, rtol=1e-6)
+    assert drawn["offset"].std() == pytest.approx(0.2, rel=0.3)
+
+
+def test_there_and_back_through_json(posterior):
+    back = Posterior.from_json(json.loads(json.dumps(posterior.to_json())))
+    assert (back.names, back.transform) == (posterior.names, posterior.transform)
+    for name in ("mean", "covariance", "low", "high"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(posterior, name))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: d.pop("mean"), "no posterior: KeyError"),
+        (lambda d: d.update(mean="much"), "no posterior: ValueError"),
+        (lambda d: d.update(covariance=[[1.0, 0.0], [0.0]]), "no posterior: ValueError"),
+        (lambda d: d.update(names=None), "no posterior: TypeError"),
+        (lambda d: d.update(format=99), "another format"),
+        (lambda d: d.update(low=[0.0]), "mixed sizes"),
+        (lambda d: d.update(covariance=[[1.0]]), "mixed sizes"),
+        (lambda d: d.update(names=["gain"]), "mixed sizes"),
+        (lambda d: d.update(transform=["log"]), "mixed sizes"),
+        (lambda d: d.update(transform=["log", "linear", "cubic"]), "another format"),
+        (lambda d: d["mean"].__setitem__(0, float("nan")), "no number"),
+        (lambda d: d["covariance"][1].__setitem__(1, float("inf")), "no number"),
+    ],
+)
+def test_damaged_files(posterior, damage, message):
+    document = json.loads(json.dumps(posterior.to_json()))
+    damage(document)
+    with pytest.raises(Sim2RealError, match=message):
+        Posterior.from_json(document)
+    with pytest.raises(Sim2RealError, match="no posterior"):
+        Posterior.from_json([])

@@ -1,0 +1,85 @@
+"""Prediction errors, on columns made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.identify.model import Channel
+from sim2real.identify.prediction import errors, free_runs, labels
+
+SETTLE_S = 0.2
+
+
+@pytest.fixture
+def problem():
+    """Two channels: a scalar with a velocity, and an entry of a vector without one."""
+    channels = (Channel("th", "thdot", 0.1, 0.2), Channel("q", None, 0.1, 0.2, index=2))
+    return SimpleNamespace(channels=channels)
+
+
+@pytest.fixture
+def columns():
+    """Two segments with a sample each 0.1 s, one of them held out; measured is a ramp in the second."""
+    into = np.tile(0.1 * np.arange(1, 8), 2)
+    segment = np.repeat([0, 1], 7)
+    measured = np.where(segment == 0, 3.0, 10.0 * into)
+    off = np.where(into > SETTLE_S, np.where(segment == 0, 0.5, 1.0 + (into > 0.45)), 100.0)
+    made = {
+        "t": into + 20.0 * segment,
+        "segment": segment,
+        "recording": segment + 4,
+        "held_out": segment == 1,
+        "into": into,
+    }
+    for label in ("th", "thdot", "q[2]"):
+        made[f"{label}_measured"] = measured
+        made[f"{label}_model"] = measured + off * (2.0 if label == "thdot" else -1.0)
+    return made
+
+
+def test_columns_are_named_by_field_and_index(problem):
+    assert labels(problem) == ["th", "thdot", "q[2]"]
+
+
+def test_errors_count_from_the_end_of_settling_to_the_horizon(problem, columns):
+    rows = {(r["model"], r["horizon_s"], r["held_out"]): r
+            for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001, 0.5001])}  # fmt: skip
+    assert len(rows) == 2 * 2 * 2
+    assert rows["model", 0.2001, False]["rmse"] == pytest.approx(0.5)
+    short, long = rows["model", 0.2001, True], rows["model", 0.5001, True]
+    assert short["rmse"] == pytest.approx(1.0)  # 0.3 and 0.4 s: off by 1
+    assert long["rmse"] == pytest.approx(np.sqrt((1 + 1 + 4 + 4 + 4) / 5))  # and 0.5, 0.6 and 0.7 s: off by 2
+    assert long["mae"] == pytest.approx((1 + 1 + 2 + 2 + 2) / 5)
+    assert long["thdot_rmse"] == pytest.approx(2 * long["rmse"])
+    assert long["q[2]_rmse"] == pytest.approx(long["rmse"]) == long["th_rmse"]
+
+
+def test_holding_still_says_what_was_measured_last(problem, columns):
+    rows = {(r["model"], r["held_out"]): r for r in errors(problem, columns, ["model"], SETTLE_S, [0.2001])}
+    assert rows["hold", False]["rmse"] == 0.0
+    # The last measurement before the horizon is the one at 0.2 s, 2: then 3 and 4 come.
+    assert rows["hold", True]["rmse"] == pytest.approx(np.sqrt((1 + 4) / 2))
+    assert rows["hold", True]["mae"] == pytest.approx(1.5)
+
+
+def test_no_samples_no_number(problem, columns):
+    fitted = {n: c[~columns["held_out"]] for n, c in columns.items()}
+    rows = [r for r in errors(problem, fitted, ["model"], SETTLE_S, [0.3]) if r["held_out"]]
+    assert {(r["rmse"], r["mae"], r["th_rmse"]) for r in rows} == {(None, None, None)}
+
+
+def test_free_runs_are_whole_segments(columns):
+    rows = free_runs(columns, ["th", "thdot"], ["model"], SETTLE_S)
+    assert len(rows) == 2 * 2 * 2
+    row = next(r for r in rows if r["held_out"] and r["field"] == "thdot" and r["model"] == "model")
+    assert (row["recording"], row["begin_s"], row["seconds"]) == (5, pytest.approx(20.3), pytest.approx(0.4))
+    assert row["rmse"] == pytest.approx(2 * np.sqrt((1 + 1 + 4 + 4 + 4) / 5))
+    assert row["mae"] == pytest.approx(2 * (1 + 1 + 2 + 2 + 2) / 5)
+    hold = next(r for r in rows if r["held_out"] and r["field"] == "th" and r["model"] == "hold")
+    assert hold["rmse"] == pytest.approx(np.sqrt(np.mean(np.arange(1, 6) ** 2)))
+
+
+def test_a_segment_that_ends_while_settling_is_left_out(columns):
+    short = {n: c[(columns["segment"] == 1) | (columns["into"] < SETTLE_S)] for n, c in columns.items()}
+    assert {r["recording"] for r in free_runs(short, ["th"], ["model"], SETTLE_S)} == {5}

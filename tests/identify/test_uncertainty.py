@@ -1,0 +1,198 @@
+"""Uncertainty: textbook covariances where they hold, and honest ones where they do not."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.uncertainty import Linearised, centred, from_linearised, sum_of, time_shift
+
+WIDE = 1e4
+
+
+def linear_table(count, names="abcdefg"):
+    return ParameterTable([Parameter(names[i], "1", 0.0, -WIDE, WIDE, "linear") for i in range(count)])
+
+
+def stub(table, initial_state="rest", segment_s=1.0):
+    """Return what the uncertainty asks of a problem."""
+    config = SimpleNamespace(initial_state=initial_state)
+    channels = (Channel("q", "v", 1.0, 1.0),)
+    return SimpleNamespace(table=table, config=config, channels=channels, segment_s=segment_s)
+
+
+def regression(X, y, table=None, **arguments):
+    """Fit ``y (S, C, F)`` by ``X (S, C, F, P)`` with numpy, and return the uncertainty of that, estimate and RSS."""
+    flat = X.reshape(-1, X.shape[-1])
+    b = np.linalg.lstsq(flat, y.reshape(-1), rcond=None)[0]
+    r = (flat @ b - y.reshape(-1)).reshape(y.shape)
+    table = table or linear_table(X.shape[-1])
+    at = Linearised(r, X, np.diag(12.0 / table.span**2), b)
+    return from_linearised(stub(table, **arguments), at), b, float(np.sum(r**2))
+
+
+def test_a_linear_model_with_white_noise_has_the_textbooks_covariance():
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(20, 50, 2, 3)) @ np.array([[1.0, 0.5, 0.0], [0.0, 2.0, 0.3], [0.0, 0.0, 0.1]])
+    y = X @ np.array([1.0, -2.0, 0.5]) + 0.7 * rng.normal(size=X.shape[:-1])
+    found, b, rss = regression(X, y)
+    flat = X.reshape(-1, 3)
+    expected = rss / (len(flat) - 3) * np.linalg.inv(flat.T @ flat)
+    assert found.inflation == pytest.approx(1.0, abs=0.1)
+    assert np.all(found.bootstrap >= 1.0)
+    assert np.all(found.bootstrap < 1.4)
+    widened = expected * found.inflation * np.outer(found.bootstrap, found.bootstrap)
+    np.testing.assert_allclose(found.covariance, widened, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(found.scale_covariance, widened, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(found.standard_error, np.sqrt(np.diag(widened)), rtol=1e-4)
+    np.testing.assert_allclose(found.correlation, widened / np.sqrt(np.outer(*[np.diag(widened)] * 2)), atol=1e-4)
+    assert found.misfit == pytest.approx(np.sqrt(rss / len(flat)))
+    reach = stats.t.ppf(0.975, len(flat) / found.inflation - 3) * found.standard_error
+    np.testing.assert_allclose(found.low, b - reach, rtol=1e-4)
+    np.testing.assert_allclose(found.high, b + reach, rtol=1e-4)
+    assert found.verdict == ("accepted",) * 3
+
+
+def test_few_measurements_get_the_quantile_of_student():
+    rng = np.random.default_rng(3)
+    x = np.linspace(-1, 1, 9)
+    X = np.stack([np.ones(9), x], axis=1)[None, :, None]
+    y = (2.0 + x + np.where(np.arange(9) % 2, -1.0, 1.0) * rng.uniform(0.05, 0.1, 9))[None, :, None]
+    found, b, _ = regression(X, y)
+    line = stats.linregress(x, y.ravel())
+    assert found.inflation == 1.0  # signs alternate
+    np.testing.assert_array_equal(found.bootstrap, 1.0)  # a block is too few
+    np.testing.assert_allclose(found.standard_error, [line.intercept_stderr, line.stderr], rtol=1e-5)
+    np.testing.assert_allclose((found.high - b) / found.standard_error, stats.t.ppf(0.975, 7), rtol=1e-5)
+
+
+def test_measurements_that_are_masked_do_not_count():
+    rng = np.random.default_rng(1)
+    X, noise = np.ones((1, 40, 1, 1)), rng.normal(size=(1, 40, 1))
+    found, _, _ = regression(X, noise)
+    padded = Linearised(
+        np.concatenate([noise - noise.mean(), np.zeros((1, 60, 1))], axis=1) * -1,
+        np.concatenate([X, np.zeros((1, 60, 1, 1))], axis=1),
+        np.diag(12.0 / np.array([2 * WIDE]) ** 2),
+        np.zeros(1),
+    )
+    again = from_linearised(stub(linear_table(1)), padded)
+    np.testing.assert_allclose(again.standard_error, found.standard_error, rtol=1e-6)
+
+
+def autoregressive(rng, shape, rho):
+    noise = rng.normal(size=shape)
+    rows = [noise[:, 0]]
+    for i in range(1, shape[1]):
+        rows.append(rho * rows[-1] + np.sqrt(1 - rho**2) * noise[:, i])
+    return np.stack(rows, axis=1)
+
+
+def spread_of_estimates(make, repeats=150):
+    """Return the standard deviation of estimates over data sets, and what one data set says of it, the median."""
+    found = [regression(np.ones((*make(0).shape, 1)), make(i)) for i in range(repeats)]
+    return np.std([b[0] for _, b, _ in found]), np.median([u.standard_error[0] for u, _, _ in found]), found[0][0]
+
+
+def test_noise_that_is_correlated_in_time_widens():
+    make = lambda i: autoregressive(np.random.default_rng(i), (20, 200, 1), 0.7)  # noqa: E731
+    actual, claimed, first = spread_of_estimates(make)
+    assert first.inflation == pytest.approx(1.7 / 0.3, rel=0.2)
+    assert claimed == pytest.approx(actual, rel=0.2)
+
+
+def test_what_differs_from_block_to_block_widens():
+    """The model lacks something that changes slowly: white noise on a level of each second's own."""
+
+    def make(i):
+        rng = np.random.default_rng(i)
+        return rng.normal(size=(30, 50, 1)) + rng.normal(size=(30, 1, 1))
+
+    actual, claimed, first = spread_of_estimates(make)
+    assert actual == pytest.approx(np.sqrt(1 / 30 + 1 / 1500), rel=0.2)
+    assert first.bootstrap[0] > 2.0
+    assert claimed == pytest.approx(actual, rel=0.2)
+
+
+def test_long_segments_are_many_blocks():
+    """Levels of a second each, in one segment of thirty."""
+    rng = np.random.default_rng(0)
+    y = (rng.normal(size=(30, 50, 1)) + rng.normal(size=(30, 1, 1))).reshape(1, 1500, 1)
+    found, _, _ = regression(np.ones((*y.shape, 1)), y, segment_s=30.0)
+    assert found.bootstrap[0] > 2.0
+
+
+def test_what_nothing_determines_gets_the_width_of_its_bounds():
+    table = ParameterTable([Parameter("a", "1", 0.0, -1.0, 1.0, "linear"), Parameter("b", "1", 1.0, 0.1, 10.0)])
+    rng = np.random.default_rng(0)
+    X = np.concatenate([np.ones((10, 50, 1, 1)), np.zeros((10, 50, 1, 1))], axis=-1)
+    at = Linearised(0.1 * rng.normal(size=(10, 50, 1)), X, np.diag(12.0 / table.span**2), np.array([0.2, 0.0]))
+    found = from_linearised(stub(table), at)
+    assert found.verdict == ("accepted", "not identifiable")
+    np.testing.assert_allclose(np.sqrt(found.scale_covariance[1, 1]), table.span[1] / np.sqrt(12.0), rtol=1e-5)
+    assert found.standard_error[1] == pytest.approx(1.0 * table.span[1] / np.sqrt(12.0), rel=1e-5)  # value 1 times dlog
+    assert (found.low[1], found.high[1]) == (pytest.approx(0.1, rel=0.2), pytest.approx(10.0, rel=0.2))
+
+
+def test_an_estimate_at_a_bound_is_told():
+    table = ParameterTable([Parameter("a", "1", 0.0, -1.0, 1.0, "linear")])
+    noise = 0.1 * np.random.default_rng(0).normal(size=(10, 50, 1))
+    for x, verdict in ((0.5, "accepted"), (0.995, "at a bound"), (-0.995, "at a bound")):
+        at = Linearised(noise, np.ones((10, 50, 1, 1)), np.diag(12.0 / table.span**2), np.array([x]))
+        found = from_linearised(stub(table), at)
+        assert found.verdict == (verdict,)
+        assert -1.0 <= found.low[0] < found.high[0] <= 1.0
+
+
+@pytest.fixture
+def delayed():
+    """A gain and two delays of which the residuals know the sum alone."""
+    table = ParameterTable(
+        [
+            Parameter("gain", "1", 0.0, -WIDE, WIDE, "linear"),
+            Parameter("late", "s", 0.0, 0.0, 0.06, "linear", "delay", side="measurement"),
+            Parameter("early", "s", 0.0, 0.0, 0.05, "linear", "delay", side="command"),
+        ]
+    )
+    rng = np.random.default_rng(0)
+    gain, delay = rng.normal(size=(2, 20, 60, 1))
+    X = np.stack([gain, 100.0 * delay, 100.0 * delay], axis=-1)
+    at = Linearised(rng.normal(size=gain.shape), X, np.diag(12.0 / table.span**2), np.array([1.0, 0.02, 0.025]))
+    return SimpleNamespace(table=table, at=at, X=X)
+
+
+def test_time_is_shifted_from_commands_to_measurements_where_initial_states_are_free(delayed):
+    np.testing.assert_array_equal(time_shift(stub(delayed.table, "free")), [0.0, 1.0, -1.0])
+    np.testing.assert_array_equal(time_shift(stub(delayed.table, "rest")), np.zeros(3))
+    one = delayed.table.with_fixed({"early": 0.0})
+    np.testing.assert_array_equal(time_shift(stub(one, "free")), np.zeros(2))
+
+
+def test_the_sum_of_delays_is_known_and_each_is_not(delayed):
+    found = from_linearised(stub(delayed.table, "free"), delayed.at)
+    assert found.verdict == ("accepted", "not identifiable", "not identifiable")
+    assert found.correlation[1, 2] < -0.9
+    # 0.02 s of time can go to commands, 0.025 s to measurements: uniform over those 0.045 s.
+    assert np.sqrt(found.covariance[1, 1]) == pytest.approx(0.045 / np.sqrt(12.0), rel=0.01)
+    flat = delayed.X[..., [0, 1]].reshape(-1, 2)
+    r = delayed.at.residuals
+    free = 3 + 2 * 20  # and the initial states
+    information = flat.T @ flat * (r.size - free) / np.sum(r**2) / found.inflation + np.diag([0.0, 12.0 / 0.05**2])
+    alone = np.sqrt(np.linalg.inv(information)[1, 1]) * found.bootstrap[2]
+    assert sum_of(found, [1, 2]) == pytest.approx(alone, rel=0.01)
+    assert found.low[1] == pytest.approx(0.0, abs=2e-3)
+    assert found.high[1] == pytest.approx(0.045, abs=5e-3)
+    assert found.low[2] == pytest.approx(0.0, abs=5e-3)
+    assert found.high[2] == pytest.approx(0.045, abs=5e-3)
+
+
+def test_time_is_centred_within_the_bounds(delayed):
+    z = delayed.table.encode({"gain": 1.0, "late": 0.01, "early": 0.045})
+    x = delayed.table.scale(centred(stub(delayed.table, "free"), z))[0]
+    # The measurement's delay can be 0.005 to 0.055 s: the other is 0.05 s at most, and 0 at least.
+    np.testing.assert_allclose(x[1:], [0.03, 0.025], atol=1e-6)
+    assert x[0] == pytest.approx(delayed.table.scale(z)[0][0])
+    np.testing.assert_array_equal(centred(stub(delayed.table, "rest"), z), z)

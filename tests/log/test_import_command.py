@@ -1,0 +1,157 @@
+"""`sim2real import`: files in, logs out; and the mappings of the pipelines that come with public data sets."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import foreign_files
+import numpy as np
+import pytest
+
+from sim2real import cli
+from sim2real.log import import_file, read_log
+from sim2real.stages.runs import newest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
+PIPELINE = """
+from sim2real.stages.pipeline import Pipeline
+
+PIPELINE = Pipeline(name="rig", summary="a rig", package=__name__)
+"""
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    """A working directory with a pipeline 'rig' that has a mapping, and two files to import."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pipelines" / "rig").mkdir(parents=True)
+    (tmp_path / "pipelines" / "rig" / "__init__.py").write_text(PIPELINE)
+    (tmp_path / "pipelines" / "rig" / "import.toml").write_text(foreign_files.TOML)
+    for name in ("one.npz", "two.npz"):
+        foreign_files.npz(tmp_path / name)
+    return tmp_path
+
+
+def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
+    assert cli.main(["import", "one.npz", "two.npz", "--pipeline", "rig"]) == 0
+    out, err = capsys.readouterr()
+    assert not err
+    assert out.count("wrote runs/rig/") == 2
+    assert "stamps     actuator generated, sensor recorded" in out
+    stage = newest(Path("runs"), "rig", "record")
+    assert stage.finished
+    assert stage.manifest["summary"]["samples"] == {"actuator": 50, "sensor": 50}
+    assert stage.manifest["inputs"]["source"]["path"] == str(workplace / "two.npz")
+    assert stage.manifest["inputs"]["mapping"]["path"].endswith("import.toml")
+    episode = read_log(stage.output("log"))
+    assert episode.metadata["pipeline"] == "rig"
+    np.testing.assert_array_equal(episode.steps["sensor"].start, foreign_files.STAMPS_US)
+
+
+def test_a_mapping_of_ones_own_a_format_a_range_and_a_name_for_the_log(workplace, capsys):
+    (workplace / "one.npz").rename("one.dat")
+    (workplace / "map.toml").write_text(foreign_files.TOML.replace("rig", "arm"))
+    flags = ["--mapping", "map.toml", "--format", "npz", "--samples", "10:20", "--out", "log.mcap"]
+    assert cli.main(["import", *flags, "one.dat"]) == 0
+    assert "wrote log.mcap" in capsys.readouterr().out
+    assert not Path("runs").exists()
+    assert len(read_log("log.mcap").steps["sensor"]) == 10
+    assert cli.main(["info", "log.mcap"]) == 0
+    assert 'stamps  {"actuator": "generated", "sensor": "recorded"}' in capsys.readouterr().out.replace("   ", " ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "import needs a file"),
+        (["one.npz"], "--pipeline NAME"),
+        (["one.npz", "--pipeline", "no_such_robot"], "no_such_robot"),
+        (["one.npz", "--pipeline", "pendulum"], "no mapping file"),
+        (["one.npz", "--mapping", "none.toml"], "none.toml"),
+        (["none.npz", "--pipeline", "rig"], "none.npz"),
+        (["one.npz", "--pipeline", "rig", "--format", "bag"], "lerobot"),
+        (["one.npz", "--pipeline", "rig", "--samples", "10"], "A:B"),
+        (["one.npz", "--pipeline", "rig", "--samples", "10:99"], "0:50"),
+        (["one.npz", "two.npz", "--pipeline", "rig", "--out", "log.mcap"], "one by one"),
+        (["one.npz", "--pipelines", "rig"], "did you mean --pipeline?"),
+    ],
+)
+def test_wrong_commands_exit_2_and_leave_no_run(workplace, capsys, arguments, named):
+    assert cli.main(["import", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ")
+    assert "\n\nhint: " in err
+    assert named in err
+    assert not out
+    assert not Path("runs").exists()
+
+
+def test_help_says_all_flags_and_imports_nothing_heavy():
+    code = "import sys; from sim2real import cli; cli.main(['import', '--help'])"
+    heavy = "print(sorted({'jax', 'numpy', 'mujoco'} & set(sys.modules)))"
+    command = [sys.executable, "-c", f"{code}; {heavy}"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
+    assert lines[-1] == "[]"
+    text = "\n".join(lines)
+    assert "usage: sim2real import" in text
+    for flag in ("--mapping", "--pipeline", "--format", "--samples", "--out", "--runs", "FILE"):
+        assert flag in text
+
+
+def public(name):
+    """Return a file of the public data sets; without them the test is skipped."""
+    if not (DATA / name).exists():
+        pytest.skip(f"{DATA / name} is not there; SIM2REAL_DATA names the folder of the public recordings")
+    return DATA / name
+
+
+def imported(name, pipeline):
+    return import_file(public(name), REPOSITORY / "pipelines" / pipeline / "import.toml")
+
+
+def test_the_unbalanced_disk():
+    episode = imported("unbalanced_disk/disk_fit.npz", "disk")
+    assert episode.outputs["actuator"]["action"].shape == (30_000, 1)
+    assert episode.outputs["sensor"]["th"].shape == (30_000,)
+    assert episode.duration_s == 749.975
+    assert set(episode.metadata["stamps"].values()) == {"generated"}
+    assert episode.metadata["units"] == {"action": "V", "th": "rad"}
+
+
+def test_bams_xl330():
+    name = "bam_xl330/2026-01-15_10h28m17.json"
+    episode = imported(name, "xl330")
+    entries = json.loads(public(name).read_text())["entries"]
+    ticks = [round(1e6 * entry["timestamp"]) for entry in entries]
+    for node in ("actuator", "sensor"):
+        np.testing.assert_array_equal(episode.steps[node].start, ticks)
+    commands, measured = episode.outputs["actuator"], episode.outputs["sensor"]
+    assert set(commands) == {"goal", "kp", "volts", "enabled"}
+    assert set(commands["kp"]) == {100.0}
+    assert set(commands["enabled"]) == {0.0, 1.0}
+    np.testing.assert_array_equal(measured["position"], [entry["position"] for entry in entries])
+    np.testing.assert_array_equal(measured["speed"], [entry["speed"] for entry in entries])
+    assert set(episode.metadata["stamps"].values()) == {"recorded"}
+
+
+def test_sages_so101(tmp_path):
+    name = "so101/single_joint_rotation.npz"
+    episode = imported(name, "so101")
+    with np.load(public(name)) as data:
+        np.testing.assert_array_equal(episode.outputs["actuator"]["goal"], data["cmd_rad"])
+        np.testing.assert_array_equal(episode.outputs["sensor"]["position"], data["q_rad"])
+        np.testing.assert_array_equal(episode.outputs["sensor"]["velocity"], data["dq_rad_s"])
+        np.testing.assert_array_equal(episode.steps["sensor"].start, np.rint(1e6 * data["t_meas_s"]))
+    assert episode.outputs["sensor"]["position"].shape == (5200, 6)
+
+
+@pytest.mark.parametrize("pipeline", ["disk", "xl330", "so101"])
+def test_the_pipelines_mappings_are_for_them(pipeline):
+    from sim2real.log import load_mapping
+
+    mapping = load_mapping(REPOSITORY / "pipelines" / pipeline / "import.toml")
+    assert mapping.pipeline == pipeline
+    assert set(mapping.nodes) == {"actuator", "sensor"}
