@@ -62,7 +62,7 @@ class DiskWorld(JointWorld):
             gain=28.0,
             gravity=134.0,
             friction=FrictionParams(viscous=1.5, load=0.047),
-            swing=0.0,
+            swing=0.05,
             voltage_offset=0.0,
             cogging=0.0,
             start=jnp.zeros(2),
@@ -90,11 +90,12 @@ class DiskWorld(JointWorld):
     def forces(self, params: DiskParams, position: Any, velocity: Any, command: Any) -> Forces:
         """Return motor, gravity and friction."""
         p = params
-        radial = p.gravity * jnp.cos(position) + p.swing * velocity**2
+        along = jnp.cos(position)
+        radial = p.gravity * along + p.swing * velocity**2
         return Forces(
             acceleration=p.gain * (command + p.voltage_offset)
             - p.gravity * jnp.sin(position)
-            + p.cogging * jnp.cos(2.0 * position),
+            + p.cogging * (2.0 * along**2 - 1.0),
             damping=friction.damping(p.friction, velocity),
             dry=friction.dry(p.friction, velocity, radial),
         )

@@ -16,6 +16,7 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from .model import JOINTS, Actuator, ActuatorParams, ArmWorld, Goal, Sensor, nominal
 
 RATE_HZ, WORLD_HZ = 1 / 0.02006, 4 / 0.02006
+_TICK_S = 1 / WORLD_HZ
 UNITS = {"position": "rad", "goal": "rad"}
 _SATURATES = ("rotation", "wrist_roll", "jaw")
 """The other servos never came to their limit in the recordings."""
@@ -49,6 +50,11 @@ def table(max_delay_s: float) -> ParameterTable:
         Parameter("table_ratio", "1", 0.85, 0.1, 2.6, leaf="world.table.ratio", about="pitch's share of the contact"),
         Parameter("table_stiffness", "1", 0.8, 0.05, 4.0, leaf="world.table.stiffness", about="contact over servo"),
         Parameter(
+            *("sensor_delay", "s", _TICK_S, 0.0, 2 * _TICK_S, linear, "delay", "the sensor's interpolation"),
+            free=False,
+            side="measurement",
+        ),
+        Parameter(
             "delay", "s", 0.0, 0.0, max_delay_s, linear, "delay", "goal to position", "actuator.delay", side="command"
         ),
     ]
@@ -71,7 +77,8 @@ class IdentifiableArm:
         world = ArmWorld("world", WORLD_HZ, substep_s=0.0051)
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=1)
         world.connect(actuator, skip=True, delay_dist=to_world)
-        sensor.connect(world)
+        # Samples fall between ticks: a tick of delay, for the sensor to interpolate.
+        sensor.connect(world, delay_dist=TrainableDist.create(_TICK_S, 0.0, 2 * _TICK_S, "linear"))
         return {n.name: n for n in (sensor, actuator, world)}
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class ServoParams(Base):
     back_emf: Any = 0.05
     softness: Any = 0.8
     armature: Any = 0.0015
-    viscous: Any = 0.002
+    viscous: Any = 0.005
     coulomb: Any = 0.01
     gears: Any = 0.15
     static: Any = 0.05
@@ -119,7 +119,7 @@ class ServoWorld(JointWorld):
 
 @struct.dataclass
 class ActuatorParams(Base):
-    """Delay from a goal's time stamp to the motor, and back to the measurement's [s]."""
+    """Delay from a goal's time stamp to the motor, and back to the measurement's, less the sensor's tick [s]."""
 
     delay: Any = None
 

@@ -13,6 +13,7 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from .model import Actuator, ActuatorParams, Command, Sensor, ServoParams, ServoWorld
 
 RATE_HZ, WORLD_HZ = 200.0, 1000.0
+_TICK_S = 1 / WORLD_HZ
 UNITS = {"position": "rad", "goal": "rad"}
 _FASTEST_HZ = 300.0
 """Goals came 3.5 to 7 ms apart."""
@@ -34,6 +35,11 @@ def table(max_delay_s: float) -> ParameterTable:
             Parameter("stribeck", "rad/s", 0.1, 0.02, 1.0, about="speed that ends it", leaf="world.stribeck_rad_s"),
             Parameter("released", "1", 0.5, 0.01, 1.0, linear, about="share, torque off", leaf="world.released"),
             Parameter("offset", "rad", 0.0, -0.06, 0.06, linear, "measurement", "encoder", leaf="world.offset"),
+            Parameter(
+                *("sensor_delay", "s", _TICK_S, 0.0, 2 * _TICK_S, linear, "delay", "the sensor's interpolation"),
+                free=False,
+                side="measurement",
+            ),
             Parameter(
                 "delay", "s", 0.0, 0.0, max_delay_s, linear, "delay", "goal to angle", "actuator.delay", side="command"
             ),
@@ -58,7 +64,7 @@ class IdentifiableServo:
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=1)
         world.connect(actuator, skip=True, delay_dist=to_world)
         # Samples fall between ticks: a tick of delay, for the sensor to interpolate.
-        sensor.connect(world, delay_dist=TrainableDist.create(1 / WORLD_HZ, 0.0, 2 / WORLD_HZ, "linear"))
+        sensor.connect(world, delay_dist=TrainableDist.create(_TICK_S, 0.0, 2 * _TICK_S, "linear"))
         return {n.name: n for n in (sensor, actuator, world)}
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from sim2real.stages.pipeline import load_pipeline
 
 SETTLE_S = 0.3
 """How much of the past the initial state of the disk's free run is estimated from [s]."""
+PARTS = ("fit", "half", "sysid", "delays", "speed")
 DELAY_PARTS = [(5000 * i, 5000 * i + 4000) for i in range(5)]
 DELAY_STARTS_S = (0.0, 0.02, 0.04, 0.06)
 
@@ -60,32 +61,40 @@ def main(arguments: list[str]) -> dict[str, Any]:
     parser.add_argument("--fit", help="what to fit on; see benches/recordings.py")
     parser.add_argument("--test", help="what to judge on")
     parser.add_argument("--seeds", type=int, nargs="+", help="seeds of the search (xl330: 0 1 2, else 0)")
-    parser.add_argument("--skip", nargs="*", default=[], choices=["sysid", "speed", "delays", "half"], help="leave out")
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="what to measure")
     options = parser.parse_args(arguments)
-    case = make_case(options.case)
+    case, parts = make_case(options.case), options.parts
     fitted = recordings.load(case.name, options.data, options.fit or SPECS[case.name])
     test = recordings.load(case.name, options.data, options.test or SPECS[f"{case.name}_test"], PAST)
-    seeds = options.seeds or ([0, 1, 2] if case.name == "xl330" else [0])
     rows: list[dict[str, Any]] = []
     found: list[Fit] = []
+    if "fit" in parts:
+        found, rows = fit_and_judge(case, fitted, test, options.seeds)
+        if case.name == "xl330" and "half" in parts:
+            rows += half_step(case, found, test)
+        if "sysid" in parts:
+            rows += yardstick(case, fitted, test, rows)
+    if case.name == "disk" and "delays" in parts:
+        rows += delays(case, options.data)
+    if case.name == "disk" and "speed" in parts:
+        rows += speed(case, fitted)
+    return {"rows": rows, "fit": list(fitted), "test": list(test), "values": [f.values for f in found]}
+
+
+def fit_and_judge(
+    case: Case, fitted: Mapping[str, Episode], test: Mapping[str, Episode], seeds: Sequence[int] | None
+) -> tuple[list[Fit], list[dict[str, Any]]]:
+    """Fit once a seed, and return the fits and what they are worth."""
+    seeds = seeds or ([0, 1, 2] if case.name == "xl330" else [0])
+    rows, found = [], []
     for seed in seeds:
-        own = replace(case, config=replace(case.config, seed=seed))
         begin = time.monotonic()
-        found.append(identify(own, fitted))
+        found.append(identify(replace(case, config=replace(case.config, seed=seed)), fitted))
         label = f"/seed_{seed}" if len(seeds) > 1 else ""
         goal = "< 60" if case.name == "disk" else ""
         rows.append(row(f"{case.name}/fit_s{label}", time.monotonic() - begin, "s", goal=goal))
     results = [predict(case, {"identified": f.values}, test) for f in found]
-    rows += judged(case, found[0], results, test, seeds)
-    if case.name == "xl330" and "half" not in options.skip:
-        rows += half_step(case, found, test)
-    if case.name == "disk" and "delays" not in options.skip:
-        rows += delays(case, options.data)
-    if "sysid" not in options.skip:
-        rows += yardstick(case, fitted, test, rows)
-    if case.name == "disk" and "speed" not in options.skip:
-        rows += speed(case, fitted)
-    return {"rows": rows, "fit": list(fitted), "test": list(test), "values": [f.values for f in found]}
+    return found, rows + judged(case, found[0], results, test, seeds)
 
 
 def make_case(name: str) -> Case:
@@ -277,13 +286,16 @@ def speed(case: Case, fitted: Mapping[str, Episode]) -> list[dict[str, Any]]:
     episode = next(iter(fitted.values()))
     problem = Problem(case.model, [episode], [Span(0, 0.3)], 150.0, config)
     device = jax.devices()[0].platform
-    count = 65536 if device == "gpu" else 512
+    count = 65536 if device == "gpu" else 2048
     candidates = 0.3 * jax.random.normal(jax.random.key(0), (count, len(problem.table)))
     run = jax.jit(lambda c: problem.losses(c, c[0]))
     run(candidates).block_until_ready()
-    begin = time.monotonic()
-    run(candidates + 0.01).block_until_ready()
-    seconds = time.monotonic() - begin
+    times = []
+    for i in range(3):
+        begin = time.monotonic()
+        run(candidates + 0.01 * i).block_until_ready()
+        times.append(time.monotonic() - begin)
+    seconds = float(np.median(times))
     rows = [row(f"disk/{device}/candidates_per_s", count / seconds, "1/s", "30,000 steps each")]
     if device == "gpu":
         rows.append(row(f"disk/{device}/generation_of_65536_s", seconds, "s", "30,000 steps each"))

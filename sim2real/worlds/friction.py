@@ -1,6 +1,6 @@
-"""Friction of motors and gears, each term a few lines; a term whose coefficients are 0 is not there.
+"""Friction of motors and gears, each term a few lines; a term without a coefficient is not there, and costs nothing.
 
-Which terms a robot has is a matter of data: the leaves of ``FrictionParams`` that its parameters name.
+Which terms a robot has is a matter of data: those whose coefficients are numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sim2real.graph.base import Base
 
 @struct.dataclass
 class FrictionParams(Base):
-    """Coefficients, per unit of inertia: accelerations for a joint in [rad].
+    """Coefficients, per unit of inertia: accelerations for a joint in [rad]; None leaves a term out.
 
     Attributes:
         viscous: Proportional to speed [1/s].
@@ -26,17 +26,19 @@ class FrictionParams(Base):
         load: Share of the load that rubs: of gears and bearings [1].
     """
 
-    viscous: Any = 0.0
-    drag: Any = 0.0
-    coulomb: Any = 0.0
-    static: Any = 0.0
+    viscous: Any = None
+    drag: Any = None
+    coulomb: Any = None
+    static: Any = None
     stribeck_rad_s: Any = 0.1
-    load: Any = 0.0
+    load: Any = None
 
 
 def damping(p: FrictionParams, velocity: Any) -> Any:
     """Return the friction proportional to speed, per speed [1/s]: viscous and drag."""
-    return p.viscous + p.drag * jnp.abs(velocity)
+    terms = [] if p.viscous is None else [p.viscous]
+    terms += [] if p.drag is None else [p.drag * jnp.abs(velocity)]
+    return sum(terms, start=0.0)
 
 
 def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
@@ -47,8 +49,10 @@ def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
         velocity: [rad/s].
         load: What presses the rubbing faces together [rad/s^2]; its sign does not matter.
     """
-    loose = jnp.exp(-jnp.abs(velocity) / p.stribeck_rad_s)
-    return p.coulomb + p.static * loose + p.load * jnp.abs(load)
+    terms = [] if p.coulomb is None else [p.coulomb]
+    terms += [] if p.static is None else [p.static * jnp.exp(-jnp.abs(velocity) / p.stribeck_rad_s)]
+    terms += [] if p.load is None else [p.load * jnp.abs(load)]
+    return sum(terms, start=0.0)
 
 
 def smooth(velocity: Any, width_rad_s: float) -> Any:

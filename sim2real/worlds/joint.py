@@ -41,7 +41,8 @@ class Forces(NamedTuple):
 class JointWorld(BaseWorld):
     """Integrates joints: position Verlet, damping by the trapezoidal rule, dry friction exactly.
 
-    Forces are evaluated in the middle of a substep, so the method is of second order where nothing sticks. On a motor
+    Forces are evaluated in the middle of a substep, so the method is of second order where nothing sticks and nothing
+    but damping depends on the speed. On a motor
     with an eccentric mass, substeps of 5 ms were as good as of 0.6 ms, and a delay that was fitted with them was not
     biased; with semi-implicit Euler it was off by half a substep.
 

@@ -31,7 +31,7 @@ class OdeWorld(BaseWorld):
         super().__init__(name, rate, color=color, order=order)
         if not substep_s > 0:
             raise UsageError(f"world {name!r}: substep_s must be positive, got {substep_s} s")
-        self.substeps = math.ceil(round(1.0 / (self.rate * substep_s), 9))
+        self.substeps = max(1, math.ceil(round(1.0 / (self.rate * substep_s), 9)))
 
     @abstractmethod
     def derivative(self, params: Any, state: Any, command: Any) -> Any:

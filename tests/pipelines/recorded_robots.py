@@ -1,0 +1,134 @@
+"""What the tests of recorded robots share: episodes from arrays, public recordings, checks of their tables."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.graph.base import GraphState
+from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.schedule import draw
+from sim2real.identify.leaves import get_leaf
+from sim2real.identify.prediction import samples
+from sim2real.log.importer import import_file
+from sim2real.log.mapping import load_mapping
+from sim2real.runtime.compiled import CompiledGraph
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
+
+
+def episode(stamps_s, **outputs):
+    """Return a recording in which every node stepped at the same stamps."""
+    at = np.round(np.asarray(stamps_s) * 1e6).astype(np.int64)
+    none = np.full(len(at), -1)
+    steps = {n: Steps(scheduled=at, start=at, woken=at, ts_overwrite=none, end=at, drift=0 * at) for n in outputs}
+    return Episode(steps=steps, messages={}, outputs=outputs)
+
+
+def public(pipeline, pattern, part=None):
+    """Return files of a public data set as episodes, by name; without them the test is skipped."""
+    files = sorted(DATA.glob(pattern))
+    if not files:
+        pytest.skip(f"no {pattern} in {DATA}; SIM2REAL_DATA names the folder of the public recordings")
+    mapping = load_mapping(REPOSITORY / "pipelines" / pipeline / "import.toml")
+    return {f.stem: import_file(f, mapping, part) for f in files}
+
+
+def predictions(problem, values, settle_s=0.0):
+    """Return times after settling, measurements and predictions, ``(N,)``, ``(N, channels)`` twice, a recording each.
+
+    Args:
+        problem: One segment a recording.
+        values: Of all parameters.
+        settle_s: What the initial state is estimated from [s].
+    """
+    columns = samples(problem, {"model": fixed(problem.table) | values}, settle_s)
+    names = [c.position if c.index is None else f"{c.position}[{c.index}]" for c in problem.channels]
+    found = []
+    for r in np.unique(columns["recording"]):
+        pick = (columns["recording"] == r) & (columns["into"] > settle_s)
+        both = (np.stack([columns[f"{n}_{k}"][pick] for n in names], axis=1) for k in ("measured", "model"))
+        found.append((columns["into"][pick] - settle_s, *both))
+    return found
+
+
+def fixed(table):
+    """Return what no identification moves, by name: the tick that a sensor needs to interpolate."""
+    return {p.name: p.nominal for p in table if not p.free}
+
+
+def rmse(error):
+    return np.sqrt(np.mean(np.square(error), axis=0))
+
+
+def check_leaves(model, delay_s):
+    """Every parameter's leaf exists in the parameters of the nodes, and its value arrives there, and nowhere else."""
+    nodes = model.nodes(delay_s)
+    table = model.parameters
+    zero = jnp.zeros(2 * len(model.channels))
+    nominal = {p.name: jnp.float32(p.nominal) for p in table}
+    base = model.params(nominal, zero)
+    assert set(base) <= set(nodes)
+    for name, own in base.items():
+        assert type(own) is type(nodes[name].init_params())
+    for p in table:
+        assert p.leaf is not None or p.name in fixed(table)
+        if p.leaf is None:
+            continue
+        assert p.low <= p.nominal <= p.high
+        other = p.low + 0.37 * (p.high - p.low)
+        moved = model.params({**nominal, p.name: jnp.float32(other)}, zero)
+        assert float(get_leaf(moved, p.leaf)) == pytest.approx(other, rel=1e-5)
+        for q in table:
+            if q.name != p.name and q.leaf is not None:
+                assert float(get_leaf(moved, q.leaf)) == pytest.approx(q.nominal, rel=1e-5, abs=1e-9)
+
+
+def check_start(model, delay_s, start):
+    """The graph builds and runs, and of the world's first output the sensor reads the measured start.
+
+    Returns:
+        The world's initial state and the nodes' parameters.
+    """
+    nodes = model.nodes(delay_s)
+    for name in model.given:  # it has no step of its own
+        nodes[name].step = lambda ss, node=nodes[name]: (ss, node.init_output())
+    graph = CompiledGraph(nodes, model.sensor, draw(nodes, 0.2))
+    params = model.params(
+        {p.name: jnp.float32(p.low + 0.37 * (p.high - p.low)) for p in model.parameters}, jnp.asarray(start)
+    )
+    _, records = jax.jit(lambda p: graph.rollout(graph.init(jax.random.key(0), params=p), (model.sensor,)))(params)
+    record = records[model.sensor]
+    readings = np.asarray(getattr(record.output, model.channels[0].position))[np.asarray(record.seq) >= 0]
+    assert len(readings) >= 0.2 * nodes[model.sensor].rate - 1
+    assert np.isfinite(readings).all()
+    gs = GraphState(params=params)
+    first = {-1: SimpleNamespace(data=nodes["world"].init_output(graph_state=gs))}
+    _, read = nodes[model.sensor].step(SimpleNamespace(params=params.get(model.sensor), inputs={"world": first}))
+    read = np.ravel(getattr(read, model.channels[0].position))
+    np.testing.assert_allclose(read, start[: len(model.channels)], atol=2e-6)
+    return nodes["world"].init_state(graph_state=gs), params
+
+
+def effects(problem, values, factor=0.1):
+    """Return by how much each parameter moves the predictions [deviations], from values to ``factor`` of its bounds."""
+    table = problem.table
+    values = fixed(table) | values
+    names = [n for n in values if table[n].free]
+    rows = {n: np.full(len(names) + 1, v, np.float32) for n, v in values.items()}
+    for i, n in enumerate(names):
+        p = table[n]
+        step = factor * (p.high - p.low)
+        rows[n][i + 1] += step if values[n] + step <= p.high else -step
+    zero = jnp.zeros(2 * len(problem.channels))
+    run = jax.jit(
+        jax.vmap(lambda v: jax.vmap(lambda e: problem.residuals(v, e, zero)[0])(jnp.arange(problem.segments)))
+    )
+    residuals = np.asarray(run({n: jnp.asarray(r) for n, r in rows.items()}))
+    moved = np.abs(residuals[1:] - residuals[0]).reshape(len(names), -1).max(axis=1)
+    return dict(zip(names, moved, strict=True))

@@ -1,0 +1,188 @@
+"""Each term of friction against its formula, and blocks on inclines that stick, slide and creep."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim2real.worlds import friction
+from sim2real.worlds.friction import FrictionParams
+from sim2real.worlds.joint import Forces, JointState, JointWorld
+
+G = 9.81
+TICK_S = 0.01
+
+speeds = st.floats(-50.0, 50.0, width=32)
+coefficients = st.floats(0.0, 20.0, width=32)
+
+
+class Block(JointWorld):
+    """A block of unit mass on an incline, whose weight presses it down: the command is the slope [rad]."""
+
+    def init_state(self, rng=None, graph_state=None):
+        return JointState(jnp.float32(0.0), jnp.float32(0.0))
+
+    def command(self, step_state):
+        return jnp.float32(0.0)
+
+    def forces(self, params, position, velocity, command):
+        return Forces(
+            acceleration=G * jnp.sin(command),
+            damping=friction.damping(params, velocity),
+            dry=friction.dry(params, velocity, G * jnp.cos(command)),
+        )
+
+
+def slide(params, slope, steps, start=(0.25, 0.0), world=None):
+    """Return positions and velocities after every tick, ``(steps, )`` each."""
+    world = world or Block("block", 1 / TICK_S, substep_s=TICK_S)
+
+    def tick(state, _):
+        state = world.integrate(params, state, slope)
+        return state, state
+
+    first = JointState(*(jnp.float32(x) for x in start))
+    states = jax.jit(lambda s: jax.lax.scan(tick, s, length=steps)[1])(first)
+    return np.asarray(states.position), np.asarray(states.velocity)
+
+
+def test_a_term_whose_coefficients_are_0_is_not_there():
+    p = FrictionParams()
+    assert [float(friction.damping(p, v)) for v in (0.0, -3.0)] == [0.0, 0.0]
+    assert [float(friction.dry(p, v, 7.0)) for v in (0.0, -3.0)] == [0.0, 0.0]
+
+
+@given(speed=speeds, viscous=coefficients, drag=coefficients)
+def test_damping_is_viscous_and_drag(speed, viscous, drag):
+    found = friction.damping(FrictionParams(viscous=viscous, drag=drag), jnp.float32(speed))
+    assert float(found) == pytest.approx(viscous + drag * abs(speed), rel=1e-5, abs=1e-6)
+
+
+@given(
+    speed=speeds,
+    load=st.floats(-200.0, 200.0, width=32),
+    coulomb=coefficients,
+    static=coefficients,
+    stribeck=st.floats(0.0625, 10.0, width=32),
+    share=st.floats(0.0, 1.0, width=32),
+)
+def test_dry_friction_is_coulomb_stribeck_and_a_share_of_the_load(speed, load, coulomb, static, stribeck, share):
+    p = FrictionParams(coulomb=coulomb, static=static, stribeck_rad_s=stribeck, load=share)
+    expected = coulomb + static * math.exp(-abs(speed) / stribeck) + share * abs(load)
+    assert float(friction.dry(p, jnp.float32(speed), load)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+def test_stribeck_falls_from_static_and_coulomb_to_coulomb():
+    p = FrictionParams(coulomb=2.0, static=1.5, stribeck_rad_s=0.3)
+    found = np.asarray(friction.dry(p, jnp.array([0.0, 0.3, 0.6, 0.9, 30.0])))
+    assert found[0] == pytest.approx(3.5)
+    assert found[1] == pytest.approx(2.0 + 1.5 / math.e, rel=1e-6)
+    assert np.all(np.diff(found) < 0)
+    assert found[-1] == pytest.approx(2.0, rel=1e-6)
+    np.testing.assert_array_equal(found, friction.dry(p, -jnp.array([0.0, 0.3, 0.6, 0.9, 30.0])))
+
+
+@given(speed=speeds, most=st.floats(0.0, 100.0, width=32))
+def test_stopped_takes_away_up_to_the_most_and_never_reverses(speed, most):
+    after = float(friction.stopped(jnp.float32(speed), jnp.float32(most)))
+    assert after == pytest.approx(math.copysign(max(abs(speed) - most, 0.0), speed), rel=1e-5, abs=1e-6)
+    if abs(speed) <= most:
+        assert after == 0.0
+
+
+LIMIT = math.atan(0.3)
+"""Slope up to which a block with a coefficient of 0.3 stays."""
+
+
+@pytest.mark.parametrize("slope", [0.99 * LIMIT, -0.99 * LIMIT])
+def test_a_block_below_the_limit_does_not_move_at_all(slope):
+    position, velocity = slide(FrictionParams(load=0.3), slope, 10_000)
+    assert set(position) == {np.float32(0.25)}
+    assert set(velocity) == {0.0}
+
+
+@pytest.mark.parametrize("slope", [1.1 * LIMIT, -1.1 * LIMIT])
+@pytest.mark.parametrize("substeps", [1, 5])
+def test_a_block_above_the_limit_moves_with_the_analytic_acceleration(slope, substeps):
+    world = Block("block", 1 / TICK_S, substep_s=TICK_S / substeps)
+    position, velocity = slide(FrictionParams(load=0.3), slope, 200, (0.0, 0.0), world)
+    expected = math.copysign(G * (math.sin(abs(slope)) - 0.3 * math.cos(slope)), slope)
+    t = TICK_S * np.arange(1, 201)
+    np.testing.assert_allclose(velocity, expected * t, rtol=2e-5)
+    np.testing.assert_allclose(position, expected * t**2 / 2, rtol=5e-5)
+
+
+def test_what_breaks_loose_keeps_sliding_where_it_would_not_have_started():
+    p = FrictionParams(coulomb=1.0, static=1.0, stribeck_rad_s=0.1)
+    between = math.asin(1.5 / G)
+    position, _ = slide(p, between, 10_000)
+    assert set(position) == {np.float32(0.25)}
+    _, velocity = slide(p, between, 400, (0.0, 0.5))
+    assert np.diff(velocity)[-1] / TICK_S == pytest.approx(1.5 - 1.0, rel=1e-3)
+    _, velocity = slide(p, math.asin(2.02 / G), 1000, (0.0, 0.0))
+    assert np.diff(velocity)[-1] / TICK_S == pytest.approx(2.02 - 1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("speed", [1.0, -1.0])
+def test_it_stops_where_the_work_of_friction_says_and_stays(speed):
+    """Only the step in which it stops is cut short: it adds an eighth of what friction moves in a step, at most."""
+    deceleration = 3.7
+    position, velocity = slide(FrictionParams(coulomb=deceleration), 0.0, 200, (0.0, speed))
+    stopped = np.flatnonzero(velocity == 0.0)
+    assert stopped[0] == math.ceil(1.0 / (deceleration * TICK_S)) - 1
+    assert len(set(position[stopped])) == 1
+    beyond = abs(position[-1]) - 1.0 / (2 * deceleration)
+    assert -1e-6 < beyond < deceleration * TICK_S**2 / 8 + 1e-6
+
+
+def test_drag_slows_as_the_reciprocal_of_time():
+    drag, v0 = 0.8, 5.0
+    world = Block("block", 1 / TICK_S, substep_s=TICK_S / 50)
+    position, velocity = slide(FrictionParams(drag=drag), 0.0, 200, (0.0, v0), world)
+    grown = 1.0 + drag * v0 * TICK_S * np.arange(1, 201)
+    np.testing.assert_allclose(velocity, v0 / grown, rtol=5e-4)
+    np.testing.assert_allclose(position, np.log(grown) / drag, rtol=5e-4)
+
+
+class Creeping(Block):
+    """The same block, with a differentiable sign instead of friction that sticks."""
+
+    def forces(self, params, position, velocity, command):
+        push = G * jnp.sin(command) - params.coulomb * friction.smooth(velocity, 0.05)
+        return Forces(acceleration=push, damping=0.0, dry=0.0)
+
+
+def test_smooth_creeps_where_real_friction_sticks():
+    p, slope = FrictionParams(coulomb=3.0), math.asin(1.5 / G)
+    position, _ = slide(p, slope, 500)
+    assert position[-1] == np.float32(0.25)
+    position, velocity = slide(p, slope, 500, world=Creeping("block", 1 / TICK_S, substep_s=0.001))
+    assert velocity[-1] == pytest.approx(0.05 * math.atanh(0.5), rel=1e-3)
+    assert position[-1] > 0.25 + 4.5 * velocity[-1]
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.03, -0.2])
+def test_smooth_is_differentiable_and_becomes_the_sign(speed):
+    slope = jax.grad(friction.smooth)(speed, 0.05)
+    assert float(slope) == pytest.approx((1.0 - math.tanh(speed / 0.05) ** 2) / 0.05, rel=1e-3)
+    assert float(friction.smooth(jnp.float32(speed), 1e-6)) == np.sign(speed)
+
+
+def test_a_trajectory_with_smooth_friction_has_the_derivative_that_differences_tell():
+    world = Creeping("block", 1 / TICK_S, substep_s=0.001)
+
+    def end(coulomb):
+        params = FrictionParams(coulomb=coulomb)
+        state = JointState(jnp.asarray(0.0), jnp.asarray(0.4))
+        step = lambda s, _: (world.integrate(params, s, 0.1), None)  # noqa: E731
+        return jax.lax.scan(step, state, length=50)[0].position
+
+    with jax.enable_x64(True):
+        slope = float(jax.jit(jax.grad(end))(2.0))
+        difference = float(jax.jit(end)(2.0 + 1e-5) - jax.jit(end)(2.0 - 1e-5)) / 2e-5
+    assert slope == pytest.approx(difference, rel=1e-5)
+    assert slope < -0.01

@@ -1,0 +1,112 @@
+"""What servos make of commands, against integers and floats by hand."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from sim2real.worlds.servo import motor_torque, play, position_duty, saturated
+
+COUNTS = 4096 / (2 * math.pi)
+FULL = 885
+
+
+def duty_by_hand(goal_counts, position_counts, kp):
+    """The firmware in whole numbers: PWM steps, cut towards 0."""
+    pwm = int(kp * (goal_counts - position_counts) / 256)  # int() cuts
+    return max(-FULL, min(FULL, pwm)) / FULL
+
+
+@given(goal=st.integers(-4096, 4096), position=st.integers(-4096, 4096), kp=st.integers(1, 2000))
+def test_position_duty_is_what_the_firmware_computes_in_integers(goal, position, kp):
+    found = position_duty(jnp.float32(goal / COUNTS), jnp.float32(position / COUNTS), kp / 256, COUNTS, float(FULL))
+    assert float(found) == pytest.approx(duty_by_hand(goal, position, kp), abs=1e-6)
+
+
+@given(goal=st.floats(-6.0, 6.0), position=st.floats(-6.0, 6.0), kp=st.integers(1, 2000))
+def test_between_counts_goal_and_position_are_rounded_to_the_nearest(goal, position, kp):
+    counts = [x * COUNTS for x in (goal, position)]
+    assume(all(abs(c - math.floor(c) - 0.5) > 0.01 for c in counts))  # float32 decides ties as it likes
+    with jax.enable_x64(True):
+        found = float(position_duty(goal, position, kp / 256, COUNTS, float(FULL)))
+    assert found == pytest.approx(duty_by_hand(round(counts[0]), round(counts[1]), kp), abs=1e-12)
+
+
+def test_an_error_below_a_step_of_the_pwm_does_nothing():
+    """At a gain of 100/256 two counts are not even one step; three are, in both directions."""
+    duties = [float(position_duty(c / COUNTS, 0.0, 100 / 256, COUNTS, 885.0)) for c in range(-3, 4)]
+    assert duties == pytest.approx([-1 / 885, 0.0, 0.0, 0.0, 0.0, 0.0, 1 / 885], abs=1e-9)
+
+
+@pytest.mark.parametrize(("off", "duty"), [(10.0, 1.0), (-10.0, -1.0)])
+def test_the_duty_ends_at_full(off, duty):
+    assert float(position_duty(off, 0.0, 800 / 256, COUNTS, 885.0)) == duty
+
+
+def test_an_error_saturates_either_way():
+    errors = jnp.array([-2.0, -0.3, 0.0, 0.2, 0.31])
+    np.testing.assert_allclose(saturated(errors, 0.3), [-0.3, -0.3, 0.0, 0.2, 0.3])
+
+
+duties, velocities = st.floats(-1.0, 1.0), st.floats(-20.0, 20.0)
+stalls, back_emfs = st.floats(0.1, 5.0), st.floats(0.0, 1.0)
+
+
+@given(duty=duties, velocity=velocities, stall=stalls, back_emf=back_emfs, softness=st.floats(0.05, 5.0))
+def test_the_torque_never_exceeds_the_reciprocal_of_the_softness(duty, velocity, stall, back_emf, softness):
+    with jax.enable_x64(True):
+        torque = float(motor_torque(duty, velocity, stall, back_emf, softness))
+        linear = float(motor_torque(duty, velocity, stall, back_emf))
+    assert abs(torque) < 1.0 / softness
+    assert abs(torque) <= abs(linear)
+    assert torque * linear >= 0.0
+    assert 1.0 / abs(torque) == pytest.approx(1.0 / abs(linear) + softness) if torque else linear == 0.0
+
+
+@given(duty=duties, velocity=velocities, stall=stalls, back_emf=back_emfs)
+def test_without_softness_the_torque_is_linear(duty, velocity, stall, back_emf):
+    with jax.enable_x64(True):
+        torque = float(motor_torque(duty, velocity, stall, back_emf))
+    assert torque == pytest.approx(stall * duty - back_emf * velocity, abs=1e-12)
+
+
+def test_the_torque_nears_its_limit_and_ends_at_the_idle_speed():
+    assert float(motor_torque(1.0, 0.0, 1e6, 0.05, 0.8)) == pytest.approx(1 / 0.8, rel=1e-4)
+    assert float(motor_torque(1.0, 20.0, 1.0, 0.05, 0.8)) == pytest.approx(0.0, abs=1e-7)
+
+
+def loop(gap, amplitude=1.0):
+    """Drive a part through two turns of a sine; return driver and follower of the second."""
+    driver = amplitude * np.sin(np.linspace(0.0, 4 * np.pi, 2001))
+
+    def step(follower, d):
+        follower = play(d, follower, gap)
+        return follower, follower
+
+    _, follower = jax.lax.scan(step, jnp.float32(0.0), jnp.asarray(driver, jnp.float32))
+    return driver[1000:], np.asarray(follower)[1000:]
+
+
+@pytest.mark.parametrize("gap", [0.1, 0.6])
+def test_the_loop_of_play_is_as_wide_as_the_gap(gap):
+    driver, follower = loop(gap)
+    up, down = np.gradient(driver) > 0, np.gradient(driver) < 0
+    for level in (-0.4 * (1 - gap), 0.0, 0.4 * (1 - gap)):
+        crossings = []
+        for way in (up, down):
+            near = np.flatnonzero(way & (np.abs(follower - level) < 0.01) & (np.abs(np.gradient(follower)) > 1e-4))
+            crossings.append(np.interp(level, *(a[near][np.argsort(follower[near])] for a in (follower, driver))))
+        assert crossings[0] - crossings[1] == pytest.approx(gap, abs=1e-3)
+    assert np.ptp(follower) == pytest.approx(2.0 - gap, abs=1e-3)
+
+
+def test_within_the_gap_the_part_stays_and_without_one_it_follows():
+    driver, follower = loop(0.5, amplitude=0.24)
+    assert np.ptp(driver) > 0.4
+    assert set(follower) == {0.0}
+    driver, follower = loop(0.0)
+    np.testing.assert_allclose(follower, driver, atol=1e-6)
