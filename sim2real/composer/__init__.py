@@ -1,0 +1,55 @@
+"""Worlds from parts: entities, arenas, tasks, observables and the environment that runs them.
+
+Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from sim2real.composer.arena import Arena as Arena
+from sim2real.composer.define import abstract_observable as abstract_observable
+from sim2real.composer.define import cached_property as cached_property
+from sim2real.composer.define import observable as observable
+from sim2real.composer.entity import Entity as Entity
+from sim2real.composer.entity import FreePropObservableMixin as FreePropObservableMixin
+from sim2real.composer.entity import ModelWrapperEntity as ModelWrapperEntity
+from sim2real.composer.environment import Environment as Environment
+from sim2real.composer.environment import ObservationPadding as ObservationPadding
+from sim2real.composer.errors import EpisodeInitializationError as EpisodeInitializationError
+from sim2real.composer.errors import PhysicsError as PhysicsError
+from sim2real.composer.hooks import HOOK_NAMES as HOOK_NAMES
+from sim2real.composer.initializer import Initializer as Initializer
+from sim2real.composer.initializers.prop_initializer import PropPlacer as PropPlacer
+from sim2real.composer.model import Model as Model
+from sim2real.composer.observables import Observables as Observables
+from sim2real.composer.physics import Physics as Physics
+from sim2real.composer.robot import Robot as Robot
+from sim2real.composer.task import NullTask as NullTask
+from sim2real.composer.task import Task as Task
+from sim2real.composer.variation.base import Variation as Variation
+
+if TYPE_CHECKING:
+    from sim2real.composer.brax_env import BraxEnv as BraxEnv
+    from sim2real.composer.mjx.environment import MjxEnvironment as MjxEnvironment
+    from sim2real.composer.vector_env import MjxVectorEnv as MjxVectorEnv
+    from sim2real.composer.world import ComposedWorld as ComposedWorld
+
+SENSOR_SITES_GROUP = 4
+"""The group of sites that sensors are attached to."""
+
+_LAZY = {
+    "BraxEnv": "sim2real.composer.brax_env",
+    "ComposedWorld": "sim2real.composer.world",
+    "MjxEnvironment": "sim2real.composer.mjx.environment",
+    "MjxVectorEnv": "sim2real.composer.vector_env",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs JAX, brax or gymnasium when it is first used."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'sim2real.composer' has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
+    return value

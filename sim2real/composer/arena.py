@@ -1,0 +1,73 @@
+"""Arenas: the entity that everything else stands in."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from sim2real.composer import parse
+from sim2real.composer.element import Element
+from sim2real.composer.entity import Entity
+from sim2real.composer.model import Model
+
+BASE = """
+<mujoco model="base">
+  <compiler angle="radian" eulerseq="xyz" boundmass="1e-5" boundinertia="1e-11"/>
+  <option cone="elliptic" noslip_tolerance="0" timestep="0.002"/>
+  <visual>
+    <map znear="0.01"/>
+    <headlight diffuse=".6 .6 .6" ambient=".3 .3 .3" specular="0 0 0"/>
+    <scale forcewidth="0.01" contactwidth="0.06" contactheight="0.01" jointwidth=".01" framewidth=".01"
+      framelength=".3"/>
+  </visual>
+</mujoco>
+"""
+"""dm_control's base arena, without the no-slip solver, which MJX does not have."""
+
+
+@functools.cache
+def _base() -> Any:
+    return parse.from_string(BASE)
+
+
+class Arena(Entity):
+    """The entity at the top: global settings, and whatever subclasses build.
+
+    Args:
+        name: Name of the model; default: the file's.
+        xml_path: MJCF file; default: ``BASE``.
+    """
+
+    def _build(self, *args: Any, **kwargs: Any) -> None:
+        given = dict(zip(("name", "xml_path"), args, strict=False)) | kwargs
+        path = given.get("xml_path")
+        self._mjcf_root = Model.from_path(path) if path else Model.owning(_base().copy())
+        if given.get("name"):
+            self._mjcf_root.model = given["name"]
+
+    @property
+    def mjcf_model(self) -> Model:
+        """The model."""
+        root = self.__dict__.get("_mjcf_root")
+        return super().mjcf_model if root is None else root
+
+    def _make_model(self) -> Model:
+        return Model.owning(_base().copy())
+
+    def add_free_entity(self, entity: Entity) -> Element:
+        """Attach an entity that moves freely; return its frame."""
+        frame = self.attach(entity)
+        frame.add("freejoint")
+        return frame
+
+    def add_entity(self, entity: Entity, attachment_frame: Any = None) -> Element:
+        """Attach an entity; the same as ``attach``."""
+        return self.attach(entity, attachment_frame)
+
+    @property
+    def ground_geoms(self) -> list[Element]:
+        """The geoms of the ground; none unless a subclass says so."""
+        return []
+
+    def regenerate(self, random_state: Any) -> None:
+        """Lay the arena out anew; nothing unless a subclass does."""

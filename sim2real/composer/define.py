@@ -1,0 +1,79 @@
+"""Decorators: properties that are computed once, and methods that declare observables."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+class cached_property(property):  # noqa: N801 - a decorator, called like dm_control's
+    """A property that is evaluated once per object.
+
+    Args:
+        func: The getter.
+    """
+
+    def __init__(self, func: Callable[..., Any]) -> None:
+        super().__init__(fget=func)
+        self._lock = threading.RLock()
+        functools.update_wrapper(self, func)  # pyright: ignore[reportArgumentType]
+
+    def __get__(self, obj: Any, owner: type | None = None) -> Any:
+        if obj is None:
+            return self
+        getter: Any = self.fget
+        name, values = getter.__name__, obj.__dict__
+        if name not in values:
+            with self._lock:
+                if name not in values:
+                    values[name] = getter(obj)
+        return values[name]
+
+    def __set__(self, obj: Any, value: Any) -> None:
+        raise AttributeError(f"{self.fget.__name__!r} is computed, it cannot be set")  # pyright: ignore[reportOptionalMemberAccess]
+
+
+class observable(cached_property):  # noqa: N801
+    """A method of an ``Observables`` class that returns an observable; evaluated when the entity is made.
+
+    A method of an entity or a task that takes ``physics`` may be decorated too, and so may a function of ``physics``:
+    it is then the observable's value itself, and stays callable.
+    """
+
+    @property
+    def takes_physics(self) -> bool:
+        """Whether the decorated function computes the value from the physics, rather than returning an observable."""
+        getter: Any = self.fget
+        parameters = [p for p in inspect.signature(getter).parameters if p != "self"]
+        return bool(parameters)
+
+    def __get__(self, obj: Any, owner: type | None = None) -> Any:
+        if obj is not None and self.takes_physics:
+            getter: Any = self.fget
+            return functools.partial(getter, obj)
+        return super().__get__(obj, owner)
+
+    def __call__(self, *args: Any) -> Any:
+        """Return what the decorated function returns."""
+        getter: Any = self.fget
+        return getter(*args)
+
+
+class abstract_observable(property):  # noqa: N801
+    """Marks a method that subclasses must override with an ``observable``."""
+
+    __isabstractmethod__ = True
+
+
+def declared(owner: Any) -> dict[str, Callable[..., Any]]:
+    """Return the functions of ``physics`` that an entity or a task declares with ``@observable``, by name."""
+    return {name: getattr(owner, name) for name in _declared(type(owner))}
+
+
+@functools.cache
+def _declared(owner: type) -> tuple[str, ...]:
+    found = ((name, inspect.getattr_static(owner, name)) for name in sorted(dir(owner)))
+    return tuple(name for name, value in found if isinstance(value, observable) and value.takes_physics)

@@ -1,0 +1,299 @@
+"""Entities: the parts that a world is made of."""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any
+
+from sim2real.composer.arrays import multiply_quaternions, namespace, rotate
+from sim2real.composer.element import Element
+from sim2real.composer.errors import NotAttachedError
+from sim2real.composer.model import Model
+from sim2real.composer.observables import Observables
+from sim2real.composer.traversal import get_attachment_frame, get_frame_freejoint
+from sim2real.errors import UsageError
+
+_log = logging.getLogger(__name__)
+
+
+class FreePropObservableMixin(ABC):
+    """What the observables of a free-moving object must offer."""
+
+    @property
+    @abstractmethod
+    def position(self) -> Any:
+        """Position ``(3,)`` [m]."""
+
+    @property
+    @abstractmethod
+    def orientation(self) -> Any:
+        """Quaternion ``(4,)``, scalar first."""
+
+    @property
+    @abstractmethod
+    def linear_velocity(self) -> Any:
+        """Velocity ``(3,)`` [m/s]."""
+
+    @property
+    @abstractmethod
+    def angular_velocity(self) -> Any:
+        """Angular velocity ``(3,)`` [rad/s]."""
+
+
+class Entity(ABC):
+    """A part of a world: a model, observables, and hooks that run at set times of an episode.
+
+    Subclasses override ``_build``, not the constructor.
+
+    Args:
+        *args: Passed on to ``_build``.
+        observable_options: Passed on to ``Observables.set_options``.
+        **kwargs: Passed on to ``_build``.
+    """
+
+    def __init__(self, *args: Any, observable_options: dict[str, Any] | None = None, **kwargs: Any) -> None:
+        self._post_init_hooks: list[Any] = []
+        self._parent: Any = None
+        self._attached: list[Entity] = []
+        self._default_model: Model | None = None
+        self._build(*args, **kwargs)
+        self._observables = self._build_observables()
+        self._observables.set_options(observable_options)
+
+    @abstractmethod
+    def _build(self, *args: Any, **kwargs: Any) -> None:
+        """Make the model."""
+
+    def _build_observables(self) -> Observables:
+        """Return the observables; default: those that methods of the entity declare."""
+        return Observables(self)
+
+    @property
+    def mjcf_model(self) -> Model:
+        """The model; an empty one at first, unless a subclass has its own."""
+        if self._default_model is None:
+            self._default_model = self._make_model()
+        return self._default_model
+
+    def _make_model(self) -> Model:
+        return Model()
+
+    @property
+    def name(self) -> str:
+        """The model's name."""
+        return self.mjcf_model.model
+
+    @property
+    def observables(self) -> Observables:
+        """What can be observed of this entity."""
+        return self._observables
+
+    @property
+    def parent(self) -> Entity | None:
+        """The entity that this one is attached to, or None."""
+        return self._parent() if self._parent else None
+
+    @property
+    def attachment_site(self) -> Any:
+        """Where other entities are attached unless told otherwise: a site or the model."""
+        return self.mjcf_model
+
+    @property
+    def root_body(self) -> Element:
+        """The body that holds this entity: the attachment frame, or the world."""
+        return get_attachment_frame(self.mjcf_model) if self.parent else self.mjcf_model.worldbody
+
+    def iter_entities(self, exclude_self: bool = False) -> Iterator[Entity]:
+        """Yield this entity and all below it: depth first, in the order of attachment."""
+        if not exclude_self:
+            yield self
+        for entity in self._attached:
+            yield from entity.iter_entities()
+
+    def attach(self, entity: Entity, attach_site: Any = None) -> Element:
+        """Attach another entity without degrees of freedom; return its frame, to which joints may be added.
+
+        Args:
+            entity: The other entity.
+            attach_site: A site of this entity's model; default: its world.
+        """
+        frame = (self.attachment_site if attach_site is None else attach_site).attach(entity.mjcf_model)
+        self._attached.append(entity)
+        entity._parent = weakref.ref(self)
+        return frame
+
+    def detach(self) -> None:
+        """Take this entity off its parent; what is attached to it stays.
+
+        Raises:
+            NotAttachedError: When it has no parent.
+        """
+        if self._parent is None:
+            raise NotAttachedError("Cannot detach an entity that is not attached.")
+        parent = self._parent()
+        if parent is not None:
+            self.mjcf_model.detach()
+            parent._attached.remove(self)
+        self._parent = None
+
+    # -- hooks: they do nothing unless a subclass overrides them
+
+    def initialize_episode_mjcf(self, random_state: Any) -> None:  # noqa: B027
+        """Change the model before it is compiled for an episode."""
+
+    def after_compile(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Look at the compiled model."""
+
+    def initialize_episode(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Set the state at the start of an episode."""
+
+    def before_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act before a control step."""
+
+    def before_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act before a step of the physics."""
+
+    def after_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act after a step of the physics."""
+
+    def after_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act after a control step."""
+
+    # -- poses and frames
+
+    def global_vector_to_local_frame(self, physics: Any, vec_in_world_frame: Any) -> Any:
+        """Return vectors of the world, shape ``(..., 3)`` or ``(..., 2)``, in this entity's axes; same shape.
+
+        Raises:
+            UsageError: When the last axis has another size.
+        """
+        xp = namespace(vec_in_world_frame, physics.bind(self.root_body).xmat)
+        vector = xp.asarray(vec_in_world_frame)
+        size = vector.shape[-1] if vector.ndim else 0
+        if size not in (2, 3):
+            raise UsageError(f"`vec_in_world_frame` should have shape with final dimension 2 or 3: got {vector.shape}")
+        xmat = xp.reshape(xp.asarray(physics.bind(self.root_body).xmat), (3, 3))
+        return xp.dot(vector, xmat[:size, :size])
+
+    def global_xmat_to_local_frame(self, physics: Any, xmat: Any) -> Any:
+        """Return a rotation of the world, shape ``(3, 3)`` or ``(9,)``, seen from this entity; same shape.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        own = physics.bind(self.root_body).xmat
+        xp = namespace(xmat, own)
+        matrix = xp.asarray(xmat)
+        if matrix.shape not in ((3, 3), (9,)):
+            raise UsageError(f"`xmat` should have shape (3, 3) or (9,): got {matrix.shape}")
+        return xp.reshape(xp.reshape(xp.asarray(own), (3, 3)).T @ xp.reshape(matrix, (3, 3)), matrix.shape)
+
+    def _pose_holder(self) -> tuple[Element, bool]:
+        """Return the free joint or the frame that holds the pose, and whether it is a free joint."""
+        if self.mjcf_model.parent_model is None:
+            raise NotAttachedError("No attachment frame found.", hint="only an attached entity has a pose")
+        joint = get_frame_freejoint(self.mjcf_model)
+        return (get_attachment_frame(self.mjcf_model), False) if joint is None else (joint, True)
+
+    def get_pose(self, physics: Any) -> tuple[Any, Any]:
+        """Return position ``(3,)`` [m] and quaternion ``(4,)``: of the world with a free joint, else of the parent."""
+        holder, free = self._pose_holder()
+        bound = physics.bind(holder)
+        return (bound.qpos[:3], bound.qpos[3:]) if free else (bound.pos, bound.quat)
+
+    def set_pose(self, physics: Any, position: Any = None, quaternion: Any = None) -> None:
+        """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent."""
+        holder, free = self._pose_holder()
+        if quaternion is not None:
+            xp = namespace(quaternion)
+            quaternion = xp.asarray(quaternion) / xp.linalg.norm(xp.asarray(quaternion))
+        if free:
+            if position is not None:
+                physics.write(holder, "qpos", position, slice(0, 3))
+            if quaternion is not None:
+                physics.write(holder, "qpos", quaternion, slice(3, 7))
+            return
+        if position is not None:
+            physics.set(holder, "pos", position)
+        if quaternion is not None:
+            physics.set(holder, "quat", quaternion)
+
+    def shift_pose(
+        self, physics: Any, position: Any = None, quaternion: Any = None, rotate_velocity: bool = False
+    ) -> None:
+        """Move and turn from the present pose.
+
+        Args:
+            physics: The physics.
+            position: Added, ``(3,)`` [m].
+            quaternion: The turn, ``(4,)``; applied after the present one.
+            rotate_velocity: Turn the linear velocity too; the angular one is in the local frame and turns by itself.
+        """
+        old_position, old_quaternion = self.get_pose(physics)
+        new_position = new_quaternion = None
+        if position is not None:
+            xp = namespace(position, old_position)
+            new_position = xp.asarray(old_position) + xp.asarray(position)
+        if quaternion is not None:
+            xp = namespace(quaternion, old_quaternion)
+            quaternion = xp.asarray(quaternion, dtype=float)
+            new_quaternion = multiply_quaternions(quaternion, xp.asarray(old_quaternion))
+            if rotate_velocity and self._pose_holder()[1]:
+                self.set_velocity(physics, rotate(xp.asarray(self.get_velocity(physics)[0]), quaternion))
+        self.set_pose(physics, new_position, new_quaternion)
+
+    def get_velocity(self, physics: Any) -> tuple[Any, Any]:
+        """Return linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s, local frame].
+
+        Raises:
+            UsageError: When the entity has no free joint.
+        """
+        holder, free = self._pose_holder()
+        if not free:
+            raise UsageError("get_velocity cannot be used on a non-free entity")
+        qvel = physics.bind(holder).qvel
+        return qvel[:3], qvel[3:]
+
+    def set_velocity(self, physics: Any, velocity: Any = None, angular_velocity: Any = None) -> None:
+        """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint."""
+        holder, free = self._pose_holder()
+        if not free:
+            _log.warning("Cannot set velocity on Entity with no free joint.")
+            return
+        if velocity is not None:
+            physics.write(holder, "qvel", velocity, slice(0, 3))
+        if angular_velocity is not None:
+            physics.write(holder, "qvel", angular_velocity, slice(3, 6))
+
+    def configure_joints(self, physics: Any, position: Any) -> None:
+        """Set the positions of this entity's own joints, frame joints of its children included."""
+        physics.set(self.mjcf_model.find_all("joint", exclude_attachments=True), "qpos", position)
+
+
+class ModelWrapperEntity(Entity):
+    """An entity around a model, without any logic.
+
+    Args:
+        mjcf_model: The model, or an ``MjSpec``.
+    """
+
+    def _build(self, mjcf_model: Any) -> None:
+        self._mjcf_model = mjcf_model if isinstance(mjcf_model, Model) else Model(spec=mjcf_model)
+
+    @property
+    def mjcf_model(self) -> Model:
+        """The model."""
+        return self._mjcf_model
+
+    @property
+    def joints(self) -> list[Element]:
+        """The model's own joints."""
+        return self.mjcf_model.find_all("joint", exclude_attachments=True)
+
+    @property
+    def actuators(self) -> list[Element]:
+        """The model's own actuators."""
+        return self.mjcf_model.find_all("actuator", exclude_attachments=True)

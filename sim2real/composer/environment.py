@@ -1,0 +1,258 @@
+"""A task as a reinforcement learning environment on MuJoCo's C engine."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+import weakref
+from collections import OrderedDict
+from enum import Enum
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from sim2real.composer.compiled import Compiler
+from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
+from sim2real.composer.hooks import Hooks
+from sim2real.composer.observation.updater import Updater
+from sim2real.composer.task import Task
+from sim2real.errors import UsageError
+
+_log = logging.getLogger(__name__)
+
+
+class ObservationPadding(Enum):
+    """What fills a buffer until enough samples have arrived."""
+
+    INITIAL_VALUE = -1
+    """The first sample."""
+    ZERO = 0
+    """Zeros."""
+
+
+class Observation(OrderedDict[str, Any]):
+    """Name -> array; a name may leave out the models in front of it as long as only one key ends with it."""
+
+    def __missing__(self, key: str) -> Any:
+        found = [k for k in self if k.endswith(f"/{key}")]
+        if len(found) == 1:
+            return self[found[0]]
+        raise KeyError(f"{key!r}. Available: {', '.join(self)}")
+
+
+class Environment(dm_env.Environment):
+    """Runs a task, with the interface of ``dm_env``.
+
+    Args:
+        task: The task.
+        time_limit: Longest episode [s]; it ends after the first control step that reaches it.
+        random_state: A ``numpy.random.RandomState`` or a seed.
+        n_sub_steps: Physics steps in a control step; deprecated, set the task's time steps.
+        raise_exception_on_physics_error: Raise MuJoCo's warnings; else they end the episode with discount 0.
+        strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
+        max_reset_attempts: How often a reset is tried when it raises ``EpisodeInitializationError``.
+        recompile_mjcf_every_episode: Run ``initialize_episode_mjcf`` and compile at every reset, not only at the first.
+        fixed_initial_state: Draw the same random numbers at every reset.
+        delayed_observation_padding: What fills buffers at first.
+        legacy_step: After a step, also compute positions and velocities of the new state.
+        arena: The root entity of a task that has none of its own.
+
+    Raises:
+        UsageError: When an option makes no sense.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        time_limit: float = math.inf,
+        random_state: Any = None,
+        n_sub_steps: int | None = None,
+        raise_exception_on_physics_error: bool = True,
+        strip_singleton_obs_buffer_dim: bool = False,
+        max_reset_attempts: int = 1,
+        recompile_mjcf_every_episode: bool = True,
+        fixed_initial_state: bool = False,
+        delayed_observation_padding: ObservationPadding = ObservationPadding.ZERO,
+        legacy_step: bool = True,
+        *,
+        arena: Any = None,
+    ) -> None:
+        if not isinstance(delayed_observation_padding, ObservationPadding):
+            raise UsageError(
+                "`delayed_observation_padding` should be an `ObservationPadding` enum value: "
+                f"got {delayed_observation_padding}"
+            )
+        if arena is not None:
+            task._root_entity = arena  # pyright: ignore[reportAttributeAccessIssue]
+        if n_sub_steps is not None:
+            warnings.warn("`n_sub_steps` is deprecated: set the task's time steps", DeprecationWarning, stacklevel=2)
+        self._task, self._time_limit, self._n_sub_steps_given = task, time_limit, n_sub_steps
+        self._random_state = (
+            random_state if isinstance(random_state, np.random.RandomState) else np.random.RandomState(random_state)
+        )
+        self._raise_on_physics_error = raise_exception_on_physics_error
+        self._strip, self._padding = strip_singleton_obs_buffer_dim, delayed_observation_padding
+        self._max_reset_attempts, self._recompile = max_reset_attempts, recompile_mjcf_every_episode
+        self._fixed_initial_state, self._legacy_step = fixed_initial_state, legacy_step
+        self._compiled_by_reset = False
+        self._physics: Any = None
+        self._compiler = Compiler(task)
+        self._hooks = Hooks(task)
+        self._build()
+        self._fixed_random_state = self._random_state.get_state()
+        self._reset_next_step = True
+        self._steps_taken = 0
+
+    def _build(self) -> None:
+        """Compile the models and start from them."""
+        self._drop()
+        self._physics = self._compiler.start(self._legacy_step)
+        self._proxy: Any = weakref.proxy(self._physics)
+        steps = self._n_sub_steps_given or self._task.physics_steps_per_control_step
+        self._n_sub_steps = steps
+        limit = self._time_limit / (self._physics.timestep() * steps)
+        self._step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else math.inf
+        self._hooks.refresh()
+        self._hooks.run("after_compile", self._proxy, self._random_state)
+        self._updater, self._is_probed = self._make_updater(), False
+
+    def _make_updater(self) -> Updater:
+        initial = self._padding is ObservationPadding.INITIAL_VALUE
+        return Updater(self._task.observables, self._n_sub_steps, self._strip, initial)
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return self._task
+
+    @property
+    def physics(self) -> Any:
+        """The physics, as a weak reference: it dies when the models are compiled anew and at ``close``."""
+        return self._proxy
+
+    @property
+    def random_state(self) -> np.random.RandomState:
+        """The source of randomness."""
+        return self._random_state
+
+    def control_timestep(self) -> float:
+        """Return the time between two actions [s]."""
+        if self._n_sub_steps_given is not None:
+            return self._physics.timestep() * self._n_sub_steps_given
+        return self._task.control_timestep
+
+    def add_extra_hook(self, hook_name: str, hook_callable: Any) -> None:
+        """Run a function after the hooks of the task and its entities; the arguments are those of the task's hook.
+
+        Raises:
+            UsageError: When there is no such hook, or the function is none.
+        """
+        self._hooks.add(hook_name, hook_callable)
+
+    def reset(self) -> dm_env.TimeStep:
+        """Start an episode.
+
+        Raises:
+            EpisodeInitializationError: When the last attempt failed too.
+        """
+        self._reset_next_step = True
+        for attempt in range(1, self._max_reset_attempts + 1):
+            try:
+                return self._reset_attempt()
+            except EpisodeInitializationError as error:
+                if attempt >= self._max_reset_attempts:
+                    raise
+                _log.error("Error during episode reset: %s", error)
+        raise UsageError(f"max_reset_attempts must be at least 1, got {self._max_reset_attempts}")
+
+    def _reset_attempt(self) -> dm_env.TimeStep:
+        if self._recompile or not self._compiled_by_reset:
+            if self._fixed_initial_state:
+                self._random_state.set_state(self._fixed_random_state)
+            self._hooks.run("initialize_episode_mjcf", self._random_state)
+            self._build()
+            self._compiled_by_reset = True
+        if self._fixed_initial_state:
+            self._random_state.set_state(self._fixed_random_state)
+        with self._physics.reset_context():
+            self._hooks.run("initialize_episode", self._proxy, self._random_state)
+        self._updater.reset(self._proxy, self._random_state)
+        self._is_probed = True
+        self._reset_next_step, self._steps_taken = False, 0
+        return dm_env.restart(self._observe())
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        """Advance by a control step under an action; starts an episode when there is none, ignoring the action."""
+        if self._reset_next_step:
+            return self.reset()
+        diverged = False
+        self._hooks.run("before_step", self._proxy, action, self._random_state)
+        self._updater.prepare_for_next_control_step()
+        try:
+            for i in range(self._n_sub_steps):
+                self._hooks.run("before_substep", self._proxy, action, self._random_state)
+                self._physics.step()
+                self._hooks.run("after_substep", self._proxy, self._random_state)
+                if i < self._n_sub_steps - 1:  # the last one is observed after the hooks that may change the state
+                    self._updater.update()
+        except PhysicsError as error:
+            if self._raise_on_physics_error:
+                raise
+            _log.warning("%s", error)
+            diverged = True
+        self._hooks.run("after_step", self._proxy, self._random_state)
+        self._updater.update()
+        self._steps_taken += 1
+        reward, discount, last = 0.0, 0.0, True
+        if not diverged:
+            reward, discount = self._task.get_reward(self._proxy), self._task.get_discount(self._proxy)
+            last = bool(self._task.should_terminate_episode(self._proxy)) or self._steps_taken >= self._step_limit
+        self._reset_next_step = last
+        step_type = dm_env.StepType.LAST if last else dm_env.StepType.MID
+        return dm_env.TimeStep(step_type, reward, discount, self._observe())
+
+    def _observe(self) -> Any:
+        found = self._updater.get_observation()
+        return Observation(found) if isinstance(found, dict) else found
+
+    def action_spec(self) -> Any:
+        """Return shape and bounds of an action."""
+        return self._task.action_spec(self._proxy)
+
+    def observation_spec(self) -> Any:
+        """Return name -> shape and dtype; before the first reset the observables are sampled for it."""
+        if not self._is_probed:
+            self._updater.reset(self._proxy, np.random.RandomState(0))
+            self._is_probed = True
+        return self._updater.observation_spec()
+
+    def reward_spec(self) -> Any:
+        """Return the task's reward spec, or that of a number."""
+        spec = self._task.get_reward_spec()
+        return super().reward_spec() if spec is None else spec
+
+    def discount_spec(self) -> Any:
+        """Return the task's discount spec, or that of a number in [0, 1]."""
+        spec = self._task.get_discount_spec()
+        return super().discount_spec() if spec is None else spec
+
+    def step_spec(self) -> dm_env.TimeStep:
+        """Return the specs of a time step; deprecated, ask for them one by one."""
+        warnings.warn(
+            "`step_spec` is deprecated: use `reward_spec` and `discount_spec`", DeprecationWarning, stacklevel=2
+        )
+        if self._task.get_reward_spec() is None or self._task.get_discount_spec() is None:
+            raise NotImplementedError("the task declares no reward and discount specs")
+        step_type: Any = None
+        return dm_env.TimeStep(step_type, self.reward_spec(), self.discount_spec(), self.observation_spec())
+
+    def close(self) -> None:
+        """Let go of the physics."""
+        self._drop()
+
+    def _drop(self) -> None:
+        if self._physics is not None:
+            self._physics.free()
+        self._physics = None

@@ -1,0 +1,85 @@
+"""Which hooks run when: the task's, then those of the entities, depth first, then extra ones."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from sim2real.composer.entity import Entity
+from sim2real.composer.task import Task
+from sim2real.errors import UsageError
+
+HOOK_NAMES = (
+    "initialize_episode_mjcf",
+    "after_compile",
+    "initialize_episode",
+    "before_step",
+    "before_substep",
+    "after_substep",
+    "after_step",
+)
+WITH_ACTION = ("before_step", "before_substep")
+"""Hooks of the task, and extra ones, that are given the action too."""
+
+
+class Hooks:
+    """The hooks of a task and its entities; those that do nothing are left out.
+
+    Args:
+        task: The task.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._entity_hooks: dict[str, list[Callable[..., Any]]] = {}
+        self._extra: dict[str, list[Callable[..., Any]]] = {name: [] for name in HOOK_NAMES}
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Collect the hooks of the entities that are attached now."""
+        entities = list(self._task.iter_entities())
+        for name in HOOK_NAMES:
+            hooks = [getattr(e, name) for e in entities if _overrides(e, Entity, name)]
+            self._entity_hooks[name] = [_with_action(h) for h in hooks] if name in WITH_ACTION else hooks
+
+    def add(self, name: str, hook: Callable[..., Any]) -> None:
+        """Run a function after the hooks of the task and the entities.
+
+        Raises:
+            UsageError: When there is no such hook, or the function is none.
+        """
+        if name not in HOOK_NAMES:
+            raise UsageError(f"{name!r} is not a valid hook name. Available: {', '.join(HOOK_NAMES)}")
+        if not callable(hook):
+            raise UsageError(f"{hook!r} is not a callable")
+        self._extra[name].append(hook)
+
+    def is_empty(self, name: str) -> bool:
+        """Return whether nothing happens at a hook."""
+        return not (_overrides(self._task, Task, name) or self._entity_hooks[name] or self._extra[name])
+
+    def run(self, name: str, *args: Any) -> None:
+        """Run all hooks of a name with the arguments that the task's hook takes."""
+        getattr(self._task, name)(*args)
+        for hook in self._entity_hooks[name]:
+            hook(*args)
+        for hook in self._extra[name]:
+            hook(*args)
+
+
+def _overrides(owner: Any, base: type, name: str) -> bool:
+    """Return whether an object has a hook of its own, in its class or as an attribute."""
+    return name in vars(owner) or getattr(type(owner), name, None) is not getattr(base, name)
+
+
+def _with_action(hook: Callable[..., Any]) -> Callable[..., Any]:
+    """Return an entity's hook as a function of physics, action and randomness; most take no action."""
+    try:
+        parameters = inspect.signature(hook).parameters.values()
+    except (TypeError, ValueError):
+        parameters = ()
+    named = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if len(named) >= 3:
+        return hook
+    return lambda physics, action, random_state: hook(physics, random_state)

@@ -1,0 +1,18 @@
+"""How a part of a world is put into its initial state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+
+class Initializer(ABC):
+    """Sets a part of the initial state; called from ``initialize_episode``."""
+
+    @abstractmethod
+    def __call__(self, physics: Any, random_state: Any) -> Any:
+        """Set the state.
+
+        Raises:
+            EpisodeInitializationError: When no acceptable state was found.
+        """

@@ -1,0 +1,54 @@
+"""Keyframes of attached models: each sets its own model's part of the state and leaves the rest at its default."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer import layout
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.model import Model
+
+
+def restore(out: Any, models: list[Model]) -> None:
+    """Add the keyframes of all models to a composed spec, under their full names.
+
+    Raises:
+        UsageError: When a keyframe has another size than its model's part of the state.
+    """
+    compiled = out.compile()
+    for model in models:
+        for native in list(model._spec.keys):
+            element = model.handle("key", native)
+            key = out.add_key(name=model.prefix(None) + (native.name or element.full_identifier), time=native.time)
+            for part in ("qpos", "qvel", "act", "ctrl", "mpos", "mquat"):
+                values = np.array(getattr(native, part))
+                if values.size:
+                    setattr(key, part, _spread(compiled, model, element.full_identifier, part, values))
+
+
+def _spread(compiled: Any, model: Model, name: str, part: str, values: np.ndarray) -> np.ndarray:
+    """Return a part of the state of the whole world that holds a model's values at the model's own places."""
+    if part in ("mpos", "mquat"):
+        whole = np.array(compiled.body_pos if part == "mpos" else compiled.body_quat)
+        bodies = [e for e in model.find_all("body", exclude_attachments=True) if e._native.mocap]
+        ids = layout.resolve(compiled, "body", tuple(e.full_identifier for e in bodies))
+        mocap = np.argsort(compiled.body_mocapid)[-compiled.nmocap :]
+        whole = whole[mocap]
+        whole[compiled.body_mocapid[list(ids)]] = values.reshape(len(ids), -1)
+        return whole.ravel()
+    kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
+    whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
+    own = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
+    frames = [e for e in own if e.parent is not None and e.parent.is_frame]  # their joints came later
+    rows: Any = np.zeros(0)
+    for elements in (own, [e for e in own if e not in frames]):
+        ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))
+        rows = np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))
+        if rows.size == values.size:
+            whole[rows] = values
+            return whole
+    raise UsageError(f"keyframe {name!r} has {values.size} values for {part}, its model has {rows.size}")

@@ -1,0 +1,164 @@
+"""Where the attributes of an element lie in MuJoCo's arrays; the same indices serve both engines."""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mujoco.introspect.structs import STRUCTS
+
+from sim2real.composer.translate import mj
+from sim2real.errors import UsageError
+
+TRIGGERS = {"qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"}
+"""Fields of the data whose change makes everything computed from them out of date."""
+_COSMETIC = ("rgba", "matid", "emission", "specular", "shininess", "reflectance", "needstage", "user", "group")
+
+DISABLED_BY = {
+    "body_pos": ("body_sameframe",),
+    "body_quat": ("body_sameframe",),
+    "geom_pos": ("geom_sameframe",),
+    "geom_quat": ("geom_sameframe",),
+    "site_pos": ("site_sameframe",),
+    "site_quat": ("site_sameframe",),
+    "body_ipos": ("body_simple", "body_sameframe"),
+    "body_iquat": ("body_simple", "body_sameframe"),
+}
+"""Shortcuts of MuJoCo's that must be switched off when a field is written: they would hide the new value."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How elements of a kind are stored: object type, first dimensions of their fields, prefixes of field names."""
+
+    object_type: Any
+    sizes: tuple[str, ...]
+    prefixes: tuple[str, ...]
+
+
+KINDS = {
+    "body": Kind(mj.mjtObj.mjOBJ_BODY, ("nbody", "nmocap"), ("body",)),
+    "joint": Kind(mj.mjtObj.mjOBJ_JOINT, ("nq", "nv", "njnt"), ("jnt", "dof")),
+    "geom": Kind(mj.mjtObj.mjOBJ_GEOM, ("ngeom",), ("geom",)),
+    "site": Kind(mj.mjtObj.mjOBJ_SITE, ("nsite",), ("site",)),
+    "camera": Kind(mj.mjtObj.mjOBJ_CAMERA, ("ncam",), ("cam",)),
+    "light": Kind(mj.mjtObj.mjOBJ_LIGHT, ("nlight",), ("light",)),
+    "actuator": Kind(mj.mjtObj.mjOBJ_ACTUATOR, ("na", "nu", "nactuator", "nout"), ("actuator",)),
+    "sensor": Kind(mj.mjtObj.mjOBJ_SENSOR, ("nsensor", "nsensordata"), ("sensor",)),
+    "tendon": Kind(mj.mjtObj.mjOBJ_TENDON, ("ntendon",), ("tendon", "ten")),
+    "equality": Kind(mj.mjtObj.mjOBJ_EQUALITY, ("neq",), ("eq",)),
+    "mesh": Kind(mj.mjtObj.mjOBJ_MESH, ("nmesh",), ("mesh",)),
+    "hfield": Kind(mj.mjtObj.mjOBJ_HFIELD, ("nhfield",), ("hfield",)),
+    "material": Kind(mj.mjtObj.mjOBJ_MATERIAL, ("nmat",), ("mat",)),
+    "texture": Kind(mj.mjtObj.mjOBJ_TEXTURE, ("ntex",), ("tex",)),
+    "numeric": Kind(mj.mjtObj.mjOBJ_NUMERIC, ("nnumeric", "nnumericdata"), ("numeric",)),
+    "text": Kind(mj.mjtObj.mjOBJ_TEXT, ("ntext",), ("text",)),
+    "key": Kind(mj.mjtObj.mjOBJ_KEY, ("nkey",), ("key",)),
+}
+OBJECT_TYPES = {**{name: kind.object_type for name, kind in KINDS.items()}, "pair": mj.mjtObj.mjOBJ_PAIR}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of mjModel or mjData: the struct, its name, its first dimension."""
+
+    struct: str
+    name: str
+    size: str
+
+    @property
+    def triggers(self) -> bool:
+        """Whether writing it makes derived quantities out of date."""
+        if self.struct == "data":
+            return self.name in TRIGGERS
+        return not self.name.endswith(_COSMETIC)
+
+
+@functools.cache
+def array_fields(struct: str) -> dict[str, Field]:
+    """Return the arrays of ``model`` or ``data`` by name."""
+    fields = STRUCTS["mjModel" if struct == "model" else "mjData"].fields
+    extents = ((f.name, getattr(f, "array_extent", None)) for f in fields)  # pyright: ignore[reportAttributeAccessIssue]
+    return {name: Field(struct, name, str(extent[0])) for name, extent in extents if extent}
+
+
+@functools.cache
+def attributes(kind: str) -> dict[str, Field]:
+    """Return attribute -> field for elements of a kind, such as ``damping`` -> ``dof_damping`` for joints."""
+    try:
+        sizes, prefixes = KINDS[kind].sizes, KINDS[kind].prefixes
+    except KeyError:
+        raise UsageError(f"elements of kind {kind!r} cannot be bound. Available: {', '.join(KINDS)}") from None
+    prefix = re.compile(rf"\A({'|'.join(prefixes)})_")
+    found = [f for struct in ("data", "model") for f in array_fields(struct).values() if f.size in sizes]
+    return {prefix.sub("", f.name): f for f in found}
+
+
+_RANGES = {
+    "nv": ("jnt_dofadr", None),
+    "nq": ("jnt_qposadr", None),
+    "na": ("actuator_actadr", "actuator_actnum"),
+    "nu": ("actuator_ctrladr", "actuator_ctrlnum"),
+    "nout": ("actuator_outadr", "actuator_outnum"),
+    "nsensordata": ("sensor_adr", "sensor_dim"),
+    "nnumericdata": ("numeric_adr", "numeric_size"),
+}
+_JOINT_WIDTH = {"nq": (7, 4, 1, 1), "nv": (6, 3, 1, 1)}
+_ALWAYS_RANGES = ("nq", "nv", "nsensordata", "nnumericdata")
+
+
+def _range(model: Any, size: str, number: int) -> range:
+    start_field, count_field = _RANGES[size]
+    start = int(getattr(model, start_field)[number])
+    if count_field is None:
+        return range(start, start + _JOINT_WIDTH[size][int(model.jnt_type[number])])
+    return range(start, start + int(getattr(model, count_field)[number])) if start >= 0 else range(0)
+
+
+def index(model: Any, field: Field, ids: tuple[int, ...], single: bool) -> Any:
+    """Return what indexes the rows of a field: an int, a slice, or an int array of shape ``(n,)``.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``.
+        field: The field.
+        ids: Numbers of the elements.
+        single: Whether one element was bound, rather than a sequence of them.
+    """
+    if field.size == "nmocap":
+        rows = [int(model.body_mocapid[i]) for i in ids]
+    elif field.size in _RANGES:
+        ranges = [_range(model, field.size, i) for i in ids]
+        if single and (field.size in _ALWAYS_RANGES or len(ranges[0]) != 1):
+            return slice(ranges[0].start, ranges[0].stop)
+        rows = [row for r in ranges for row in r]
+    else:
+        rows = list(ids)
+    return rows[0] if single else np.array(rows, dtype=int)
+
+
+def resolve(model: Any, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the numbers of elements in a compiled model.
+
+    Raises:
+        UsageError: When the model has no element of one of the names.
+    """
+    object_type = OBJECT_TYPES[kind]
+    found = tuple(mj.mj_name2id(model, object_type, name) for name in names)
+    if -1 in found:
+        known = names_of(model, kind)
+        raise UsageError(
+            f"the compiled model has no {kind} {names[found.index(-1)]!r}. Available: {', '.join(known)}",
+            hint="an element added after the model was compiled is there after the next compilation",
+        )
+    return found
+
+
+def names_of(model: Any, kind: str) -> list[str]:
+    """Return the names of all elements of a kind in a compiled model, '' for those without one."""
+    object_type = OBJECT_TYPES[kind]
+    count = {"camera": "ncam", "joint": "njnt", "material": "nmat", "texture": "ntex", "equality": "neq"}.get(kind)
+    count = count or {"actuator": "nactuator"}.get(kind) or f"n{kind}"
+    return [mj.mj_id2name(model, object_type, i) or "" for i in range(getattr(model, count))]

@@ -1,0 +1,14 @@
+"""Models and elements under the names that PyMJCF gives them: ``mjcf.from_path``, ``mjcf.RootElement`` and so on."""
+
+from sim2real.composer.binding import Binding as Binding
+from sim2real.composer.element import Element as Element
+from sim2real.composer.model import Model as RootElement
+from sim2real.composer.physics import Physics as Physics
+from sim2real.composer.traversal import get_attachment_frame as get_attachment_frame
+from sim2real.composer.traversal import get_frame_freejoint as get_frame_freejoint
+from sim2real.composer.traversal import get_frame_joints as get_frame_joints
+from sim2real.composer.traversal import get_freejoint as get_freejoint
+
+from_xml_string = RootElement.from_xml_string
+from_path = RootElement.from_path
+from_file = RootElement.from_file

@@ -1,0 +1,6 @@
+"""The MJX engine: the same tasks, compiled by JAX for many copies at once."""
+
+from sim2real.composer.mjx.environment import MjxEnvironment as MjxEnvironment
+from sim2real.composer.mjx.environment import State as State
+from sim2real.composer.mjx.physics import MjxPhysics as MjxPhysics
+from sim2real.composer.mjx.random import JaxRandomState as JaxRandomState

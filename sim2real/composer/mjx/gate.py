@@ -1,0 +1,54 @@
+"""What MJX would ignore or compute otherwise, refused by name before anything is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sim2real.composer.observation.base import MujocoCamera, Observable
+from sim2real.composer.observation.mjcf import MJCFCamera
+from sim2real.composer.translate import mj
+from sim2real.errors import UsageError
+
+_INTEGRATORS = (mj.mjtIntegrator.mjINT_EULER, mj.mjtIntegrator.mjINT_RK4, mj.mjtIntegrator.mjINT_IMPLICITFAST)
+
+
+def check_model(model: Any) -> None:
+    """Refuse a compiled model that MJX does not simulate as MuJoCo does.
+
+    Raises:
+        UsageError: With the option or the elements.
+    """
+    if int(model.opt.noslip_iterations) > 0:
+        raise UsageError(
+            f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",
+            hint="set it to 0 in the model that sets it",
+        )
+    for kind, count in (("actuator", model.nactuator), ("sensor", model.nsensor)):
+        object_type = getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}")
+        adr = getattr(model, f"{kind}_historyadr", None)
+        late = [] if adr is None else [mj.mj_id2name(model, object_type, i) for i in range(count) if adr[i] >= 0]
+        if late:
+            raise UsageError(
+                f"MJX ignores MuJoCo's own delays and intervals: {kind} {', '.join(map(repr, late))}",
+                hint="take delay, nsample and interval out of the MJCF; delay the observable instead",
+            )
+    if model.opt.integrator not in _INTEGRATORS:
+        raise UsageError(
+            f"MJX has no integrator {mj.mjtIntegrator(model.opt.integrator).name}",
+            hint="use Euler, RK4 or implicitfast",
+        )
+
+
+def check_observables(observables: Mapping[str, Observable]) -> None:
+    """Refuse enabled observables that cannot be computed inside a compiled program.
+
+    Raises:
+        UsageError: With the names of the observables.
+    """
+    cameras = [k for k, o in observables.items() if o.enabled and isinstance(o, MJCFCamera | MujocoCamera)]
+    if cameras:
+        raise UsageError(
+            f"MJX renders no images: camera observables {', '.join(map(repr, cameras))}",
+            hint="disable them, or use the C engine",
+        )

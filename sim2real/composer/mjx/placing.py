@@ -1,0 +1,67 @@
+"""Placing props inside a compiled program: poses are drawn until nothing touches, a bounded number of times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from mujoco import mjx
+
+from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer.mjx.random import JaxRandomState
+from sim2real.composer.variation.base import evaluate
+
+
+def place(
+    physics: MjxPhysics,
+    random_state: JaxRandomState,
+    props: Sequence[Any],
+    pose: tuple[Any, Any],
+    attempts: int,
+    ignore_collisions: bool,
+    ignored: Sequence[Any],
+) -> None:
+    """Place one prop after the other where it touches neither the world nor the props before it.
+
+    Contacts cannot be switched off inside a program, so those with props that are not placed yet do not count.
+
+    Args:
+        physics: The physics; ``physics.fail`` is called where a prop found no place.
+        random_state: Source of randomness.
+        props: The entities to place.
+        pose: Position ``(3,)`` [m] and quaternion ``(4,)``, or variations.
+        attempts: Poses that are tried for each prop.
+        ignore_collisions: Take the first pose.
+        ignored: Entities that may be touched.
+    """
+    numbers = [_geoms(physics, prop) for prop in props]
+    passed = [n for prop in ignored for n in _geoms(physics, prop)]
+    for i, prop in enumerate(props):
+        later = jnp.array([*passed, *(n for other in numbers[i + 1 :] for n in other)], int)
+        own = jnp.array(numbers[i], int)
+        initial = prop.get_pose(physics)
+
+        def attempt(prop: Any = prop, own: Any = own, later: Any = later, initial: Any = initial) -> None:
+            drawn = [evaluate(p, x, x, random_state) for p, x in zip(pose, initial, strict=True)]
+            prop.set_pose(physics, *drawn)
+            if not ignore_collisions:
+                physics.fail(_touches(physics, own, later))
+
+        physics.fail(physics.retry(attempt, random_state, attempts))
+
+
+def _geoms(physics: MjxPhysics, prop: Any) -> list[int]:
+    return [int(i) for i in physics.bind(prop.mjcf_model.find_all("geom")).element_id]
+
+
+def _touches(physics: MjxPhysics, own: Any, later: Any) -> Any:
+    """Return whether a geom of a prop touches one that counts."""
+    if physics.dry:
+        return jnp.zeros((), bool)
+    model = physics.mjx_model
+    data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, physics.mjx_data)))
+    contact: Any = data._impl.contact  # pyright: ignore[reportAttributeAccessIssue]
+    pair = jnp.stack([contact.geom1, contact.geom2])
+    hit = (contact.dist <= 0) & jnp.isin(pair, own).any(axis=0) & ~jnp.isin(pair, later).any(axis=0)
+    return hit.any()

@@ -1,0 +1,121 @@
+"""Randomness inside a compiled program, with the methods of ``numpy.random.RandomState``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Registry:
+    """Which variations keep something from draw to draw, such as the position of a random walk.
+
+    Attributes:
+        initial: Name -> what is kept at the start of an episode.
+    """
+
+    def __init__(self) -> None:
+        self.initial: dict[str, Any] = {}
+        self._owners: list[Any] = []
+
+    def name(self, owner: Any, initial: Any) -> str:
+        """Return the name of what an owner keeps."""
+        number = next((i for i, known in enumerate(self._owners) if known is owner), None)
+        if number is None:
+            number = len(self._owners)
+            self._owners.append(owner)
+        name = f"{type(owner).__name__}_{number}"
+        self.initial.setdefault(name, initial)
+        return name
+
+
+class JaxRandomState:
+    """Draws like a ``RandomState``, from a JAX key that it splits at every draw.
+
+    Args:
+        key: The key.
+        memory: What variations keep from draw to draw: name -> array.
+        registry: The names of what is kept.
+
+    Attributes:
+        key: The key that is left.
+        memory: The same dictionary, with new values.
+    """
+
+    def __init__(self, key: Any, memory: dict[str, Any] | None = None, registry: Registry | None = None) -> None:
+        self.key = key
+        self.memory = {} if memory is None else memory
+        self._registry = registry or Registry()
+
+    def recall(self, owner: Any, initial: Any) -> Any:
+        """Return what a variation kept at its last draw, or its initial value."""
+        name = self._registry.name(owner, initial)
+        return self.memory[name] if name in self.memory else jnp.asarray(initial)
+
+    def keep(self, owner: Any, value: Any) -> None:
+        """Keep a value for the next draw of a variation."""
+        name = self._registry.name(owner, value)
+        self.memory[name] = jnp.asarray(value, jnp.asarray(self._registry.initial[name]).dtype)
+
+    def next_key(self) -> Any:
+        """Return a key that was not used before."""
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+        """Return floats in ``[low, high)``."""
+        low, high = jnp.asarray(low, float), jnp.asarray(high, float)
+        return low + (high - low) * jax.random.uniform(self.next_key(), _shape(size, low, high))
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+        """Return normally distributed floats."""
+        loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
+        return loc + scale * jax.random.normal(self.next_key(), _shape(size, loc, scale))
+
+    def lognormal(self, mean: Any = 0.0, sigma: Any = 1.0, size: Any = None) -> Any:
+        """Return exponentials of normally distributed floats."""
+        return jnp.exp(self.normal(mean, sigma, size))
+
+    def exponential(self, scale: Any = 1.0, size: Any = None) -> Any:
+        """Return exponentially distributed floats."""
+        return jnp.asarray(scale, float) * jax.random.exponential(self.next_key(), _shape(size, scale))
+
+    def poisson(self, lam: Any = 1.0, size: Any = None) -> Any:
+        """Return Poisson distributed integers."""
+        # JAX draws Poisson numbers with threefry keys only.
+        key = jax.random.wrap_key_data(jax.random.key_data(self.next_key()), impl="threefry2x32")
+        return jax.random.poisson(key, lam, _shape(size, lam))
+
+    def binomial(self, n: Any, p: Any, size: Any = None) -> Any:
+        """Return binomially distributed integers."""
+        return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
+
+    def randint(self, low: Any, high: Any = None, size: Any = None) -> Any:
+        """Return integers in ``[low, high)``, or in ``[0, low)``."""
+        low, high = (0, low) if high is None else (low, high)
+        return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
+
+    def choice(self, a: Any, size: Any = None) -> Any:
+        """Return items of ``a``, or integers below it."""
+        values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
+        return jax.random.choice(self.next_key(), values, _shape(size))
+
+    def permutation(self, x: Any) -> Any:
+        """Return ``x``, or the integers below it, in random order."""
+        return jax.random.permutation(self.next_key(), x)
+
+    def rand(self, *shape: int) -> Any:
+        """Return floats in [0, 1)."""
+        return self.uniform(size=shape)
+
+    def randn(self, *shape: int) -> Any:
+        """Return normally distributed floats."""
+        return self.normal(size=shape)
+
+
+def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
+    if size is None:
+        return jnp.broadcast_shapes(*(jnp.shape(p) for p in parameters)) if parameters else ()
+    return (int(size),) if np.ndim(size) == 0 else tuple(int(s) for s in size)

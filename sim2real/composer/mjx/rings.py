@@ -1,0 +1,159 @@
+"""Sampling, delays and buffers of observables inside a compiled program; the rules are those of the ``Updater``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer.mjx.random import JaxRandomState
+from sim2real.composer.observation.base import Observable
+from sim2real.composer.variation import deterministic, distributions
+from sim2real.composer.variation.base import Variation
+from sim2real.errors import UsageError
+
+_NEVER = np.iinfo(np.int32).max
+
+
+class Ring:
+    """One observable: when it is sampled, and the samples that may still be read.
+
+    Args:
+        name: Key in the observation.
+        observable: The observable.
+        steps: Physics steps in a control step.
+        strip: Leave the buffer's axis out when it holds one sample.
+        pad_initial: Pad with the first sample rather than with zeros.
+
+    Raises:
+        UsageError: When a delay or an interval has no bound that a compiled program could reserve space for.
+    """
+
+    def __init__(self, name: str, observable: Observable, steps: int, strip: bool, pad_initial: bool) -> None:
+        self.name, self.observable, self.steps, self.pad_initial = name, observable, steps, pad_initial
+        size: Any = observable.buffer_size or 1
+        if callable(size):
+            raise UsageError(f"observable {name!r}: on MJX the buffer size is a number, got {size!r}")
+        self.size = int(size)
+        self.strip = strip and self.size == 1
+        self._interval: Any = observable.update_interval or 1
+        self._delay: Any = observable.delay or 0
+        shortest = self._bound(self._interval, observable.min_interval, "min_interval", 0)
+        longest = self._bound(self._delay, observable.max_delay, "max_delay", 1)
+        if shortest < 1 or (not callable(self._delay) and self._delay < 0):
+            raise UsageError(f"observable {name!r}: intervals are at least 1 step and delays at least 0")
+        self.capacity = self.size + 2 * -(-longest // shortest) + 2
+        aligned = not callable(self._interval) and steps % shortest == 0
+        self.direct = aligned and longest == 0 and self.size == 1
+        """Whether every read falls on a sample and shows nothing but it: then there is no ring at all."""
+
+    def _bound(self, value: Any, declared: int | None, attribute: str, which: int) -> int:
+        if not callable(value):
+            return int(value)
+        if declared is not None:
+            return int(declared)
+        bounds = _bounds(value)
+        if bounds is None:
+            raise UsageError(
+                f"observable {self.name!r}: {value!r} has no bound, and MJX needs to know how many samples can wait",
+                hint=f"set {attribute} of the observable",
+            )
+        return bounds[which]
+
+    def sample(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+        """Return the corrupted value as it is now."""
+        return jnp.asarray(self.observable(physics, random_state))
+
+    def reset(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+        """Return the ring at the start of an episode: the first sample is in it."""
+        value = self.sample(physics, random_state)
+        if self.direct:
+            return {"first": value}
+        ring = {
+            "arrival": jnp.full(self.capacity, _NEVER, jnp.int32),
+            "value": jnp.zeros((self.capacity, *value.shape), value.dtype),
+            "count": jnp.zeros((), jnp.int32),
+            "next": jnp.zeros((), jnp.int32),
+        }
+        if self.pad_initial:
+            ring["first"] = value
+        return self._insert(ring, jnp.zeros((), jnp.int32), value, random_state)
+
+    def update(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState, counts: Any) -> Any:
+        """Return the ring after a physics step; ``counts`` is False for a step that is observed later."""
+        if self.direct:
+            return ring
+        due = (now == ring["next"]) & counts
+        before = dict(random_state.memory)
+        new = self._insert(ring, now, self.sample(physics, random_state), random_state)
+        for name, value in before.items():  # a draw that did not happen leaves no trace
+            random_state.memory[name] = jnp.where(due, random_state.memory[name], value)
+        return jax.tree_util.tree_map(lambda a, b: jnp.where(due, a, b), new, ring)
+
+    def _insert(self, ring: Any, now: Any, value: Any, random_state: JaxRandomState) -> Any:
+        slot = ring["count"] % self.capacity
+        return {
+            **ring,
+            "arrival": ring["arrival"].at[slot].set(now + _draw(self._delay, random_state)),
+            "value": ring["value"].at[slot].set(value),
+            "count": ring["count"] + 1,
+            "next": now + _draw(self._interval, random_state),
+        }
+
+    def read(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+        """Return the last samples that have arrived, in the order of arrival, or what the aggregator makes of them."""
+        if self.direct:
+            value = self.sample(physics, random_state)
+            return self._shaped(value[None])
+        order = ring["count"] - 1 - jnp.arange(self.capacity)
+        slots = order % self.capacity
+        there = (order >= 0) & (ring["arrival"][slots] <= now)
+        by_arrival = jnp.where(there, ring["arrival"][slots], -1)
+        last = jnp.lexsort((order, by_arrival))[-self.size :]
+        values = ring["value"][slots[last]]
+        pad = ring["first"] if self.pad_initial else jnp.zeros_like(values[0])
+        shown = jnp.reshape(there[last], (self.size, *(1,) * (values.ndim - 1)))
+        return self._shaped(jnp.where(shown, values, pad))
+
+    def first(self, ring: Any, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+        """Return the observation at the start of an episode."""
+        if self.direct:
+            return self._shaped(ring["first"][None])
+        return self.read(ring, jnp.zeros((), jnp.int32), physics, random_state)
+
+    def _shaped(self, buffer: Any) -> Any:
+        values = buffer[0] if self.strip else buffer
+        return values if self.observable.aggregator is None else self.observable.aggregator(values)
+
+
+def make_rings(observables: Mapping[str, Observable], steps: int, strip: bool, pad_initial: bool) -> list[Ring]:
+    """Return the rings of the enabled ones of some observables."""
+    return [Ring(name, o, steps, strip, pad_initial) for name, o in observables.items() if o.enabled]
+
+
+def _draw(value: Any, random_state: JaxRandomState) -> Any:
+    if isinstance(value, Variation):
+        value = value(random_state=random_state)
+    elif callable(value):
+        value = value()
+    return jnp.asarray(value).astype(jnp.int32)
+
+
+def _bounds(value: Any) -> tuple[int, int] | None:
+    """Return the least and the greatest value of a variation of integers, or None where it tells none."""
+    if isinstance(value, deterministic.Constant):
+        return int(value.value), int(value.value)
+    if isinstance(value, deterministic.Sequence):
+        values: Any = value.values
+        return int(min(values)), int(max(values))
+    if isinstance(value, distributions.UniformInteger) and not any(map(callable, value.parameters)):
+        low, high = value.parameters
+        low, high = (0, low) if high is None else (low, high)
+        return int(low), int(high) - 1
+    if isinstance(value, distributions.UniformChoice) and not any(map(callable, value.parameters[0])):
+        return int(min(value.parameters[0])), int(max(value.parameters[0]))
+    return None

@@ -1,0 +1,44 @@
+"""One step of MJX that ends where one of dm_control's ends, and the state that an episode starts from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mujoco import mjx
+
+
+def legacy_step(model: Any, data: Any) -> Any:
+    """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
+
+    The data must be consistent: what ``forward`` or an earlier step returned. No dearer than ``mjx.step``: the same
+    stages, begun elsewhere.
+    """
+    integrator = model.opt.integrator
+    if integrator == mjx.IntegratorType.RK4:
+        return _positions(model, mjx.step(model, data))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    data = _accelerate(model, data)
+    data = mjx.euler(model, data) if integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
+    return _positions(model, data)
+
+
+def forward(model: Any, data: Any, actuation: bool = True) -> Any:
+    """Compute everything that follows from the state; without actuation, as at the start of an episode.
+
+    ``mjx.forward`` leaves accelerometers and force sensors at 0 in models without constraints; this does not.
+    """
+    if not actuation:
+        flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
+        model = model.tree_replace({"opt.disableflags": flags})
+    data = _positions(model, data)
+    return _accelerate(model, mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data)))
+
+
+def _positions(model: Any, data: Any) -> Any:
+    data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+    return mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+
+
+def _accelerate(model: Any, data: Any) -> Any:
+    data = data.replace(qacc=data.qacc_smooth) if data._impl.efc_J.size == 0 else mjx.solve(model, data)
+    return mjx.sensor_acc(model, data)

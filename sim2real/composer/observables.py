@@ -1,0 +1,121 @@
+"""The observables of one entity."""
+
+from __future__ import annotations
+
+import functools
+import weakref
+from collections import OrderedDict
+from typing import Any
+
+from sim2real.composer import define
+from sim2real.composer.observation.base import Generic, Observable
+
+OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
+"""What ``set_options`` can set."""
+
+
+class ObservableKeys:
+    """``observables.dict_keys.position`` is the key of ``position`` in an observation."""
+
+    def __init__(self, entity: Any, observables: dict[str, Any]) -> None:
+        self._entity, self._observables = entity, observables
+
+    def __getattr__(self, name: str) -> str:
+        return self._entity.mjcf_model.full_identifier + name
+
+    def __dir__(self) -> list[str]:
+        return [*self._observables, *super().__dir__()]
+
+
+@functools.cache
+def _declared(owner: type) -> tuple[str, ...]:
+    return tuple(name for name in sorted(dir(owner)) if isinstance(getattr(owner, name), define.observable))
+
+
+class Observables:
+    """Named observables of an entity; subclasses declare them with ``@composer.observable``.
+
+    Args:
+        entity: The entity that they observe.
+    """
+
+    def __init__(self, entity: Any) -> None:
+        self._entity = weakref.proxy(entity)
+        self._observables: OrderedDict[str, Any] = OrderedDict()
+        self._keys = ObservableKeys(self._entity, self._observables)
+        for name in _declared(type(self)):
+            self._observables[name] = getattr(self, name)
+        for name, function in define.declared(entity).items():
+            self.add_observable(name, function)
+
+    @property
+    def dict_keys(self) -> ObservableKeys:
+        """Name -> key in an observation, as attributes."""
+        return self._keys
+
+    def as_dict(self, fully_qualified: bool = True) -> OrderedDict[str, Any]:
+        """Return name -> observable; names are prefixed with the entity's full name unless told otherwise."""
+        prefix = self._entity.mjcf_model.full_identifier if fully_qualified else ""
+        return OrderedDict((prefix + name, value) for name, value in self._observables.items())
+
+    def get_observable(self, name: str, name_fully_qualified: bool = False) -> Any:
+        """Return an observable.
+
+        Raises:
+            KeyError: When there is none of that name.
+        """
+        if name_fully_qualified:
+            name = name.removeprefix(self._entity.mjcf_model.full_identifier)
+        try:
+            return self._observables[name]
+        except KeyError:
+            raise KeyError(self._unknown(name)) from None
+
+    def set_options(self, options: dict[str, Any] | None) -> None:
+        """Configure observables.
+
+        Args:
+            options: Options for all observables (``update_interval``, ``buffer_size``, ``delay``, ``aggregator``,
+                ``corruptor``, ``enabled``), or observable name -> options.
+
+        Raises:
+            KeyError: When there is no observable of a name.
+            AttributeError: When there is no such option.
+        """
+        options = options or {}
+        if options and OPTIONS.issuperset(options):
+            options = dict.fromkeys(self._observables, options)
+        for name, values in options.items():
+            if name not in self._observables:
+                raise KeyError(self._unknown(name))
+            self._observables[name].configure(**values)
+
+    def _unknown(self, name: str) -> str:
+        return f"No observable with name {name!r}. Available: {', '.join(self._observables)}"
+
+    def enable_all(self) -> None:
+        """Enable all observables of this entity."""
+        for value in self._observables.values():
+            value.enabled = True
+
+    def disable_all(self) -> None:
+        """Disable all observables of this entity."""
+        for value in self._observables.values():
+            value.enabled = False
+
+    def add_observable(self, name: str, observable: Any, enabled: bool = True) -> None:
+        """Add an observable, or a function of ``physics`` that returns the value."""
+        if not isinstance(observable, Observable):
+            observable = Generic(observable)
+        self._observables[name] = observable
+        observable.enabled = enabled
+
+    def get_observation(self, physics: Any) -> dict[str, Any]:
+        """Return the present value of every observable, without delays and buffers."""
+        return {name: value(physics) for name, value in self._observables.items()}
+
+    def __getattr__(self, name: str) -> Any:
+        found = self.__dict__.get("_observables", {})
+        if name in found:
+            return found[name]
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}. Observables: {', '.join(found)}")

@@ -1,0 +1,218 @@
+"""What can be observed: a function of the physics, a MuJoCo array by name, a camera by name."""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from dm_env import specs
+
+from sim2real.composer.arrays import namespace
+
+
+class Aggregator:
+    """A reduction of the buffer's first axis.
+
+    Args:
+        name: Function of numpy and of ``jax.numpy``.
+        preserves_bounds: Whether the result lies within the bounds of the values.
+    """
+
+    def __init__(self, name: str, preserves_bounds: bool) -> None:
+        self.name, self.preserves_bounds = name, preserves_bounds
+
+    def __call__(self, values: Any) -> Any:
+        """Return the reduced values."""
+        return getattr(namespace(values), self.name)(values, axis=0)
+
+    def __repr__(self) -> str:
+        return f"Aggregator({self.name!r})"
+
+
+AGGREGATORS = {name: Aggregator(name, name != "sum") for name in ("min", "max", "mean", "median", "sum")}
+
+
+def _aggregator(value: Any) -> Any:
+    if value is None or callable(value):
+        return value
+    try:
+        return AGGREGATORS[value]
+    except KeyError:
+        names = ", ".join(AGGREGATORS)
+        raise KeyError(f"Unrecognized aggregator name: {value!r}. Valid names: {names}.") from None
+
+
+class Observable(ABC):
+    """A quantity that an agent may see.
+
+    Args:
+        update_interval: Time steps of the physics between samples: a number, a variation or a callable; default 1.
+        buffer_size: How many of the last samples an observation holds; default 1.
+        delay: Time steps between sampling and arrival: a number, a variation or a callable; default 0.
+        aggregator: Reduces the buffer: ``min``, ``max``, ``mean``, ``median``, ``sum`` or a callable.
+        corruptor: Called as ``corruptor(value, random_state=...)`` on every sample; may be a variation.
+
+    Attributes:
+        enabled: Whether it is part of the observation; False at first.
+        max_delay: Bound of a delay that varies; compiled programs need it where the variation has none of its own.
+        min_interval: Bound of an interval that varies; the same.
+    """
+
+    def __init__(
+        self,
+        update_interval: Any = 1,
+        buffer_size: Any = None,
+        delay: Any = None,
+        aggregator: Any = None,
+        corruptor: Any = None,
+    ) -> None:
+        self.update_interval = update_interval
+        self.buffer_size = buffer_size
+        self.delay = delay
+        self.corruptor = corruptor
+        self.max_delay: int | None = None
+        self.min_interval: int | None = None
+        self.enabled = False
+        self._aggregator = _aggregator(aggregator)
+
+    @property
+    def aggregator(self) -> Any:
+        """The reduction of the buffer, or None."""
+        return self._aggregator
+
+    @aggregator.setter
+    def aggregator(self, value: Any) -> None:
+        self._aggregator = _aggregator(value)
+
+    @property
+    def array_spec(self) -> specs.Array | None:
+        """Shape and dtype of a sample; None: found by sampling."""
+        return None
+
+    @abstractmethod
+    def _callable(self, physics: Any) -> Callable[[], Any]:
+        """Return a function that samples the raw value."""
+
+    def observation_callable(self, physics: Any, random_state: Any = None) -> Callable[[], Any]:
+        """Return a function that samples the value and corrupts it."""
+        sample, corruptor = self._callable(physics), self.corruptor
+        if corruptor is None:
+            return sample
+        return lambda: corruptor(sample(), random_state=random_state)
+
+    def __call__(self, physics: Any, random_state: Any = None) -> Any:
+        """Return a sample."""
+        return self.observation_callable(physics, random_state)()
+
+    def configure(self, **options: Any) -> None:
+        """Set several attributes; AttributeError when there is none of a name."""
+        for name, value in options.items():
+            if not hasattr(self, name):
+                raise AttributeError(f"Cannot add attribute {name} in configure.")
+            setattr(self, name, value)
+
+
+class Generic(Observable):
+    """A function of the physics.
+
+    Args:
+        raw_observation_callable: Takes the physics, returns a number or an array.
+        update_interval: See ``Observable``.
+        buffer_size: See ``Observable``.
+        delay: See ``Observable``.
+        aggregator: See ``Observable``.
+        corruptor: See ``Observable``.
+    """
+
+    def __init__(
+        self,
+        raw_observation_callable: Callable[[Any], Any],
+        update_interval: Any = 1,
+        buffer_size: Any = None,
+        delay: Any = None,
+        aggregator: Any = None,
+        corruptor: Any = None,
+    ) -> None:
+        self._raw_callable = raw_observation_callable
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+
+    def _callable(self, physics: Any) -> Callable[[], Any]:
+        return functools.partial(self._raw_callable, physics)
+
+
+class MujocoFeature(Observable):
+    """Rows of an array of mjData, by name.
+
+    Args:
+        kind: Name of the array, such as ``geom_xpos``.
+        feature_name: Name or names of elements, or a callable that returns them.
+        update_interval: See ``Observable``.
+        buffer_size: See ``Observable``.
+        delay: See ``Observable``.
+        aggregator: See ``Observable``.
+        corruptor: See ``Observable``.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        feature_name: Any,
+        update_interval: Any = 1,
+        buffer_size: Any = None,
+        delay: Any = None,
+        aggregator: Any = None,
+        corruptor: Any = None,
+    ) -> None:
+        self._kind, self._feature_name = kind, feature_name
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+
+    def _callable(self, physics: Any) -> Callable[[], Any]:
+        array, name = getattr(physics.named.data, self._kind), self._feature_name
+        return lambda: array[name() if callable(name) else name]
+
+
+class MujocoCamera(Observable):
+    """The image of a camera, by name; uint8 ``(height, width, 3)``, or float32 ``(height, width, 1)`` [m] for depth.
+
+    Args:
+        camera_name: Name of the camera.
+        height: Pixels.
+        width: Pixels.
+        update_interval: See ``Observable``.
+        buffer_size: See ``Observable``.
+        delay: See ``Observable``.
+        aggregator: See ``Observable``.
+        corruptor: See ``Observable``.
+        depth: Measure distances instead of colours.
+    """
+
+    def __init__(
+        self,
+        camera_name: str,
+        height: int = 240,
+        width: int = 320,
+        update_interval: Any = 1,
+        buffer_size: Any = None,
+        delay: Any = None,
+        aggregator: Any = None,
+        corruptor: Any = None,
+        depth: bool = False,
+    ) -> None:
+        self._camera_name, self.height, self.width, self._depth = camera_name, height, width, depth
+        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+
+    @property
+    def array_spec(self) -> specs.Array:
+        """Shape and dtype of the image."""
+        shape = (self.height, self.width, 1 if self._depth else 3)
+        return specs.Array(shape, np.float32 if self._depth else np.uint8)
+
+    def _callable(self, physics: Any) -> Callable[[], Any]:
+        def image() -> np.ndarray:
+            pixels = physics.render(self.height, self.width, self._camera_name, depth=self._depth)
+            return np.atleast_3d(pixels)
+
+        return image

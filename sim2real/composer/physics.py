@@ -1,0 +1,341 @@
+"""A compiled model and its state on MuJoCo's C engine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer import layout
+from sim2real.composer.binding import Binding, EmptyBinding
+from sim2real.composer.element import as_elements
+from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
+from sim2real.composer.named import Named
+from sim2real.composer.translate import mj
+from sim2real.errors import UsageError
+
+_log = logging.getLogger(__name__)
+_NO_ACTUATION = int(mj.mjtDisableBit.mjDSBL_ACTUATION)
+
+
+class _Wrapper:
+    """An mjModel or mjData whose attributes are those of ``ptr``, the native object."""
+
+    __slots__ = ("ptr",)
+
+    def __init__(self, ptr: Any) -> None:
+        object.__setattr__(self, "ptr", ptr)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.ptr, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self.ptr, name, value)
+
+
+class ModelView(_Wrapper):
+    """``physics.model``: the ``MjModel``, and names to numbers and back."""
+
+    __slots__ = ()
+
+    def name2id(self, name: str, kind: str) -> int:
+        """Return the number of the element of a kind with a name; UsageError when there is none."""
+        return layout.resolve(self.ptr, kind, (name,))[0]
+
+    def id2name(self, number: int, kind: str) -> str:
+        """Return the name of an element, '' when it has none."""
+        return mj.mj_id2name(self.ptr, layout.OBJECT_TYPES[kind], number) or ""
+
+    @contextlib.contextmanager
+    def disable(self, *flags: str) -> Iterator[None]:
+        """Switch parts of the physics off, such as ``'actuation'`` or ``'contact'``, inside a ``with`` block."""
+        before = self.ptr.opt.disableflags
+        try:
+            for flag in flags:
+                self.ptr.opt.disableflags |= int(getattr(mj.mjtDisableBit, f"mjDSBL_{flag.upper()}"))
+            yield
+        finally:
+            self.ptr.opt.disableflags = before
+
+
+class DataView(_Wrapper):
+    """``physics.data``: the ``MjData``."""
+
+    __slots__ = ()
+
+
+class Physics:
+    """A model and its state; hooks, observables and tasks read and write it.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``.
+        legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
+        data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
+
+    Attributes:
+        np: The module that computes with this engine's arrays: numpy.
+        variables: What tasks keep from hook to hook during an episode: name -> array. Emptied by ``reset``.
+    """
+
+    np: Any = np
+
+    def __init__(self, model: Any, legacy_step: bool = True, data: Any = None) -> None:
+        self.legacy_step = legacy_step
+        self.variables: dict[str, Any] = {}
+        self._suppress = False
+        self._start(model, data)
+
+    def _start(self, model: Any, data: Any = None) -> None:
+        self._load(model, mj.MjData(model) if data is None else data)
+        with self.suppress_physics_errors():
+            self.after_reset()
+
+    def _load(self, model: Any, data: Any) -> None:
+        self.model = ModelView(model)
+        self.data = DataView(data)
+        self.named = Named(model, model, self.data.ptr)
+        self._bindings: dict[Any, Any] = {}
+        self._dirty = False
+        self._warnings = self.data.ptr.warning.number
+        self._warned = self._warnings.copy()
+
+    @classmethod
+    def from_mjcf_model(cls, model: Any) -> Physics:
+        """Compile a model with all that is attached to it."""
+        return cls(model.compile())
+
+    @classmethod
+    def from_xml_string(cls, xml_string: str, assets: dict[str, bytes] | None = None) -> Physics:
+        """Compile MJCF."""
+        return cls(mj.MjModel.from_xml_string(xml_string, assets or {}))
+
+    @classmethod
+    def from_xml_path(cls, path: str) -> Physics:
+        """Compile an MJCF file."""
+        return cls(mj.MjModel.from_xml_path(str(path)))
+
+    def reload_from_mjcf_model(self, model: Any) -> None:
+        """Compile a model anew and start from its initial state."""
+        self._start(model.compile())
+
+    # -- state
+
+    def time(self) -> float:
+        """Return the simulated time [s]."""
+        return self.data.ptr.time
+
+    def timestep(self) -> float:
+        """Return the time that a step takes [s]."""
+        return self.model.ptr.opt.timestep
+
+    def control(self) -> np.ndarray:
+        """Return the controls, shape ``(nu,)``."""
+        return self.data.ptr.ctrl
+
+    def set_control(self, control: Any) -> None:
+        """Set the controls, shape ``(nu,)`` [the actuators' units]."""
+        np.copyto(self.data.ptr.ctrl, control)
+
+    def position(self) -> np.ndarray:
+        """Return a copy of qpos, shape ``(nq,)``."""
+        return self.data.ptr.qpos.copy()
+
+    def velocity(self) -> np.ndarray:
+        """Return a copy of qvel, shape ``(nv,)``."""
+        return self.data.ptr.qvel.copy()
+
+    def activation(self) -> np.ndarray:
+        """Return a copy of act, shape ``(na,)``."""
+        return self.data.ptr.act.copy()
+
+    def get_state(self) -> np.ndarray:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
+        data = self.data.ptr
+        return np.concatenate([data.qpos, data.qvel, data.act])
+
+    state = get_state
+
+    def set_state(self, state: Any) -> None:
+        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        data, model = self.data.ptr, self.model.ptr
+        expected = (model.nq + model.nv + model.na,)
+        if np.shape(state) != expected:
+            raise UsageError(f"Input physics state has shape {np.shape(state)}. Expected {expected}.")
+        data.qpos[:], data.qvel[:], data.act[:] = np.split(np.asarray(state), [model.nq, model.nq + model.nv])
+
+    def copy(self, share_model: bool = False) -> Physics:
+        """Return an independent copy of the state, and of the model unless it is to be shared."""
+        made = object.__new__(type(self))
+        made.legacy_step, made.variables, made._suppress = self.legacy_step, dict(self.variables), False
+        model = self.model.ptr if share_model else mj.MjModel.__copy__(self.model.ptr)
+        data = mj.MjData(model)
+        mj.mj_copyData(data, model, self.data.ptr)
+        made._load(model, data)
+        return made
+
+    # -- dynamics
+
+    def step(self, nstep: int = 1) -> None:
+        """Advance by a number of time steps.
+
+        Raises:
+            PhysicsError: When MuJoCo warns.
+        """
+        model, data = self.model.ptr, self.data.ptr
+        self._warned[:] = self._warnings
+        if not self.legacy_step:
+            mj.mj_step(model, data, nstep)
+        elif model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
+            mj.mj_step(model, data, nstep)
+            mj.mj_step1(model, data)
+        else:  # positions and velocities are those of this state already: finish the step, then prepare the next
+            mj.mj_step2(model, data)
+            if nstep > 1:
+                mj.mj_step(model, data, nstep - 1)
+            mj.mj_step1(model, data)
+        self._check_warnings()
+
+    def forward(self) -> None:
+        """Compute everything that follows from the state, without advancing."""
+        self._warned[:] = self._warnings
+        mj.mj_forward(self.model.ptr, self.data.ptr)
+        self._dirty = False
+        self._check_warnings()
+
+    def reset(self, keyframe_id: int | None = None) -> None:
+        """Return to the initial state, or to a keyframe."""
+        model, data = self.model.ptr, self.data.ptr
+        if keyframe_id is None:
+            mj.mj_resetData(model, data)
+        elif 0 <= keyframe_id < model.nkey:
+            mj.mj_resetDataKeyframe(model, data, keyframe_id)
+        else:
+            raise UsageError(f"`keyframe_id` must be between 0 and {model.nkey - 1} inclusive, got: {keyframe_id}")
+        self.variables.clear()
+        self.after_reset()
+
+    def after_reset(self) -> None:
+        """Compute everything without the actuators: there are no controls yet."""
+        with self.model.disable("actuation"):
+            self.forward()
+
+    @contextlib.contextmanager
+    def reset_context(self) -> Iterator[Physics]:
+        """Reset, let the block set the initial state, then compute everything that follows from it."""
+        with contextlib.suppress(PhysicsError):
+            self.reset()
+        yield self
+        self.after_reset()
+
+    @contextlib.contextmanager
+    def suppress_physics_errors(self) -> Iterator[None]:
+        """Log MuJoCo's warnings inside a ``with`` block instead of raising them."""
+        before, self._suppress = self._suppress, True
+        try:
+            yield
+        finally:
+            self._suppress = before
+
+    def _check_warnings(self) -> None:
+        if np.array_equal(self._warnings, self._warned):
+            return
+        names = [n for n, new in zip(mj.mjtWarning.__members__, self._warnings > self._warned, strict=False) if new]
+        message = f"Physics state is invalid. Warning(s) raised: {', '.join(names)}"
+        if not self._suppress:
+            raise PhysicsError(message)
+        _log.warning(message)
+
+    # -- elements
+
+    @property
+    def is_dirty(self) -> bool:
+        """Whether something was written through a binding since everything was last computed."""
+        return self._dirty
+
+    def mark_as_dirty(self) -> None:
+        """Have everything computed again before the next computed attribute is read through a binding."""
+        self._dirty = True
+
+    def bind(self, elements: Any) -> Any:
+        """Return the attributes of an element, or of several of one kind, in this physics.
+
+        Raises:
+            UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
+        """
+        found, single = as_elements(elements)
+        key = (found, single)
+        binding = self._bindings.get(key)
+        if binding is None:
+            if not found:
+                binding = EmptyBinding()
+            else:
+                kind = found[0].kind
+                layout.attributes(kind)
+                ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
+                binding = Binding(weakref.proxy(self), kind, ids, single)
+            self._bindings[key] = binding
+        return binding
+
+    def get(self, elements: Any, name: str) -> Any:
+        """Return an attribute of elements; the same call on both engines."""
+        return getattr(self.bind(elements), name)
+
+    def set(self, elements: Any, name: str, value: Any) -> Physics:
+        """Set an attribute of elements and return the physics; the same call on both engines."""
+        setattr(self.bind(elements), name, value)
+        return self
+
+    def write(self, elements: Any, name: str, value: Any, index: Any) -> Physics:
+        """Set a part of an attribute of elements; the same call on both engines."""
+        getattr(self.bind(elements), name)[index] = value
+        return self
+
+    def fail(self, condition: Any = True) -> None:
+        """Give this initial state up where the condition holds; the same call on both engines.
+
+        Raises:
+            EpisodeInitializationError: When it holds.
+        """
+        if np.any(condition):
+            raise EpisodeInitializationError
+
+    def recompute_constants(self) -> None:
+        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
+        state = self.data.ptr.qpos.copy()
+        mj.mj_setConst(self.model.ptr, self.data.ptr)  # which moves the data to the reference position
+        self.data.ptr.qpos[:] = state
+        self.mark_as_dirty()
+
+    def render(
+        self,
+        height: int = 240,
+        width: int = 320,
+        camera_id: int | str = -1,
+        depth: bool = False,
+        segmentation: bool = False,
+        scene_option: Any = None,
+    ) -> np.ndarray:
+        """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``."""
+        if depth and segmentation:
+            raise UsageError("Only one of depth or segmentation can be rendered at a time.")
+        with mj.Renderer(self.model.ptr, height, width) as renderer:
+            if depth:
+                renderer.enable_depth_rendering()
+            if segmentation:
+                renderer.enable_segmentation_rendering()
+            renderer.update_scene(self.data.ptr, camera_id, scene_option)
+            return renderer.render()
+
+    def free(self) -> None:
+        """Drop the model and the state."""
+        for binding in self._bindings.values():
+            binding.free()
+        self._bindings.clear()

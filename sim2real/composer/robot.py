@@ -1,0 +1,28 @@
+"""Robots: entities with actuators."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer.element import Element
+from sim2real.composer.entity import Entity
+
+DOWN_QUATERNION = np.array([0.0, 0.70710678118, 0.70710678118, 0.0])
+"""The orientation of a hand that points down."""
+
+
+class Robot(Entity):
+    """An entity that is driven by actuators."""
+
+    @property
+    @abstractmethod
+    def actuators(self) -> Any:
+        """The actuators, in the order of an action."""
+
+    @property
+    def joints(self) -> list[Element]:
+        """The joints; default: all of the robot's own model."""
+        return self.mjcf_model.find_all("joint", exclude_attachments=True)

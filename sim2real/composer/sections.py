@@ -1,0 +1,191 @@
+"""What a model has besides its bodies: options, sizes, defaults, assets, actuators, sensors and so on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer import builder, translate
+from sim2real.composer.element import Element
+from sim2real.composer.translate import mj
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.model import Model
+
+_LISTS = {
+    "actuator": ("actuator",),
+    "sensor": ("sensor",),
+    "equality": ("equality",),
+    "tendon": ("tendon",),
+    "contact": ("pair", "exclude"),
+    "asset": ("mesh", "material", "texture", "hfield"),
+    "custom": ("numeric", "text", "tuple"),
+    "keyframe": ("key",),
+}
+_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+_CHOICES = {
+    "integrator": {k: getattr(mj.mjtIntegrator, f"mjINT_{k.upper()}") for k in _INTEGRATORS},
+    "cone": {k: getattr(mj.mjtCone, f"mjCONE_{k.upper()}") for k in ("pyramidal", "elliptic")},
+    "jacobian": {k: getattr(mj.mjtJacobian, f"mjJAC_{k.upper()}") for k in ("dense", "sparse", "auto")},
+    "solver": {k: getattr(mj.mjtSolver, f"mjSOL_{k.upper()}") for k in ("PGS", "CG", "Newton")},
+}
+_BYTES = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
+_UNSET = object()
+
+
+class Section:
+    """One section of a model, such as ``option``, ``actuator`` or ``visual.map``.
+
+    Attributes read and set the fields of the ``MjSpec``; ``add`` adds an element to the sections that hold some.
+    """
+
+    __slots__ = ("_kinds", "_model", "_name", "_path")
+
+    def __init__(self, model: Model, name: str, path: str = "", kinds: tuple[str, ...] = ()) -> None:
+        for key, value in (("_model", model), ("_name", name), ("_path", path), ("_kinds", kinds)):
+            object.__setattr__(self, key, value)
+
+    def __repr__(self) -> str:
+        return f"<{self._name} of model {self._model.model!r}>"
+
+    @property
+    def _native(self) -> Any:
+        """Return the part of the ``MjSpec`` that holds the fields."""
+        found = self._model._spec
+        for step in self._path.split(".") if self._path else ():
+            found = getattr(found, step)
+        return found
+
+    def add(self, tag: str, **attrs: Any) -> Any:
+        """Add an element, such as ``actuator.add('motor', joint=...)``.
+
+        Raises:
+            UsageError: When elements of this tag do not stand in this section.
+        """
+        if not self._kinds:
+            raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
+        kind = self._kinds[0] if len(self._kinds) == 1 else tag
+        if kind not in self._kinds:
+            raise UsageError(f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}")
+        return builder.add_to_section(self._model, kind, tag, attrs)
+
+    def all_children(self) -> list[Element]:
+        """Return the elements of this section, without those of attached models."""
+        return [e for kind in self._kinds for e in self._model.find_all(kind, exclude_attachments=True)]
+
+    def set_attributes(self, **attrs: Any) -> None:
+        """Set several attributes."""
+        for name, value in attrs.items():
+            setattr(self, name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name in self._kinds:
+            return self._model.find_all(name, exclude_attachments=True)
+        if self._name == "compiler" and name == "angle":
+            return "degree" if self._native.degree else "radian"
+        if self._name == "visual":
+            return Section(self._model, f"visual.{name}", f"visual.{name.rstrip('_')}")
+        if self._name == "option" and name == "flag":
+            return Flags(self._model)
+        if not hasattr(self._native, name):
+            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
+        value = getattr(self._native, name)
+        if isinstance(value, np.ndarray):  # which the caller may write into
+            self._model.touch_settings()
+        return next((k for k, v in _CHOICES[name].items() if v == value), value) if name in _CHOICES else value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        native = self._native
+        self._model.touch_settings()
+        if self._name == "compiler" and name == "angle":
+            native.degree = value == "degree"
+            return
+        if self._name == "size" and name == "memory" and isinstance(value, str):
+            value = int(float(value.rstrip("kKmMgG")) * _BYTES.get(value[-1].lower(), 1))
+        current = getattr(native, name, _UNSET)
+        if current is _UNSET:
+            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
+        if name in _CHOICES and isinstance(value, str):
+            if value not in _CHOICES[name]:
+                raise UsageError(f"{name}={value!r} is not valid. Available: {', '.join(_CHOICES[name])}")
+            value = int(_CHOICES[name][value])
+        if name == "eulerseq":
+            native.eulerseq = list(value)
+            return
+        setattr(native, name, translate.like(current, value))
+
+    def _known(self) -> str:
+        return ", ".join(n for n in dir(self._native) if not n.startswith("_"))
+
+
+class Flags:
+    """``option.flag``: parts of the physics that are switched with ``enable`` and ``disable``."""
+
+    __slots__ = ("_model",)
+
+    def __init__(self, model: Model) -> None:
+        object.__setattr__(self, "_model", model)
+
+    def _bit(self, name: str) -> tuple[str, int]:
+        for field, kind, prefix in (
+            ("disableflags", mj.mjtDisableBit, "mjDSBL_"),
+            ("enableflags", mj.mjtEnableBit, "mjENBL_"),
+        ):
+            bit = kind.__members__.get(prefix + name.upper())
+            if bit is not None:
+                return field, int(bit)
+        raise AttributeError(f"<option.flag> has no attribute {name!r}")
+
+    def __getattr__(self, name: str) -> str:
+        field, bit = self._bit(name)
+        on = bool(getattr(self._model._spec.option, field) & bit) == (field == "enableflags")
+        return "enable" if on else "disable"
+
+    def __setattr__(self, name: str, value: str) -> None:
+        field, bit = self._bit(name)
+        if value not in ("enable", "disable"):
+            raise UsageError(f"option.flag.{name}={value!r} is not valid. Available: disable, enable")
+        bits = getattr(self._model._spec.option, field)
+        raised = (value == "enable") == (field == "enableflags")
+        setattr(self._model._spec.option, field, bits | bit if raised else bits & ~bit)
+        self._model.touch_settings()
+
+
+class Defaults:
+    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another."""
+
+    __slots__ = ("_model", "name")
+
+    def __init__(self, model: Model, name: str) -> None:
+        self._model, self.name = model, name
+
+    def add(self, tag: str, dclass: str) -> Defaults:
+        """Add a class below this one."""
+        if tag != "default":
+            raise UsageError(f"a <{tag}> cannot be added to <default>", hint="set default.<tag>.<attribute>")
+        spec = self._model._spec
+        spec.add_default(dclass, spec.find_default(self.name))
+        self._model.touch()
+        return Defaults(self._model, dclass)
+
+    def __getattr__(self, tag: str) -> Element:
+        if tag.startswith("__"):
+            raise AttributeError(tag)
+        native = getattr(self._model._spec.find_default(self.name), tag, None)
+        if native is None:
+            raise AttributeError(f"<default> has no elements {tag!r}")
+        return Element(self._model, tag, native)
+
+
+def make_sections(model: Model) -> dict[str, Any]:
+    """Return the sections of a model by name."""
+    found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in _LISTS.items()}
+    for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
+        found[name] = Section(model, name, path)
+    found["statistic"] = Section(model, "statistic", "stat")
+    found["default"] = Defaults(model, "main")
+    return found

@@ -1,0 +1,205 @@
+"""Tasks: what an agent has to do in a world."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from dm_env import specs
+
+from sim2real.composer import define
+from sim2real.composer.entity import Entity
+from sim2real.composer.layout import names_of
+from sim2real.composer.observation.base import Generic
+from sim2real.errors import UsageError
+
+_UNLIMITED = 1e10
+
+
+def _steps(control_timestep: float, physics_timestep: float) -> int:
+    """Return how many physics steps a control step has."""
+    ratio = control_timestep / physics_timestep
+    steps = round(ratio)
+    if abs(ratio - steps) > 1e-6:
+        raise UsageError(
+            "Control timestep should be an integer multiple of physics timestep: "
+            f"got {control_timestep!r} and {physics_timestep!r}"
+        )
+    if steps < 1:
+        raise UsageError(
+            f"a control step of {control_timestep!r} s is shorter than a physics step of {physics_timestep!r} s"
+        )
+    return steps
+
+
+class Task(ABC):
+    """Reward, termination and the initial state of an episode, in a world of entities."""
+
+    @property
+    def root_entity(self) -> Entity:
+        """The entity that holds all others; subclasses override it, or the environment sets it."""
+        entity = self.__dict__.get("_root_entity")
+        if entity is None:
+            raise NotImplementedError(f"{type(self).__name__} has no root_entity: define it, or pass an arena")
+        return entity
+
+    def iter_entities(self) -> Iterator[Entity]:
+        """Yield all entities, depth first."""
+        return self.root_entity.iter_entities()
+
+    @property
+    def observables(self) -> OrderedDict[str, Any]:
+        """Name -> observable: those of the task, then those of every entity."""
+        found: OrderedDict[str, Any] = OrderedDict()
+        for name, function in define.declared(self).items():
+            found[name] = Generic(function)
+            found[name].enabled = True
+        found.update(self.task_observables)
+        for entity in self.iter_entities():
+            found.update(entity.observables.as_dict())
+        return found
+
+    @property
+    def task_observables(self) -> Any:
+        """Name -> observable of what belongs to no entity."""
+        return OrderedDict()
+
+    def _check_root_entity(self, name: str) -> None:
+        try:
+            _ = self.root_entity
+        except Exception as error:
+            raise error from RuntimeError(f"call to `{name}` made before `root_entity` is available")
+
+    @property
+    def control_timestep(self) -> float:
+        """Time between two actions [s]; default: the physics's time step."""
+        self._check_root_entity("control_timestep")
+        return self.__dict__.get("_control_timestep", self.physics_timestep)
+
+    @control_timestep.setter
+    def control_timestep(self, value: float) -> None:
+        self._check_root_entity("control_timestep")
+        _steps(value, self.physics_timestep)
+        self._control_timestep = value
+
+    @property
+    def physics_timestep(self) -> float:
+        """Time step of the physics [s]."""
+        self._check_root_entity("physics_timestep")
+        return self.root_entity.mjcf_model.option.timestep
+
+    @physics_timestep.setter
+    def physics_timestep(self, value: float) -> None:
+        self._check_root_entity("physics_timestep")
+        if "_control_timestep" in self.__dict__:
+            _steps(self._control_timestep, value)
+        self.root_entity.mjcf_model.option.timestep = value
+
+    def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
+        """Set both time steps [s].
+
+        Raises:
+            UsageError: When a control step is no whole number of physics steps.
+        """
+        self._check_root_entity("set_timesteps")
+        _steps(control_timestep, physics_timestep)
+        self.root_entity.mjcf_model.option.timestep = physics_timestep
+        self._control_timestep = control_timestep
+
+    @property
+    def physics_steps_per_control_step(self) -> int:
+        """Physics steps in a control step."""
+        return _steps(self.control_timestep, self.physics_timestep)
+
+    def action_spec(self, physics: Any) -> specs.BoundedArray:
+        """Return shape ``(nu,)`` and bounds of an action; its name lists the actuators, separated by tabs."""
+        model = physics.model
+        limited = np.asarray(model.actuator_ctrllimited, bool)
+        low, high = np.asarray(model.actuator_ctrlrange, float).T
+        names = names_of(physics.model.ptr, "actuator")
+        return specs.BoundedArray(
+            (model.nu,),
+            float,
+            np.where(limited, low, -_UNLIMITED),
+            np.where(limited, high, _UNLIMITED),
+            name="\t".join(name or str(i) for i, name in enumerate(names)),
+        )
+
+    def get_reward_spec(self) -> Any:
+        """Return the spec of a reward that is no number; None: it is one."""
+        return None
+
+    def get_discount_spec(self) -> Any:
+        """Return the spec of a discount that is no number in [0, 1]; None: it is one."""
+        return None
+
+    # -- hooks
+
+    def initialize_episode_mjcf(self, random_state: Any) -> None:  # noqa: B027
+        """Change the models before they are compiled for an episode."""
+
+    def after_compile(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Look at the compiled model."""
+
+    def initialize_episode(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Set the state at the start of an episode."""
+
+    def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+        """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
+        del random_state
+        physics.set_control(action)
+
+    def before_substep(self, physics: Any, action: Any, random_state: Any) -> None:  # noqa: B027
+        """Act before a step of the physics."""
+
+    def after_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act after a step of the physics."""
+
+    def after_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+        """Act after a control step."""
+
+    @abstractmethod
+    def get_reward(self, physics: Any) -> Any:
+        """Return the reward of the step that was just taken."""
+
+    def should_terminate_episode(self, physics: Any) -> Any:
+        """Return whether the episode ends here; default: what ``get_termination`` says."""
+        return self.get_termination(physics)
+
+    def get_termination(self, physics: Any) -> Any:
+        """Return whether the episode ends here; another name for ``should_terminate_episode``."""
+        del physics
+        return False
+
+    def get_discount(self, physics: Any) -> Any:
+        """Return the discount of what comes after this step, in [0, 1]."""
+        del physics
+        return 1.0
+
+
+class NullTask(Task):
+    """A task without a reward.
+
+    Args:
+        root_entity: The entity that holds all others; default: an empty arena.
+    """
+
+    def __init__(self, root_entity: Entity | None = None) -> None:
+        if root_entity is None:
+            from sim2real.composer.arena import Arena
+
+            root_entity = Arena()
+        self._root_entity = root_entity
+
+    @property
+    def root_entity(self) -> Entity:
+        """The entity that holds all others."""
+        return self._root_entity
+
+    def get_reward(self, physics: Any) -> float:
+        """Return 0."""
+        del physics
+        return 0.0

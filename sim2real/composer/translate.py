@@ -1,0 +1,275 @@
+"""Attributes as MJCF spells them, put on the elements of an ``MjSpec``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import mujoco
+import numpy as np
+
+from sim2real.errors import UsageError
+
+mj: Any = mujoco
+
+TREE_KINDS = ("body", "geom", "joint", "site", "camera", "light")
+"""What may stand in a body."""
+
+_ORIENTATIONS = {
+    "euler": mj.mjtOrientation.mjORIENTATION_EULER,
+    "axisangle": mj.mjtOrientation.mjORIENTATION_AXISANGLE,
+    "xyaxes": mj.mjtOrientation.mjORIENTATION_XYAXES,
+    "zaxis": mj.mjtOrientation.mjORIENTATION_ZAXIS,
+}
+_RENAMED = {
+    "geom": {"mesh": "meshname", "hfield": "hfieldname", "fluidcoef": "fluid_coefs"},
+    "joint": {
+        "solreflimit": "solref_limit",
+        "solimplimit": "solimp_limit",
+        "solreffriction": "solref_friction",
+        "solimpfriction": "solimp_friction",
+        "actuatorfrcrange": "actfrcrange",
+        "actuatorfrclimited": "actfrclimited",
+        "actuatorgravcomp": "actgravcomp",
+    },
+    "camera": {"target": "targetbody"},
+    "light": {"target": "targetbody"},
+    "tendon": {
+        "solreflimit": "solref_limit",
+        "solimplimit": "solimp_limit",
+        "solreffriction": "solref_friction",
+        "solimpfriction": "solimp_friction",
+        "actuatorfrcrange": "actfrcrange",
+        "actuatorfrclimited": "actfrclimited",
+    },
+    "actuator": {"kp": "gainprm"},
+    "equality": {"body1": "name1", "body2": "name2", "joint1": "name1", "joint2": "name2"},
+    "sensor": dict.fromkeys(("site", "joint", "body", "actuator", "tendon", "camera"), "objname"),
+    "pair": {"geom1": "geomname1", "geom2": "geomname2"},
+    "exclude": {"body1": "bodyname1", "body2": "bodyname2"},
+}
+_LIMITED = {"false": 0, "true": 1, "auto": 2}
+_TRACKING = {
+    name: getattr(mj.mjtCamLight, f"mjCAMLIGHT_{name.upper()}")
+    for name in ("fixed", "track", "trackcom", "targetbody", "targetbodycom")
+}
+_ENUMS: dict[tuple[str, str], dict[str, Any]] = {
+    ("geom", "type"): {
+        name: getattr(mj.mjtGeom, f"mjGEOM_{name.upper()}")
+        for name in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
+    },
+    ("joint", "type"): {
+        name: getattr(mj.mjtJoint, f"mjJNT_{name.upper()}") for name in ("free", "ball", "slide", "hinge")
+    },
+    ("camera", "mode"): _TRACKING,
+    ("light", "mode"): _TRACKING,
+}
+_ENUMS["site", "type"] = _ENUMS["geom", "type"]
+_SECTIONS = {
+    **dict.fromkeys(("mesh", "material", "texture", "hfield", "skin"), "asset"),
+    **dict.fromkeys(("pair", "exclude"), "contact"),
+    **dict.fromkeys(("numeric", "text", "tuple"), "custom"),
+    "key": "keyframe",
+}
+_VECTORS = ("MjDoubleVec", "MjFloatVec")
+_SKIPPED = {
+    "id",
+    "signature",
+    "compiler",
+    "name",
+    "alt",
+    "ialt",
+    "plugin",
+    "parent",
+    "frame",
+    "classname",
+    "path",
+    "info",
+}
+
+
+def native_name(kind: str, key: str) -> str:
+    """Return the ``MjSpec`` spelling of an MJCF attribute."""
+    key = "userdata" if key == "user" else key
+    return _RENAMED.get(kind, {}).get(key, key)
+
+
+def read(native: Any, kind: str, key: str) -> Any:
+    """Return an attribute of an element; AttributeError when there is none of that name."""
+    if key in _ORIENTATIONS and hasattr(native, "alt"):
+        return np.array(getattr(native.alt, key))
+    value = getattr(native, native_name(kind, key))
+    names = _ENUMS.get((kind, key))
+    if names is not None:
+        return next((name for name, number in names.items() if number == value), value)
+    if kind == "body" and key == "mocap":
+        return "true" if value else "false"
+    return value
+
+
+def assign(native: Any, kind: str, key: str, value: Any) -> None:
+    """Set an attribute of an element.
+
+    Raises:
+        AttributeError: When elements of this kind have no such attribute.
+    """
+    plan = _PLANS.get((kind, key))
+    if plan is None:
+        plan = _PLANS[kind, key] = _plan(native, kind, key)
+    name, size, dtype, choices = plan
+    if size:
+        numbers = np.array(value, dtype) if value.__class__ is not str else np.array(_numbers(value), dtype)
+        if numbers.size < size:  # a part is given: the rest stays
+            whole = getattr(native, name).copy()
+            whole[: numbers.size] = numbers
+            numbers = whole
+        if name == "quat":
+            native.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
+        setattr(native, name, numbers)
+    elif name in _ORIENTATIONS:
+        setattr(native.alt, name, np.asarray(_numbers(value), float))
+        native.alt.type = _ORIENTATIONS[name]
+    elif choices is not None and isinstance(value, str):
+        if value not in choices:
+            raise UsageError(f"{key}={value!r} is not valid for <{kind}>. Available: {', '.join(choices)}")
+        setattr(native, name, choices[value])
+    else:
+        setattr(native, name, like(getattr(native, name), value))
+
+
+_PLANS: dict[tuple[str, str], tuple[str, int, Any, dict[str, Any] | None]] = {}
+
+
+def _plan(native: Any, kind: str, key: str) -> tuple[str, int, Any, dict[str, Any] | None]:
+    """Return the native name of an attribute, length and dtype where it is an array, and names of its values."""
+    if key in _ORIENTATIONS and hasattr(native, "alt"):
+        return key, 0, None, None
+    name = native_name(kind, key)
+    if name in _SKIPPED or not hasattr(native, name):
+        known = ", ".join(attributes(native))
+        raise AttributeError(f"{key!r} is not a valid attribute for <{kind}>. Available: {known}")
+    value = getattr(native, name)
+    is_array = isinstance(value, np.ndarray) and value.ndim == 1
+    return name, value.size if is_array else 0, value.dtype if is_array else None, _ENUMS.get((kind, key))
+
+
+def like(current: Any, value: Any) -> Any:
+    """Return a value in the form that a native attribute takes: padded, parsed, counted."""
+    if isinstance(current, mj.mjtLimited):
+        return _LIMITED[value] if isinstance(value, str) else int(value)
+    if isinstance(current, bool):
+        return value == "true" if isinstance(value, str) else bool(value)
+    if isinstance(current, np.ndarray):
+        numbers = np.atleast_1d(np.asarray(_numbers(value), current.dtype)).ravel()
+        if current.ndim == 1 and numbers.size < current.size:
+            numbers = np.concatenate([numbers, current[numbers.size :]])
+        return numbers
+    if isinstance(current, int | float) and isinstance(value, str):
+        return type(current)(float(value))
+    if type(current).__name__ in _VECTORS:
+        return [float(v) for v in np.ravel(_numbers(value))]
+    return value
+
+
+def _numbers(value: Any) -> Any:
+    return [float(word) for word in value.split()] if isinstance(value, str) else value
+
+
+def attributes(native: Any) -> tuple[str, ...]:
+    """Return the names of an element's plain attributes."""
+    return _attributes(type(native))
+
+
+@functools.cache
+def _attributes(native_type: type) -> tuple[str, ...]:
+    names = (n for n in dir(native_type) if not n.startswith("_") and n not in _SKIPPED)
+    return tuple(n for n in names if isinstance(getattr(native_type, n), property))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return str(value).lower()
+    array = np.asarray(value)
+    if array.dtype == bool:
+        return " ".join(str(v).lower() for v in array.ravel().tolist())
+    return " ".join(repr(v) for v in array.ravel().tolist())
+
+
+def from_xml(
+    kind: str, tag: str, attrs: Mapping[str, Any], references: Iterable[str]
+) -> tuple[Mapping[str, Any], dict[str, Any]]:
+    """Return the native attributes that MuJoCo's own parser reads from MJCF: plain ones, and those that name elements.
+
+    Args:
+        kind: Namespace of the element, such as ``actuator``.
+        tag: Its tag, such as ``position``.
+        attrs: MJCF attribute -> value.
+        references: Attributes in ``attrs`` that name other elements.
+
+    Raises:
+        ValueError: When the parser refuses the element.
+    """
+    plain = tuple([(k, v if v.__class__ is str else _text(v)) for k, v in attrs.items() if k not in references])
+    fixed, named = _parsed(kind, tag, plain, tuple(references))
+    return fixed, {
+        name: [attrs.get(v[1:], v) for v in value] if isinstance(value, list) else attrs[value[1:]]
+        for name, value in named.items()
+    }
+
+
+@functools.lru_cache(maxsize=4096)
+def _parsed(
+    kind: str, tag: str, plain: tuple[tuple[str, str], ...], references: tuple[str, ...]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*plain, *((k, f"@{k}") for k in references)))
+    section = _SECTIONS.get(kind, kind)
+    spec = mj.MjSpec.from_string(f"<mujoco><{section}><{tag} {words}/></{section}></mujoco>")
+    source = getattr(spec, plural(kind))[0]
+    blank = getattr(mj.MjSpec(), f"add_{kind}")()
+    given = {native_name(kind, k) for k, _ in plain}
+    fixed, named = {}, {}
+    for name in _attributes(type(source)):
+        value = getattr(source, name)
+        if name in given or not _same(value, getattr(blank, name)):
+            value = _detached(value)
+            (named if _is_reference(value) else fixed)[name] = value
+    return fixed, named
+
+
+def _is_reference(value: Any) -> bool:
+    """Return whether a parsed value is a placeholder, or a list with one."""
+    if isinstance(value, list):
+        value = next((v for v in value if v), "")
+        return isinstance(value, str) and value[:1] == "@"
+    return isinstance(value, str) and value[:1] == "@"
+
+
+def _detached(value: Any) -> Any:
+    """Return a value that outlives the spec it was read from."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    return list(value) if type(value).__name__.endswith("Vec") else value
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, str | bool | int | float) or hasattr(a, "value"):
+        return a == b or a != a
+    try:
+        return list(a) == list(b)
+    except TypeError:
+        return True
+
+
+def plural(kind: str) -> str:
+    """Return the name of the list in an ``MjSpec`` that holds elements of a kind."""
+    if kind == "body":
+        return "bodies"
+    if kind == "equality":
+        return "equalities"
+    return f"{kind}es" if kind == "mesh" else f"{kind}s"

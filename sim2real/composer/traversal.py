@@ -1,0 +1,35 @@
+"""From a model to the frame and the joints that hold it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sim2real.composer import compose
+from sim2real.composer.element import Element
+from sim2real.composer.model import Model
+
+
+def get_attachment_frame(mjcf_model: Model) -> Any:
+    """Return the body that holds an attached model, or None."""
+    parent = mjcf_model.parent_model
+    if parent is None:
+        return None
+    own = compose.free_body(mjcf_model)
+    return parent.find("attachment_frame", mjcf_model.model) if own is None else mjcf_model.handle("body", own)
+
+
+def get_freejoint(element: Element) -> Element | None:
+    """Return the free joint of a body, or None."""
+    return element.freejoint if element.kind == "body" else None
+
+
+def get_frame_freejoint(mjcf_model: Model) -> Element | None:
+    """Return the free joint that moves an attached model: of its frame, or its own one; or None."""
+    frame = get_attachment_frame(mjcf_model)
+    return None if frame is None else get_freejoint(frame)
+
+
+def get_frame_joints(mjcf_model: Model) -> list[Element] | None:
+    """Return all joints of the frame of an attached model, or None when it is not attached."""
+    frame = get_attachment_frame(mjcf_model)
+    return None if frame is None else frame.find_all("joint", immediate_children_only=True)

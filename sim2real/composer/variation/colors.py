@@ -1,0 +1,63 @@
+"""Colours whose channels vary; the values are RGBA, shape ``(4,)`` in [0, 1]."""
+
+from __future__ import annotations
+
+import colorsys
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer.arrays import namespace
+from sim2real.composer.variation.base import Variation, evaluate
+
+
+class RgbVariation(Variation):
+    """Red, green, blue and alpha."""
+
+    def __init__(self, r: Any, g: Any, b: Any, alpha: Any = 1.0) -> None:
+        self._channels = [r, g, b, alpha]
+
+    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+        """Return a colour."""
+        values = evaluate(self._channels, initial_value, current_value, random_state)
+        return namespace(values).asarray(values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RgbVariation) and self._channels == other._channels
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __repr__(self) -> str:
+        r, g, b, alpha = self._channels
+        return f"RgbVariation(r={r}, g={g}, b={b}, alpha={alpha})"
+
+
+class HsvVariation(Variation):
+    """Hue, saturation, value and alpha."""
+
+    def __init__(self, h: Any, s: Any, v: Any, alpha: Any = 1.0) -> None:
+        self._channels = (h, s, v, alpha)
+
+    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+        """Return a colour."""
+        h, s, v, alpha = evaluate(self._channels, initial_value, current_value, random_state)
+        return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HsvVariation) and self._channels == other._channels
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __repr__(self) -> str:
+        h, s, v, alpha = self._channels
+        return f"HsvVariation(h={h}, s={s}, v={v}, alpha={alpha})"
+
+
+class GrayVariation(HsvVariation):
+    """Gray level and alpha."""
+
+    def __init__(self, gray_level: Any, alpha: Any = 1.0) -> None:
+        super().__init__(h=0.0, s=0.0, v=gray_level, alpha=alpha)
+
+    def __repr__(self) -> str:
+        return f"GrayVariation(gray_level={self._channels[2]}, alpha={self._channels[3]})"

@@ -1,0 +1,46 @@
+"""One variation for several attributes."""
+
+from __future__ import annotations
+
+import weakref
+from collections import deque
+from typing import Any
+
+from sim2real.composer.variation.base import Variation, evaluate
+
+
+class VariationBroadcaster:
+    """Hands the same draws to several users: the n-th call of every proxy returns the n-th draw.
+
+    Args:
+        wrapped_variation: What is drawn from.
+    """
+
+    def __init__(self, wrapped_variation: Any) -> None:
+        self._wrapped = wrapped_variation
+        self._waiting: weakref.WeakKeyDictionary[Proxy, deque[Any]] = weakref.WeakKeyDictionary()
+
+    def get_proxy(self) -> Proxy:
+        """Return a variation that stands for the wrapped one."""
+        proxy = Proxy(self)
+        self._waiting[proxy] = deque()
+        return proxy
+
+    def next_value(self, proxy: Proxy, random_state: Any) -> Any:
+        """Return the next draw that a proxy has not had yet."""
+        if not self._waiting[proxy]:
+            value = evaluate(self._wrapped, None, None, random_state)
+            for waiting in self._waiting.values():
+                waiting.append(value)
+        return self._waiting[proxy].popleft()
+
+
+class Proxy(Variation):
+    """Stands for a broadcast variation; made by ``VariationBroadcaster.get_proxy``."""
+
+    def __init__(self, broadcaster: VariationBroadcaster) -> None:
+        self._broadcaster = broadcaster
+
+    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+        """Return the next draw."""
+        return self._broadcaster.next_value(self, random_state)

@@ -1,0 +1,107 @@
+"""Variations bound to attributes: of the model before it is compiled, or of the compiled one."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer.arrays import is_jax
+from sim2real.composer.variation.base import evaluate
+
+_CONSTANTS = frozenset(
+    {"mass", "inertia", "ipos", "iquat", "pos", "quat", "armature", "qpos0", "qpos_spring", "gear", "stiffness", "size"}
+)
+"""Attributes that MuJoCo computes constants from, such as the inertia seen at a joint."""
+
+
+class _Bound:
+    __slots__ = ("initial", "variation")
+
+    def __init__(self, variation: Any, initial: Any = None) -> None:
+        self.variation, self.initial = variation, initial
+
+
+class MJCFVariator:
+    """Varies attributes of models before they are compiled; for ``initialize_episode_mjcf``."""
+
+    def __init__(self) -> None:
+        self._variations: dict[Any, dict[str, _Bound]] = {}
+
+    def bind_attributes(self, element: Any, **attributes: Any) -> None:
+        """Bind variations, or fixed values, to attributes of an element; None unbinds."""
+        bound = self._variations.setdefault(element, {})
+        for name, variation in attributes.items():
+            if variation is None and name in bound:
+                del bound[name]
+            else:
+                bound[name] = _Bound(variation, copy.copy(getattr(element, name)))
+
+    def apply_variations(self, random_state: Any) -> None:
+        """Draw a value for every bound attribute and set it."""
+        for element, attributes in self._variations.items():
+            values = {}
+            for name, bound in attributes.items():
+                current = getattr(element, name)
+                if bound.initial is None:
+                    bound.initial = copy.copy(current)
+                values[name] = evaluate(bound.variation, bound.initial, current, random_state)
+            element.set_attributes(**values)
+
+    def clear(self) -> None:
+        """Unbind everything."""
+        self._variations.clear()
+
+    def reset_initial_values(self) -> None:
+        """Take the values at the next application as the initial ones."""
+        for attributes in self._variations.values():
+            for bound in attributes.values():
+                bound.initial = None
+
+
+class PhysicsVariator:
+    """Varies attributes of the compiled model and of the state; for ``initialize_episode`` and the steps.
+
+    On MJX the initial value is that of the compiled model, and only numeric fields of the model can vary from copy to
+    copy. Constants that MuJoCo derives from masses and lengths are computed anew on the C engine.
+    """
+
+    def __init__(self) -> None:
+        self._variations: dict[Any, dict[str, _Bound]] = {}
+
+    def bind_attributes(self, element: Any, **attributes: Any) -> None:
+        """Bind variations, or fixed values, to attributes that ``physics.bind(element)`` has; None unbinds."""
+        bound = self._variations.setdefault(element, {})
+        for name, variation in attributes.items():
+            if variation is None and name in bound:
+                del bound[name]
+            else:
+                bound[name] = _Bound(variation)
+
+    def apply_variations(self, physics: Any, random_state: Any) -> None:
+        """Draw a value for every bound attribute and set it."""
+        derived = False
+        for element, attributes in self._variations.items():
+            binding = physics.bind(element)
+            for name, bound in attributes.items():
+                current = getattr(binding, name)
+                if is_jax(current):
+                    initial = physics.initial(element, name)
+                else:
+                    if bound.initial is None:
+                        bound.initial = np.copy(current)
+                    initial, derived = bound.initial, derived or name in _CONSTANTS
+                setattr(binding, name, evaluate(bound.variation, initial, current, random_state))
+        if derived and hasattr(physics, "recompute_constants"):
+            physics.recompute_constants()
+
+    def clear(self) -> None:
+        """Unbind everything."""
+        self._variations.clear()
+
+    def reset_initial_values(self) -> None:
+        """Take the values at the next application as the initial ones."""
+        for attributes in self._variations.values():
+            for bound in attributes.values():
+                bound.initial = None

@@ -1,0 +1,80 @@
+"""A composed task as a gymnasium vector environment: many copies, stepped together on MJX."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from sim2real.composer.mjx.environment import MjxEnvironment
+
+
+class MjxVectorEnv(VectorEnv):
+    """Copies of a task, with the interface of ``gymnasium.vector``; a copy that is done starts anew at the next step.
+
+    Args:
+        environment: The task as a pure environment.
+        num_envs: Number of copies.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012 - gymnasium's own form
+
+    def __init__(self, environment: MjxEnvironment, num_envs: int) -> None:
+        self.environment, self.num_envs = environment, num_envs
+        model = environment.model
+        limited = np.asarray(model.actuator_ctrllimited, bool)
+        low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf).astype(np.float32)
+        high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf).astype(np.float32)
+        self.single_action_space = gymnasium.spaces.Box(low, high)
+        self.single_observation_space = gymnasium.spaces.Dict(
+            {k: _box(v) for k, v in environment.observation_spec().items()}
+        )
+        batch = gymnasium.vector.utils.batch_space
+        self.action_space = batch(self.single_action_space, num_envs)
+        self.observation_space = batch(self.single_observation_space, num_envs)
+        self._reset = jax.jit(jax.vmap(environment.reset))
+        self._step = jax.jit(jax.vmap(environment.step))
+        self._select = jax.jit(jax.vmap(environment.select))
+        self._key = jax.random.key(0)
+        self._state: Any = None
+        self._done = np.zeros(num_envs, bool)
+
+    def _keys(self) -> Any:
+        self._key, key = jax.random.split(self._key)
+        return jax.random.split(key, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start all copies; return observations and infos."""
+        del options
+        if seed is not None:
+            self._key = jax.random.key(seed)
+        self._state = self._reset(self._keys())
+        self._done = np.zeros(self.num_envs, bool)
+        return self._observation(), {"failed": np.asarray(self._state.failed)}
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step all copies; return observations, rewards, terminations, truncations and infos."""
+        before, done = self._state, self._done
+        self._state = self._step(before, np.asarray(actions))
+        if done.any():
+            self._state = self._select(done, self._reset(self._keys()), self._state)
+        state = self._state
+        truncated = np.asarray(state.truncated)
+        self._done = np.asarray(state.done)
+        infos = {"discount": np.asarray(state.discount), "failed": np.asarray(state.failed)}
+        return self._observation(), np.asarray(state.reward), self._done & ~truncated, truncated, infos
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        return {k: np.asarray(v) for k, v in self._state.observation.items()}
+
+
+def _box(leaf: Any) -> gymnasium.spaces.Box:
+    if np.issubdtype(leaf.dtype, np.floating):
+        return gymnasium.spaces.Box(-np.inf, np.inf, leaf.shape, leaf.dtype)
+    if leaf.dtype == bool:
+        return gymnasium.spaces.Box(0, 1, leaf.shape, np.int8)
+    info = np.iinfo(leaf.dtype)
+    return gymnasium.spaces.Box(info.min, info.max, leaf.shape, leaf.dtype)

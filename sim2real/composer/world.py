@@ -1,0 +1,126 @@
+"""A composed task as the world of a graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sim2real.composer.mjx.environment import MjxEnvironment, State
+from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer.task import Task
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseWorld
+
+
+@struct.dataclass
+class WorldParams(Base):
+    """What is to be identified, or differs from copy to copy.
+
+    Attributes:
+        values: Name -> array, in the unit of the attribute that it sets.
+    """
+
+    values: Any
+
+
+@struct.dataclass
+class Observations(Base):
+    """The observation of a task.
+
+    Attributes:
+        values: Key of the observable -> array.
+    """
+
+    values: Any
+
+
+class ComposedWorld(BaseWorld):
+    """A task that ticks in MJX as a node: its action comes from one input, its output is the observation.
+
+    A tick is a control step. Delays and intervals of observables pass inside the node, those of connections between
+    nodes. The state is the environment's: data, samples that may still be read, variables of the task.
+
+    Args:
+        name: Unique in the graph.
+        task: The task.
+        command: Name of the input that carries the action.
+        field: Field of that input's message: shape ``(nu,)``.
+        parameters: Name -> (element or elements, attribute), such as ``{"friction": (joint, "frictionloss")}``.
+        rate: Ticks per second [Hz]; default, and only choice: once a control step.
+        color: Colour in drawings.
+        order: Place in drawings.
+        **options: Passed on to ``MjxEnvironment``.
+
+    Raises:
+        UsageError: When the rate is another, a parameter cannot vary on MJX, or MJX cannot run the world.
+
+    Attributes:
+        environment: The task as a pure environment.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        task: Task,
+        command: str = "actuator",
+        field: str = "action",
+        parameters: Mapping[str, tuple[Any, str]] | None = None,
+        rate: float | None = None,
+        color: str | None = None,
+        order: int | None = None,
+        **options: Any,
+    ) -> None:
+        self.environment = MjxEnvironment(task, **options)
+        ticks = 1.0 / task.control_timestep
+        if rate is not None and not math.isclose(rate, ticks, rel_tol=1e-6):
+            raise UsageError(
+                f"world {name!r}: a tick of {1 / rate:g} s is no control step of {task.control_timestep:g} s",
+                hint="set the task's control_timestep to 1 / rate",
+            )
+        super().__init__(name, ticks, color=color, order=order)
+        self.input_name, self.field = command, field
+        self._parameters = dict(parameters or {})
+        self._model(self.init_params())  # refuses what cannot vary
+
+    def _view(self) -> MjxPhysics:
+        return MjxPhysics(self.environment.model, self.environment.mjx_model, None, {})
+
+    def _model(self, params: WorldParams) -> Any:
+        """Return the model with the parameters in it."""
+        physics = self._view()
+        for name, (elements, attribute) in self._parameters.items():
+            physics.set(elements, attribute, params.values[name])
+        return physics.mjx_model
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> WorldParams:
+        """Return the parameters' compiled values."""
+        del rng, graph_state
+        physics = self._view()
+        return WorldParams({k: jnp.asarray(physics.get(*place)) for k, place in self._parameters.items()})
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> State:
+        """Return the start of an episode."""
+        key = jax.random.key(0) if rng is None else rng
+        return self.environment.reset(key, self._model(self._params(graph_state)))
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Observations:
+        """Return the observation at the start of the episode."""
+        state = (graph_state or GraphState()).state.get(self.name)
+        return Observations((self.init_state(rng, graph_state) if state is None else state).observation)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Observations]:
+        """Take a control step under the newest action."""
+        action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
+        state = self.environment.step(step_state.state, action, self._model(step_state.params))
+        new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
+        return new, Observations(state.observation)
+
+    def _params(self, graph_state: GraphState | None) -> WorldParams:
+        found = (graph_state or GraphState()).params.get(self.name)
+        return self.init_params() if found is None else found

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+from composer_parts import ARM
+
+from sim2real.composer import mjcf
+from sim2real.errors import UsageError
+
+
+@pytest.fixture
+def arm():
+    model = mjcf.from_xml_string(ARM)
+    return model, mjcf.Physics.from_mjcf_model(model)
+
+
+def test_what_follows_from_a_write_is_computed_before_it_is_read(arm):
+    model, physics = arm
+    joint, wrist = model.find("joint", "shoulder"), model.find("site", "wrist")
+    before = physics.bind(wrist).xpos.copy()
+    physics.bind(joint).qpos = 0.4
+    assert physics.is_dirty
+    assert not np.allclose(physics.bind(wrist).xpos, before)
+    assert not physics.is_dirty
+    physics.bind(joint).qpos[0] += 0.1
+    assert physics.data.qpos[0] == 0.5
+    assert physics.is_dirty
+
+
+def test_parts_of_several_elements_are_written_through(arm):
+    model, physics = arm
+    joints, geoms = physics.bind(model.find_all("joint")), physics.bind(model.find_all("geom"))
+    qpos = joints.qpos
+    qpos[1] = 0.3
+    assert physics.data.qpos.tolist() == [0, 0.3]
+    geoms["pos", ["x", "z"]] = 0.5
+    np.testing.assert_array_equal(physics.model.geom_pos[:, [0, 2]], np.full((4, 2), 0.5))
+    sums = joints.qpos + 1
+    sums[0] = 9
+    assert physics.data.qpos[0] == 0
+    assert not geoms.element_id.flags.writeable
+
+
+def test_writing_a_pose_switches_mujocos_shortcuts_off(arm):
+    model, physics = arm
+    geom = model.worldbody.geom[0]
+    assert physics.bind(geom).sameframe != 0
+    physics.bind(geom).pos = [0.2, 0, 0]
+    assert physics.bind(geom).sameframe == 0
+    np.testing.assert_array_equal(physics.bind(geom).xpos, [0.2, 0, 0])
+
+
+def test_nothing_bound_is_empty(arm):
+    _, physics = arm
+    assert physics.bind([]).qpos.shape == (0,)
+    with pytest.raises(UsageError, match="empty binding"):
+        physics.bind([]).qpos = 1
+
+
+def test_what_cannot_be_bound_is_named(arm):
+    model, physics = arm
+    joint = model.find("joint", "shoulder")
+    with pytest.raises(UsageError, match="multiple element types: geom, joint"):
+        physics.bind([joint, model.worldbody.geom[0]])
+    with pytest.raises(AttributeError, match="<joint> does not have attribute 'colour'"):
+        _ = physics.bind(joint).colour
+    with pytest.raises(UsageError, match="the element is None"):
+        physics.bind(model.find("joint", "knee"))
+    late = model.worldbody.add("site", name="late")
+    with pytest.raises(UsageError, match=r"no site 'late'. Available: wrist"):
+        physics.bind(late)
+
+
+def test_named_arrays(arm):
+    model, physics = arm
+    data = physics.named.data
+    assert data.xpos["lower", "z"] == pytest.approx(0.35)
+    assert data.xpos[["upper", "lower"], ["x", "z"]].shape == (2, 2)
+    assert data.qpos[model.find_all("joint")].shape == (2,)
+    data.qpos["shoulder"] = 0.2
+    assert np.sum(data.qpos**2) == pytest.approx(0.04)
+    with pytest.raises(KeyError, match=r"body 'hip' is not there. Available: world, upper, lower"):
+        _ = data.xpos["hip"]
+
+
+def test_the_functional_view_is_the_same_physics(arm):
+    model, physics = arm
+    joint = model.find("joint", "shoulder")
+    assert physics.set(joint, "qpos", [0.3]).write(joint, "qvel", 2.0, 0) is physics
+    assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.3, 2.0)
+
+
+def test_copies_and_states_are_independent(arm):
+    _, physics = arm
+    other = physics.copy()
+    other.set_state([0.1, 0.2, 0.3, 0.4])
+    assert other.get_state().tolist() == [0.1, 0.2, 0.3, 0.4]
+    assert physics.data.qpos.tolist() == [0, 0]
+    with pytest.raises(UsageError, match=r"Expected \(4,\)"):
+        physics.set_state([0.0])
+    physics.reset(0)
+    assert physics.data.qpos.tolist() == [0.5, -0.3]
+    with pytest.raises(UsageError, match="must be between 0 and 0"):
+        physics.reset(1)

@@ -1,0 +1,177 @@
+"""A composed task as a node of a graph, as a brax environment and as a gymnasium vector environment."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper
+from flax import struct
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.observation.observable import MJCFFeature
+from sim2real.errors import UsageError
+from sim2real.graph import Base, BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+
+CART = """
+<mujoco model="cart"><option timestep="0.01"/>
+  <worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="0.2"/>
+    <geom size=".1" mass="0.5"/></body></worldbody>
+  <actuator><motor joint="rail" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+class Push(composer.Task):
+    """Go to the right; the position is seen two physics steps late."""
+
+    def __init__(self, start=0.0):
+        self._root_entity = composer.ModelWrapperEntity(mjcf.from_xml_string(CART))
+        self.rail = self._root_entity.mjcf_model.find("joint", "rail")
+        self.control_timestep, self.start = 0.02, start
+
+    @property
+    def task_observables(self):
+        found = {
+            "late": MJCFFeature("qpos", self.rail, delay=2),
+            "v": MJCFFeature("qvel", self.rail),
+            "x": MJCFFeature("qpos", self.rail),
+        }
+        for value in found.values():
+            value.enabled = True
+        return found
+
+    def initialize_episode(self, physics, random_state):
+        physics.bind(self.rail).qpos = self.start * random_state.uniform(-1, 1)
+
+    def get_reward(self, physics):
+        return physics.bind(self.rail).qpos[0]
+
+    def should_terminate_episode(self, physics):
+        return physics.bind(self.rail).qpos[0] > 0.5
+
+
+@struct.dataclass
+class Force(Base):
+    action: jax.Array
+
+
+class Waves(BaseNode):
+    def init_output(self, rng=None, graph_state=None):
+        return Force(jnp.zeros(1))
+
+    def step(self, step_state):
+        return step_state, Force(jnp.sin(4.0 * step_state.ts)[None])
+
+
+def play(parameters):
+    """Return the commands and the observations of a second in a graph, at other parameters."""
+    task = Push()
+    places = {"damping": (task.rail, "damping"), "mass": (task.root_entity.mjcf_model.find("body", "cart"), "mass")}
+    world = composer.ComposedWorld("world", task, parameters=places)
+    agent = Waves("actuator", 50.0)
+    world.connect(agent, skip=True, delay_dist=0.005)
+    nodes = {"actuator": agent, "world": world}
+    graph = CompiledGraph(nodes, "actuator", draw(nodes, 1.0))
+    params = world.init_params()
+    assert {k: np.asarray(v).tolist() for k, v in params.values.items()} == {"damping": [np.float32(0.2)], "mass": 0.5}
+    values = {k: jnp.asarray(v, jnp.float32).reshape(params.values[k].shape) for k, v in parameters.items()}
+    params = {"world": params.replace(values=values)}
+    records = jax.jit(lambda: graph.rollout(graph.init(jax.random.key(0), params), record=("world", "actuator"))[1])()
+    made = np.asarray(records["actuator"].seq)
+    commands = {int(k): np.asarray(records["actuator"].output.action)[i] for i, k in enumerate(made) if k >= 0}
+    consumed = graph.timeline.edges["world", "actuator"].seq_in[0]
+    actions = []
+    for tick in range(graph.rows * graph.wiring.ticks):
+        arrived = np.flatnonzero((consumed >= 0) & (consumed <= tick))
+        actions.append(commands[arrived[-1]] if arrived.size else np.zeros(1))
+    return actions, records["world"].output.values
+
+
+def test_a_graph_plays_the_task_of_the_c_engine_at_given_parameters():
+    actions, found = play({"damping": 0.8, "mass": 0.4})
+    task = Push()
+    env = composer.Environment(task)
+    env.reset()
+    task.initialize_episode = lambda physics, random_state: None
+    env.physics.bind(task.rail).damping = 0.8
+    env.physics.bind(task.root_entity.mjcf_model.find("body", "cart")).mass = 0.4
+    env.physics.recompute_constants()
+    env.physics.forward()
+    for i, action in enumerate(actions):
+        env._reset_next_step = False  # the graph's world goes on where the task would end
+        observation = env.step(action).observation
+        for name in ("late", "x", "v"):
+            np.testing.assert_allclose(found[name][i], observation[name], atol=1e-5)
+    assert np.abs(found["x"]).max() > 0.01
+
+
+def test_wrong_rates_and_parameters_are_refused():
+    task = Push()
+    with pytest.raises(UsageError, match=r"a tick of 0.01 s is no control step of 0.02 s"):
+        composer.ComposedWorld("world", task, rate=100.0)
+    geoms = task.root_entity.mjcf_model.find_all("geom")
+    with pytest.raises(UsageError, match="cannot change 'geom_contype'"):
+        composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
+
+
+@pytest.fixture(scope="module")
+def environment():
+    return composer.MjxEnvironment(Push(start=0.1), time_limit=0.2)
+
+
+def test_brax_runs_the_task_with_its_own_wrappers(environment):
+    env = composer.BraxEnv(environment)
+    assert (env.observation_size, env.action_size, env.backend, env.dt) == (3, 1, "mjx", 0.02)
+    wrapped = AutoResetWrapper(EpisodeWrapper(env, episode_length=1000, action_repeat=1))
+
+    def run(key):
+        def step(state, _):
+            state = wrapped.step(state, jnp.ones(1))
+            return state, (state.done, state.info["truncation"], state.obs)
+
+        state = wrapped.reset(key)
+        return state.obs, jax.lax.scan(step, state, length=25)[1]
+
+    first, (done, _, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
+    assert first.shape == (3, 3)
+    assert [np.flatnonzero(d).tolist() for d in np.asarray(done)] == [[9, 19]] * 3
+    np.testing.assert_array_equal(observations[:, 9], first)
+    assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
+
+
+@pytest.fixture(scope="module")
+def vector(environment):
+    pytest.importorskip("gymnasium", reason="the vector environment: pip install gymnasium")
+    return composer.MjxVectorEnv(environment, 4)
+
+
+def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
+    env = vector
+    observation, _ = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    assert env.action_space.low.tolist() == [[-1]] * 4
+    starts = observation["x"].copy()
+    for i in range(1, 12):
+        observation, reward, terminated, truncated, infos = env.step(np.ones((4, 1), np.float32))
+        assert truncated.tolist() == [i == 10] * 4
+        assert not terminated.any()
+        assert (infos["discount"] == 1).all()
+    assert observation["v"].tolist() == [[[0.0]]] * 4  # a new episode
+    assert (observation["x"] != starts).all()
+    assert reward.tolist() == [0.0] * 4
+    again, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(again["x"], starts)
+
+
+def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
+    vector.reset(seed=0)
+    places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])
+    vector._state = vector._state.replace(data=vector._state.data.replace(qpos=places))
+    _, reward, terminated, truncated, infos = vector.step(np.zeros((4, 1)))
+    assert terminated.tolist() == [True, True, False, False]
+    assert not truncated.any()
+    assert infos["discount"].tolist() == [1.0, 0.0, 1.0, 1.0]
+    assert reward[:2].tolist() == [1.0, 0.0]

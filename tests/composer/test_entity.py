@@ -1,0 +1,152 @@
+import logging
+
+import numpy as np
+import pytest
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.errors import UsageError
+
+ABOUT_Z = np.array([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)])
+ABOUT_X = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4), 0, 0])
+
+
+class Ball(composer.Entity):
+    def _build(self, name="ball"):
+        self._model = mjcf.RootElement(model=name)
+        self._model.worldbody.add("geom", type="sphere", size=[0.1])
+
+    @property
+    def mjcf_model(self):
+        return self._model
+
+
+@pytest.fixture(params=[True, False], ids=["free", "fixed"])
+def placed(request):
+    arena, ball = composer.Arena(), Ball()
+    frame = arena.add_free_entity(ball) if request.param else arena.attach(ball)
+    return mjcf.Physics.from_mjcf_model(arena.mjcf_model), ball, frame, request.param
+
+
+def test_pose_is_set_normalised_and_read(placed):
+    physics, ball, frame, _ = placed
+    ball.set_pose(physics, position=[1.0, 2.0, 3.0], quaternion=3 * ABOUT_Z)
+    np.testing.assert_allclose(physics.bind(frame).xpos, [1, 2, 3])
+    np.testing.assert_allclose(physics.bind(frame).xquat, ABOUT_Z, atol=1e-12)
+    position, quaternion = ball.get_pose(physics)
+    np.testing.assert_allclose(position, [1, 2, 3])
+    np.testing.assert_allclose(quaternion, ABOUT_Z, atol=1e-12)
+
+
+def test_shift_adds_the_position_and_premultiplies_the_quaternion(placed):
+    physics, ball, frame, _ = placed
+    ball.set_pose(physics, position=[1.0, 0, 0], quaternion=ABOUT_X)
+    ball.shift_pose(physics, position=[0, 1, 0], quaternion=ABOUT_Z)
+    np.testing.assert_allclose(physics.bind(frame).xpos, [1, 1, 0])
+    np.testing.assert_allclose(physics.bind(frame).xquat, [0.5, 0.5, 0.5, 0.5], atol=1e-12)
+
+
+def test_velocity_is_for_free_entities(placed, caplog):
+    physics, ball, _, free = placed
+    if not free:
+        with pytest.raises(UsageError, match="non-free"):
+            ball.get_velocity(physics)
+        with caplog.at_level(logging.WARNING):
+            ball.set_velocity(physics, [1, 0, 0])
+        assert "no free joint" in caplog.text
+        return
+    ball.set_velocity(physics, [0, 1, 0], [0, 0, 2])
+    ball.shift_pose(physics, quaternion=ABOUT_Z, rotate_velocity=True)
+    velocity, angular = ball.get_velocity(physics)
+    np.testing.assert_allclose(velocity, [-1, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(angular, [0, 0, 2])
+
+
+def test_an_entity_that_is_not_attached_has_no_pose():
+    ball = Ball()
+    physics = mjcf.Physics.from_mjcf_model(ball.mjcf_model)
+    with pytest.raises(RuntimeError, match="No attachment frame found"):
+        ball.get_pose(physics)
+
+
+def test_vectors_and_rotations_in_the_local_frame():
+    arena, ball = composer.Arena(), Ball()
+    site = arena.mjcf_model.worldbody.add("site", xyaxes=[0, 1, 0, -1, 0, 0])
+    arena.attach(ball, site)
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    np.testing.assert_allclose(ball.global_vector_to_local_frame(physics, [0, 1, 0]), [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        ball.global_vector_to_local_frame(physics, [[-1, 0], [0, 1]]), [[0, 1], [1, 0]], atol=1e-12
+    )
+    turn = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
+    local = np.array([[0, 0, -1], [0, -1, 0], [-1, 0, 0]])
+    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn), local, atol=1e-12)
+    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn.ravel()), local.ravel(), atol=1e-12)
+    for call, value in (
+        (ball.global_vector_to_local_frame, np.zeros(4)),
+        (ball.global_xmat_to_local_frame, np.zeros((2, 2))),
+    ):
+        with pytest.raises(ValueError, match="should have shape"):
+            call(physics, value)
+
+
+def test_the_tree_is_walked_depth_first_and_survives_detaching():
+    e = [Ball(f"e{i}") for i in range(4)]
+    e[0].attach(e[1])
+    e[1].attach(e[2])
+    e[0].attach(e[3])
+    assert list(e[0].iter_entities()) == e
+    assert list(e[0].iter_entities(exclude_self=True)) == e[1:]
+    assert e[2].root_body == mjcf.get_attachment_frame(e[2].mjcf_model)
+    e[1].detach()
+    assert (e[1].parent, e[2].parent) == (None, e[1])
+    assert list(e[0].iter_entities()) == [e[0], e[3]]
+    assert mjcf.Physics.from_mjcf_model(e[0].mjcf_model).model.ngeom == 2
+    assert mjcf.Physics.from_mjcf_model(e[1].mjcf_model).model.ngeom == 2
+    with pytest.raises(RuntimeError, match="Cannot detach an entity that is not attached"):
+        e[1].detach()
+    e[3].attach(e[1])
+    physics = mjcf.Physics.from_mjcf_model(e[0].mjcf_model)
+    assert physics.model.name2id("e3/e1/e2/", "body") > 0
+
+
+def test_configure_joints_sets_own_joints_and_those_of_childrens_frames():
+    arena, ball, door = composer.Arena(), Ball(), Ball("door")
+    frame = ball.attach(door)
+    frame.add("joint", type="hinge")
+    own = arena.add_free_entity(ball)
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    ball.configure_joints(physics, [0.3])
+    np.testing.assert_array_equal(physics.data.qpos[7:], [0.3])
+    np.testing.assert_array_equal(physics.bind(own.find_all("joint", True)).qpos, [0, 0, 0, 1, 0, 0, 0])
+
+
+def test_robot_needs_actuators_and_has_joints():
+    class Arm(composer.Robot):
+        def _build(self):
+            body = self.mjcf_model.worldbody.add("body")
+            body.add("joint", name="a")
+
+        @property
+        def actuators(self):
+            return self.mjcf_model.find_all("actuator")
+
+    assert [j.name for j in Arm().joints] == ["a"]
+    with pytest.raises(TypeError, match="actuators"):
+        composer.Robot()
+
+
+def test_cached_properties_are_computed_once():
+    class Part(Ball):
+        count = 0
+
+        @composer.cached_property
+        def big(self):
+            self.count += 1
+            return object()
+
+    part = Part()
+    assert part.big is part.big
+    assert part.count == 1
+    with pytest.raises(AttributeError, match="computed"):
+        part.big = 3

@@ -1,0 +1,238 @@
+import weakref
+
+import dm_env
+import numpy as np
+import pytest
+from dm_env import specs
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.observation import observable
+from sim2real.errors import UsageError
+
+PENDULUM = """
+<mujoco model="pendulum"><option timestep="0.01"/>
+  <worldbody><body>
+    <joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".02"/>
+  </body></worldbody>
+  <actuator><motor name="torque" joint="hinge" ctrlrange="-1 2" ctrllimited="true"/><motor joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+class Swing(composer.Task):
+    def __init__(self, failures=0, control=0.02):
+        self._root_entity = composer.ModelWrapperEntity(mjcf.from_xml_string(PENDULUM))
+        self.hinge = self._root_entity.mjcf_model.find("joint", "hinge")
+        self.control_timestep = control
+        self.failures, self.attempts, self.starts = failures, 0, []
+
+    @property
+    def root_entity(self):
+        return self._root_entity
+
+    @property
+    def task_observables(self):
+        angle = observable.MJCFFeature("qpos", self.hinge)
+        angle.enabled = True
+        return {"angle": angle}
+
+    def initialize_episode(self, physics, random_state):
+        self.attempts += 1
+        if self.attempts <= self.failures:
+            raise composer.EpisodeInitializationError("not this time")
+        self.starts.append(random_state.uniform(-1, 1))
+        physics.bind(self.hinge).qpos = self.starts[-1]
+
+    def get_reward(self, physics):
+        return float(np.cos(physics.bind(self.hinge).qpos[0]))
+
+
+def test_time_steps_follow_dm_env():
+    env = composer.Environment(Swing(), random_state=0)
+    first = env.reset()
+    assert first.first()
+    assert (first.reward, first.discount) == (None, None)
+    step = env.step(np.zeros(2))
+    assert step.mid()
+    assert step.discount == 1.0
+    assert step.reward == pytest.approx(np.cos(env.physics.data.qpos[0]))
+    assert env.physics.time() == pytest.approx(0.02)
+    assert env.control_timestep() == 0.02
+    np.testing.assert_array_equal(step.observation["angle"], [env.physics.data.qpos])
+
+
+def test_a_step_without_an_episode_starts_one_and_ignores_the_action():
+    env = composer.Environment(Swing(), time_limit=0.04)
+    assert env.step(None).first()
+    assert [env.step(np.zeros(2)).step_type for _ in range(3)] == [
+        dm_env.StepType.MID,
+        dm_env.StepType.LAST,
+        dm_env.StepType.FIRST,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("limit", "control", "physics", "steps"),
+    [(5.0, 0.05, 0.005, 100), (2.0, 0.02, 0.005, 100), (1.0, 0.02, 0.002, 50), (0.05, 0.02, 0.01, 3)],
+)
+def test_the_time_limit_counts_steps(limit, control, physics, steps):
+    task = Swing()
+    task.set_timesteps(control, physics)
+    env = composer.Environment(task, time_limit=limit)
+    env.reset()
+    count, step = 0, None
+    while step is None or not step.last():
+        step, count = env.step(np.zeros(2)), count + 1
+    assert count == steps
+    assert step.discount == 1.0
+
+
+def test_failed_resets_are_tried_again_as_often_as_asked():
+    task = Swing(failures=3)
+    env = composer.Environment(task, max_reset_attempts=2)
+    with pytest.raises(composer.EpisodeInitializationError, match="not this time"):
+        env.reset()
+    assert task.attempts == 2
+    assert env.reset().first()
+    assert task.attempts == 4
+
+
+def test_a_failed_reset_inside_step_does_not_run_the_physics_unprepared():
+    env = composer.Environment(Swing(failures=1))
+    with pytest.raises(composer.EpisodeInitializationError):
+        env.step(np.zeros(2))
+    assert env.step(np.zeros(2)).first()
+
+
+def test_other_errors_are_not_retried():
+    task = Swing()
+    task.initialize_episode = lambda physics, random_state: 1 / 0
+    env = composer.Environment(task, max_reset_attempts=5)
+    with pytest.raises(ZeroDivisionError):
+        env.reset()
+
+
+def test_a_fixed_initial_state_draws_the_same_numbers():
+    task = Swing()
+    env = composer.Environment(task, fixed_initial_state=True, random_state=np.random.RandomState(3))
+    assert len({env.reset().observation["angle"].item() for _ in range(3)}) == 1
+    env = composer.Environment(task, random_state=3)
+    assert len({env.reset().observation["angle"].item() for _ in range(3)}) == 3
+
+
+def test_models_are_compiled_anew_at_every_reset_or_only_at_the_first():
+    for every, expected in ((True, 4), (False, 2)):
+        task, compiled = Swing(), []
+        task.after_compile = lambda physics, random_state, compiled=compiled: compiled.append(physics)
+        env = composer.Environment(task, recompile_mjcf_every_episode=every)
+        for _ in range(3):
+            env.reset()
+        assert len(compiled) == expected
+
+
+def test_the_physics_is_a_weak_reference_that_dies_with_its_model():
+    env = composer.Environment(Swing())
+    before = env.physics
+    assert isinstance(before, weakref.ProxyType)
+    env.reset()
+    with pytest.raises(ReferenceError):
+        before.time()
+    env.close()
+    with pytest.raises(ReferenceError):
+        env.physics.time()
+
+
+def test_a_changed_model_is_compiled_and_a_changed_physics_is_forgotten():
+    task = Swing()
+    env = composer.Environment(task)
+    geom = task.root_entity.mjcf_model.find_all("geom")[0]
+    env.physics.bind(geom).rgba = [0, 0, 1, 1]
+    env.reset()
+    np.testing.assert_array_equal(env.physics.bind(geom).rgba, np.float32([0.5, 0.5, 0.5, 1]))
+    task.initialize_episode_mjcf = lambda random_state: geom.set_attributes(rgba=[1, 0, 0, 1])
+    env.reset()
+    np.testing.assert_array_equal(env.physics.bind(geom).rgba, [1, 0, 0, 1])
+    geom.native.rgba = [0, 1, 0, 1]  # behind the model's back
+    task.initialize_episode_mjcf = lambda random_state: None
+    env.reset()
+    np.testing.assert_array_equal(env.physics.bind(geom).rgba, [0, 1, 0, 1])
+
+
+def test_divergence_raises_or_ends_the_episode():
+    env = composer.Environment(Swing())
+    env.reset()
+    with pytest.raises(composer.PhysicsError, match="mjWARN_BADCTRL"):
+        env.step([np.nan, 0.0])
+    env = composer.Environment(Swing(), raise_exception_on_physics_error=False)
+    env.reset()
+    step = env.step([np.nan, 0.0])
+    assert (step.last(), step.reward, step.discount) == (True, 0.0, 0.0)
+    assert env.step([0.0, 0.0]).first()
+
+
+def test_specs():
+    env = composer.Environment(Swing(), strip_singleton_obs_buffer_dim=True)
+    action = env.action_spec()
+    assert (action.shape, action.dtype) == ((2,), float)
+    assert action.name == "torque\t//unnamed_actuator_1"
+    np.testing.assert_array_equal(action.minimum, [-1, -1e10])
+    np.testing.assert_array_equal(action.maximum, [2, 1e10])
+    assert env.observation_spec() == {"angle": specs.Array((1,), float, "angle")}
+    assert env.reward_spec() == specs.Array((), float, "reward")
+    assert env.discount_spec() == specs.BoundedArray((), float, 0.0, 1.0, "discount")
+    env.task.get_reward_spec = lambda: specs.Array((2,), float)
+    assert env.reward_spec().shape == (2,)
+    assert env.reset().observation["angle"].shape == (1,)
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(UsageError, match="ObservationPadding"):
+        composer.Environment(Swing(), delayed_observation_padding="zero")
+    with pytest.warns(DeprecationWarning, match="n_sub_steps"):
+        env = composer.Environment(Swing(), n_sub_steps=5)
+    assert env.control_timestep() == pytest.approx(0.05)
+    with pytest.raises(UsageError, match="Available: initialize_episode_mjcf"):
+        env.add_extra_hook("before_lunch", print)
+    with pytest.raises(UsageError, match="not a callable"):
+        env.add_extra_hook("before_step", 3)
+
+
+def test_legacy_step_keeps_positions_in_step_with_the_state():
+    for legacy in (True, False):
+        env = composer.Environment(Swing(), legacy_step=legacy)
+        env.reset()
+        env.step([1.0, 0.0])
+        body = env.physics.data.xquat[1].copy()
+        env.physics.forward()
+        assert np.allclose(body, env.physics.data.xquat[1], atol=0) == legacy
+
+
+def test_a_task_without_a_root_entity_says_so():
+    class Rootless(composer.Task):
+        def get_reward(self, physics):
+            return 0.0
+
+    with pytest.raises(NotImplementedError, match="root_entity") as error:
+        _ = Rootless().control_timestep
+    assert "before `root_entity` is available" in str(error.value.__cause__)
+
+
+def test_timesteps_must_divide():
+    task = Swing()
+    with pytest.raises(UsageError, match="integer multiple"):
+        task.control_timestep = 0.015
+    with pytest.raises(UsageError, match="integer multiple"):
+        task.physics_timestep = 0.03
+    with pytest.raises(UsageError, match="shorter than"):
+        task.set_timesteps(1e-9, 0.01)
+    task.set_timesteps(0.03, 0.003)
+    assert (task.control_timestep, task.physics_timestep, task.physics_steps_per_control_step) == (0.03, 0.003, 10)
+
+
+def test_importing_the_composer_does_not_import_jax(tmp_path):
+    import subprocess
+    import sys
+
+    code = "import sys; from sim2real import composer; composer.Environment; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,290 @@
+"""The same task on both engines: MJX against C in float64, and what MJX cannot run."""
+
+from collections import OrderedDict
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.observation.observable import Generic, MJCFCamera, MJCFFeature
+from sim2real.composer.variation import PhysicsVariator, deterministic, distributions, noises
+from sim2real.errors import UsageError
+
+PENDULUM = """
+<mujoco model="pendulum"><option timestep="0.01" {option}/>
+  <worldbody>
+    <camera name="front"/>
+    <body name="rod"><joint name="hinge" axis="0 1 0" damping=".05"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 .3" size=".02"/>
+      <site name="tip" pos="0 0 .3" euler="0 30 0"/></body>
+  </worldbody>
+  <actuator><motor name="torque" joint="hinge" {actuator}/></actuator>
+  <sensor><accelerometer site="tip"/><jointvel joint="hinge"/></sensor>
+</mujoco>
+"""
+STEPS, SUBSTEPS = 100, 3
+
+
+class Swing(composer.Task):
+    """Every hook does something, in calls that both engines know."""
+
+    def __init__(self, option="", actuator="", vary=False):
+        self._root_entity = composer.ModelWrapperEntity(
+            mjcf.from_xml_string(PENDULUM.format(option=option, actuator=actuator))
+        )
+        model = self._root_entity.mjcf_model
+        self.hinge, self.tip, self.sensors = (
+            model.find("joint", "hinge"),
+            model.find("site", "tip"),
+            model.sensor.sensor,
+        )
+        self.control_timestep = SUBSTEPS * 0.01
+        self.variator = PhysicsVariator()
+        if vary:
+            self.variator.bind_attributes(self.hinge, damping=noises.Multiplicative(distributions.Uniform(0.5, 2.0)))
+
+    @property
+    def task_observables(self):
+        found = OrderedDict(
+            sensors=MJCFFeature("sensordata", self.sensors),
+            angle=MJCFFeature("qpos", self.hinge, buffer_size=3, delay=4, update_interval=2),
+            smooth=MJCFFeature("qvel", self.hinge, buffer_size=5, aggregator="mean"),
+            jitter=MJCFFeature(
+                "qpos", self.hinge, buffer_size=2, delay=deterministic.Sequence([0, 5, 1]), update_interval=2
+            ),
+            turn=MJCFFeature("xmat", self.tip),
+            pushed=Generic(lambda physics: physics.variables["pushed"]),
+        )
+        for value in found.values():
+            value.enabled = True
+        return found
+
+    def initialize_episode(self, physics, random_state):
+        self.variator.apply_variations(physics, random_state)
+        physics.bind(self.hinge).qpos = 0.5
+        physics.variables["pushed"] = physics.np.zeros(2)
+
+    def before_step(self, physics, action, random_state):
+        physics.set_control(0.3 * action)
+
+    def before_substep(self, physics, action, random_state):
+        physics.variables["pushed"] = physics.variables["pushed"] + 1.0
+
+    def after_step(self, physics, random_state):
+        physics.set(self.hinge, "qfrc_applied", 0.1 * physics.get(self.hinge, "qpos"))
+
+    def get_reward(self, physics):
+        return -physics.np.sum(physics.bind(self.tip).xpos ** 2)
+
+    def should_terminate_episode(self, physics):
+        return physics.bind(self.hinge).qpos[0] > 100.0
+
+
+@pytest.fixture(scope="module")
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def rollout(environment, actions):
+    """Return the first state and, in one program, all that follow."""
+
+    def play(key, actions):
+        start = environment.reset(key)
+        return start, jax.lax.scan(lambda s, a: (environment.step(s, a),) * 2, start, actions)[1]
+
+    return jax.jit(play)(jax.random.key(0), actions)
+
+
+@pytest.fixture(scope="module")
+def played(double):
+    environment = composer.MjxEnvironment(Swing(), time_limit=2.0)
+    actions = np.random.RandomState(0).uniform(-1, 1, (STEPS, 1))
+    return rollout(environment, jnp.asarray(actions)), actions
+
+
+def test_a_task_without_contacts_is_that_of_the_c_engine(played):
+    (start, states), actions = played
+    env = composer.Environment(Swing(), time_limit=2.0)
+    step = env.reset()
+    for name, value in step.observation.items():
+        np.testing.assert_allclose(start.observation[name], value, atol=1e-10, err_msg=name)
+    for i, action in enumerate(actions[:66]):  # 198 physics steps: up to the time limit
+        step = env.step(action)
+        for name, value in step.observation.items():
+            np.testing.assert_allclose(states.observation[name][i], value, atol=1e-10, err_msg=f"{name} at {i}")
+        np.testing.assert_allclose(states.reward[i], step.reward, atol=1e-10)
+        assert bool(states.done[i]) == step.last()
+
+
+def test_three_hundred_steps_without_contacts_agree(played):
+    (_, states), actions = played
+    env = composer.Environment(Swing())
+    env.reset()
+    worst = 0.0
+    for i, action in enumerate(actions):
+        env.step(action)
+        data = env.physics.data
+        for name in ("qpos", "qvel", "sensordata", "site_xpos", "qacc"):
+            worst = max(worst, np.abs(np.asarray(getattr(states.data, name)[i]) - getattr(data, name)).max())
+    assert worst < 1e-10
+
+
+def test_the_time_limit_truncates(played):
+    (_, states), _ = played
+    assert np.flatnonzero(states.done).tolist() == list(range(66, STEPS))  # 2 s are 66.7 steps of 30 ms
+    assert np.asarray(states.truncated)[66]
+    assert np.asarray(states.discount)[66] == 1.0
+
+
+class Bounce(composer.NullTask):
+    def __init__(self):
+        arena, self.ball = composer.Arena(), mjcf.RootElement(model="ball")
+        arena.mjcf_model.option.timestep = 0.004
+        arena.mjcf_model.worldbody.add("geom", type="plane", size=[1, 1, 0.1])
+        self.ball.worldbody.add("geom", type="sphere", size=[0.1])
+        frame = arena.add_free_entity(composer.ModelWrapperEntity(self.ball))
+        frame.pos = [0, 0, 0.2]
+        super().__init__(arena)
+
+    def initialize_episode(self, physics, random_state):
+        physics.bind(mjcf.get_frame_freejoint(self.ball)).qvel = np.array([0.5, 0, 0, 0, 0, 0])
+
+
+def test_three_hundred_steps_with_contacts_agree(double):
+    environment = composer.MjxEnvironment(Bounce())
+    _, states = rollout(environment, jnp.zeros((300, 0)))
+    env = composer.Environment(Bounce())
+    env.reset()
+    contacts = 0
+    for i in range(300):
+        env.step([])
+        contacts = max(contacts, env.physics.data.ncon)
+        np.testing.assert_allclose(states.data.qpos[i], env.physics.data.qpos, atol=1e-6)
+    assert contacts == 1
+
+
+def test_numeric_variations_differ_from_copy_to_copy():
+    environment = composer.MjxEnvironment(Swing(vary=True))
+    states = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), 5))
+    damping = np.asarray(states.leaves["dof_damping"])[:, 0]
+    assert len(set(damping.tolist())) == 5
+    assert (damping > 0.02).all()
+    assert (damping < 0.11).all()
+    after = jax.eval_shape(environment.step, jax.tree_util.tree_map(lambda x: x[0], states), jnp.zeros(1))
+    assert jax.tree_util.tree_structure(after) == jax.tree_util.tree_structure(states)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"option": 'noslip_iterations="3"'}, "no-slip solver: option noslip_iterations is 3"),
+        ({"actuator": 'delay="0.02" nsample="8"'}, "delays and intervals: actuator 'torque'"),
+        ({"option": 'integrator="implicit"'}, "integrator mjINT_IMPLICIT"),
+    ],
+)
+def test_what_mjx_would_do_otherwise_is_refused_by_name(options, match):
+    with pytest.raises(UsageError, match=match):
+        composer.MjxEnvironment(Swing(**options))
+
+
+def refused(match, **hooks):
+    task = Swing()
+    for name, hook in hooks.items():
+        setattr(task, name, hook.__get__(task))
+    with pytest.raises(UsageError, match=match):
+        composer.MjxEnvironment(task)
+
+
+def test_contact_toggling_is_refused_by_name():
+    def initialize_episode(self, physics, random_state):
+        physics.bind(self.root_entity.mjcf_model.find("geom", "rod")).contype = 0
+
+    refused("cannot change 'geom_contype' inside a compiled program", initialize_episode=initialize_episode)
+
+
+def test_values_that_tasks_keep_must_be_variables():
+    def initialize_episode(self, physics, random_state):
+        physics.variables["pushed"] = physics.np.zeros(2)
+        self.target = random_state.uniform()
+
+    refused("Swing.target was set by a hook", initialize_episode=initialize_episode)
+
+    def after_step(self, physics, random_state):
+        physics.variables["late"] = physics.time()
+
+    refused("'late' first appear in a step", after_step=after_step)
+
+
+def test_cameras_and_delays_without_a_bound_are_refused_by_name():
+    task = Swing()
+    camera = MJCFCamera(task.root_entity.mjcf_model.find("camera", "front"))
+    task.root_entity.observables.add_observable("front", camera)
+    with pytest.raises(UsageError, match="camera observables 'front'"):
+        composer.MjxEnvironment(task)
+    task, late = Swing(), Generic(lambda physics: physics.time(), delay=distributions.Poisson(2.0))
+    task.root_entity.observables.add_observable("late", late)
+    with pytest.raises(UsageError, match=r"observable 'late': .* has no bound"):
+        composer.MjxEnvironment(task)
+    late.max_delay = 9
+    assert composer.MjxEnvironment(task).observation_spec()["late"].shape == (1,)
+
+
+def test_random_walks_keep_their_state_in_each_copy():
+    task = Swing()
+    walk = Generic(lambda physics: physics.np.zeros(2), corruptor=noises.Additive(distributions.BiasedRandomWalk()))
+    task.root_entity.observables.add_observable("walk", walk)
+    state = jax.eval_shape(composer.MjxEnvironment(task).reset, jax.random.key(0))
+    assert "BiasedRandomWalk_1" in state.memory
+
+
+class Placed(Bounce):
+    def __init__(self, high):
+        super().__init__()
+        other = mjcf.RootElement(model="other")
+        other.worldbody.add("geom", type="sphere", size=[0.1])
+        props = [composer.ModelWrapperEntity(other), next(self.root_entity.iter_entities(exclude_self=True))]
+        self.root_entity.add_free_entity(props[0])
+        self.props = props
+        self.placer = composer.PropPlacer(props, distributions.Uniform([-0.2, -0.2, 0.15], [0.2, 0.2, high]))
+
+    def initialize_episode(self, physics, random_state):
+        self.placer(physics, random_state)
+
+
+def test_props_are_placed_apart_in_every_copy():
+    environment = composer.MjxEnvironment(Placed(0.4))
+    states = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(1), 64))
+    places = np.asarray(states.data.qpos).reshape(64, 2, 7)[:, :, :3]
+    assert not np.asarray(states.failed).any()
+    assert np.linalg.norm(places[:, 0] - places[:, 1], axis=-1).min() > 0.2
+    assert places[..., 2].min() > 0.1
+    task = Placed(0.4)
+    task.placer = composer.PropPlacer(task.props, [0, 0, 1], settle_physics=True)
+    with pytest.raises(UsageError, match="cannot settle physics on MJX"):
+        composer.MjxEnvironment(task)
+
+
+def test_giving_up_is_a_flag():
+    class Never(Bounce):
+        def initialize_episode(self, physics, random_state):
+            physics.variables["tries"] = random_state.uniform()
+            physics.fail(physics.variables["tries"] > -1)
+
+    with pytest.raises(composer.EpisodeInitializationError):
+        composer.Environment(Never()).reset()
+    state = jax.jit(composer.MjxEnvironment(Never(), max_reset_attempts=4).reset)(jax.random.key(0))
+    assert bool(state.failed)
+
+
+def test_fields_and_elements_that_are_not_there_are_named():
+    def after_step(self, physics, random_state):
+        _ = physics.bind(self.hinge).qfrc_adhesion
+
+    task = Swing()
+    task.after_step = after_step.__get__(task)
+    with pytest.raises(AttributeError, match="MJX has no field 'qfrc_adhesion'"):
+        composer.MjxEnvironment(task)

@@ -1,0 +1,204 @@
+"""Composition: attach, detach, rename, references between models, options, keyframes, assets."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from composer_parts import ARM, HAND, prop
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.errors import UsageError
+
+KIT = SimpleNamespace(mjcf=mjcf, composer=composer)
+MESH = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def geoms(model):
+    compiled = model.compile()
+    return [mujoco.mj_id2name(compiled, mujoco.mjtObj.mjOBJ_GEOM, i) for i in range(compiled.ngeom)]
+
+
+def test_equal_names_are_numbered():
+    root = mjcf.RootElement(model="root")
+    for _ in range(3):
+        root.attach(prop(KIT))
+    assert list(root.attachments) == ["prop", "prop_1", "prop_2"]
+    assert geoms(root)[::2] == ["prop/ball", "prop_1/ball", "prop_2/ball"]
+    root.attachments["prop_1"].model.model = "cube"
+    assert geoms(root)[2] == "cube/ball"
+    with pytest.raises(UsageError, match="attached already"):
+        root.attachments["cube"].model.model = "prop"
+
+
+def test_any_order_of_attaching_and_attaching_again():
+    root, arm, hand = mjcf.RootElement(model="root"), mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
+    root.attach(arm)
+    arm.find("site", "wrist").attach(hand)
+    assert root.find("body", "arm/hand/finger").full_identifier == "arm/hand/finger"
+    assert hand.root_model is root
+    hand.detach()
+    assert "arm/hand/palm" not in geoms(root)
+    root.attach(hand).add("freejoint")
+    physics = mjcf.Physics.from_mjcf_model(root)
+    assert physics.bind(hand.find("body", "finger")).element_id == physics.model.name2id("hand/finger", "body")
+    assert physics.bind(mjcf.get_frame_freejoint(hand)).qpos.shape == (7,)
+    assert hand.compile().nbody == 2  # the part on its own, without the frame that held it
+
+
+def test_what_cannot_be_attached():
+    root, ball = mjcf.RootElement(model="root"), prop(KIT)
+    root.attach(ball)
+    with pytest.raises(ValueError, match="already attached elsewhere"):
+        mjcf.RootElement().attach(ball)
+    with pytest.raises(ValueError, match="to itself"):
+        ball.attach(root)
+    with pytest.raises(ValueError, match="Expected a model"):
+        root.attach("ball")
+    frame = mjcf.get_attachment_frame(ball)
+    with pytest.raises(ValueError, match="cannot stand in the attachment frame"):
+        frame.add("geom", size=[1])
+    inner = ball.worldbody.add("site").attach(mjcf.RootElement(model="inner"))
+    inner.add("joint", type="slide")
+    with pytest.raises(ValueError, match="only for bodies that stand in the world"):
+        ball.worldbody.add("body").add("body").add("freejoint")
+    with pytest.raises(ValueError, match="contains '/'"):
+        ball.worldbody.add("geom", name="a/b", size=[1])
+
+
+def test_references_to_attached_models_resolve_and_keep_their_order():
+    root, arm = mjcf.RootElement(model="root"), mjcf.from_xml_string(ARM)
+    root.attach(arm)
+    first = root.worldbody.add("site", name="here")
+    root.sensor.add("framepos", name="a", objtype="site", objname=arm.find("site", "wrist"))
+    root.sensor.add("framepos", name="b", objtype="site", objname="here")
+    root.sensor.add("framepos", name="c", objtype="site", objname="arm/wrist")
+    arm.model = "left"
+    first.name = "there"
+    root.find("sensor", "b").objname = first
+    root.find("sensor", "c").objname = "left/wrist"
+    model = root.compile()
+    named = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SENSOR, i) for i in range(model.nsensor)]
+    assert named == ["a", "b", "c", "left/angle", "left//unnamed_sensor_1"]
+    sites = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, i) for i in model.sensor_objid[:3]]
+    assert sites == ["left/wrist", "there", "left/wrist"]
+
+
+def test_a_reference_to_a_model_that_is_not_below_is_an_error():
+    arm, other = mjcf.from_xml_string(ARM), prop(KIT)
+    arm.equality.add("weld", body1="upper", body2=other.worldbody.add("body", name="far"))
+    with pytest.raises(UsageError, match="not attached below"):
+        arm.compile()
+
+
+def test_options_of_one_model_hold_for_all_and_contradictions_are_errors():
+    def with_option(name, **options):
+        model = mjcf.RootElement(model=name)
+        model.option.set_attributes(**options)
+        return model
+
+    root = with_option("root", gravity=[0, 0, -5])
+    root.attach(with_option("a", timestep=0.01, iterations=7, density=1.2))
+    root.attach(with_option("b", timestep=0.004))
+    option = root.compile().opt
+    assert (option.timestep, option.density, option.gravity[2]) == (0.004, 1.2, -5)
+    with pytest.raises(ValueError, match=r"Conflicting values for attribute `option.density`: 1.2 in model 'a'"):
+        root.attach(with_option("c", density=3.0))
+    assert list(root.attachments) == ["a", "b"]
+
+
+def test_units_travel_with_the_model():
+    radian = mjcf.from_xml_string('<mujoco model="r"><compiler angle="radian"/></mujoco>')
+    degree = mjcf.from_xml_string('<mujoco model="d"><worldbody><geom size="1" euler="90 0 0"/></worldbody></mujoco>')
+    radian.attach(degree)
+    np.testing.assert_allclose(radian.compile().geom_quat[0], [2**-0.5, 2**-0.5, 0, 0])
+
+
+def test_keyframes_and_defaults_stay_with_their_model():
+    root = mjcf.RootElement(model="root")
+    root.default.geom.rgba = [0, 1, 0, 1]
+    for _ in range(2):
+        frame = root.attach(mjcf.from_xml_string(ARM))
+        frame.add("joint", type="slide", name="rail")
+    root.worldbody.add("geom", name="mine", size=[1])
+    model = root.compile()
+    assert [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(2)] == ["arm/home", "arm_1/home"]
+    np.testing.assert_array_equal(model.key_qpos, [[0, 0.5, -0.3, 0, 0, 0], [0, 0, 0, 0, 0.5, -0.3]])
+    assert model.geom("mine").rgba.tolist() == [0, 1, 0, 1]
+    assert model.joint("arm/shoulder").damping == [0.2]
+    assert model.joint("arm/rail/").damping == [0.0]
+
+
+def test_meshes_come_from_files_and_from_memory(tmp_path):
+    (tmp_path / "tip.obj").write_bytes(MESH)
+    xml = """<mujoco model="m"><asset><mesh {}file="tip.obj"/></asset>
+      <worldbody><geom type="mesh" mesh="tip"/></worldbody></mujoco>"""
+    (tmp_path / "part.xml").write_text(xml.format(""), encoding="utf-8")
+    root = mjcf.RootElement()
+    root.attach(mjcf.from_path(tmp_path / "part.xml"))
+    root.attach(mjcf.from_xml_string(xml.format('name="tip" '), assets={"tip.obj": MESH}))
+    model = root.compile()
+    assert [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_MESH, i) for i in range(2)] == ["m/tip", "m_1/tip"]
+    with pytest.raises(UsageError, match="there is no MJCF file"):
+        mjcf.from_path(tmp_path / "none.xml")
+
+
+def test_a_model_with_a_free_joint_of_its_own_keeps_it():
+    drone = mjcf.from_xml_string(
+        """<mujoco model="drone"><worldbody><body name="hull" pos="0 0 1">
+          <freejoint name="root"/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    arena, entity = composer.Arena(), composer.ModelWrapperEntity(drone)
+    arena.attach(entity)
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    entity.set_pose(physics, position=[1.0, 0, 2])
+    np.testing.assert_array_equal(physics.bind(drone.find("body", "hull")).xpos, [1, 0, 2])
+    holder = prop(KIT, "holder")
+    arena.mjcf_model.attach(holder)
+    entity.detach()
+    holder.worldbody.add("site", name="s").attach(drone)
+    with pytest.raises(UsageError, match="only be attached to the world"):
+        arena.mjcf_model.compile()
+
+
+def test_elements_read_and_write_their_attributes():
+    model = mjcf.from_xml_string(ARM)
+    shoulder, actuator = model.find("joint", "shoulder"), model.find("actuator", "shoulder")
+    assert actuator.joint is shoulder
+    assert shoulder.parent.name == "upper"
+    assert [g.type for g in model.worldbody.geom] == ["box", "sphere"]
+    assert model.find("joint", "knee") is None
+    assert model.find("body", "hand/finger") is None
+    shoulder.range = [-1, 1]
+    model.worldbody.geom[0].size = ".1 .2 .3"
+    compiled = model.compile()
+    np.testing.assert_array_equal(compiled.jnt_range[0], [-1, 1])
+    assert shoulder.name == "shoulder"
+    for call, match in (
+        (lambda: setattr(shoulder, "colour", 3), "'colour' is not a valid attribute for <joint>"),
+        (lambda: model.worldbody.add("geom", colour=3), "'colour' is not a valid attribute for <geom>"),
+    ):
+        with pytest.raises(AttributeError, match=match):
+            call()
+    with pytest.raises(UsageError, match="cannot stand in <asset>"):
+        model.asset.add("geom", size=[1])
+    with pytest.raises(UsageError, match="no default class 'thin'"):
+        model.worldbody.add("geom", dclass="thin", size=[1])
+    assert len(model.worldbody.geom) == 2
+    model.find("body", "upper").remove()
+    assert model.find_all("joint") == []
+
+
+def test_a_wrapped_spec_can_be_edited_all_along():
+    spec = mujoco.MjSpec()
+    spec.modelname = "native"
+    body = spec.worldbody.add_body(name="b")
+    body.add_geom(size=[0.1, 0, 0])
+    entity, arena = composer.ModelWrapperEntity(spec), composer.Arena()
+    arena.attach(entity)
+    env = composer.Environment(composer.NullTask(arena))
+    body.add_joint(name="late")
+    env.reset()
+    assert env.physics.model.nq == 1
+    assert "native/late" in arena.mjcf_model.to_xml_string()

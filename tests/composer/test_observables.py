@@ -1,0 +1,102 @@
+import pytest
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.observation.base import AGGREGATORS
+from sim2real.composer.observation.observable import Generic, MJCFFeature
+
+
+class Pair(composer.Observables):
+    @composer.observable
+    def second(self):
+        return Generic(lambda physics: 2.0)
+
+    @composer.observable
+    def first(self):
+        return Generic(lambda physics: 1.0)
+
+
+class Part(composer.Entity):
+    def _build(self, name="part"):
+        self._model = mjcf.RootElement(model=name)
+
+    def _build_observables(self):
+        return Pair(self)
+
+    @property
+    def mjcf_model(self):
+        return self._model
+
+
+def test_names_are_alphabetical_and_prefixed_below_the_root():
+    root, part = Part("root"), Part()
+    root.attach(part)
+    assert list(root.observables.as_dict()) == ["first", "second"]
+    assert list(part.observables.as_dict()) == ["part/first", "part/second"]
+    assert list(part.observables.as_dict(fully_qualified=False)) == ["first", "second"]
+    assert part.observables.dict_keys.first == "part/first"
+    assert part.observables.get_observable("part/first", name_fully_qualified=True) is part.observables.first
+    assert list(composer.NullTask(root).observables) == ["first", "second", "part/first", "part/second"]
+
+
+def test_options_for_all_or_by_name():
+    everything = {"update_interval": 2, "buffer_size": 10, "delay": 1, "aggregator": "max", "enabled": True}
+    part = Part(observable_options=everything)
+    for value in part.observables.as_dict().values():
+        assert (value.update_interval, value.buffer_size, value.delay, value.enabled) == (2, 10, 1, True)
+        assert value.aggregator is AGGREGATORS["max"]
+    part = Part(observable_options={"first": {"delay": 3}})
+    assert (part.observables.first.delay, part.observables.second.delay) == (3, None)
+    assert (part.observables.second.update_interval, part.observables.second.enabled) == (1, False)
+    with pytest.raises(KeyError, match="No observable with name 'third'"):
+        part.observables.set_options({"third": {}})
+    with pytest.raises(AttributeError, match="Cannot add attribute colour in configure"):
+        part.observables.set_options({"first": {"colour": 2}})
+    with pytest.raises(KeyError, match="Unrecognized aggregator name: 'mode'"):
+        part.observables.first.aggregator = "mode"
+
+
+def test_enabling_and_adding():
+    part = Part()
+    part.observables.enable_all()
+    assert all(o.enabled for o in part.observables.as_dict().values())
+    part.observables.disable_all()
+    part.observables.add_observable("third", Generic(lambda physics: 3.0))
+    part.observables.add_observable("fourth", lambda physics: 4.0, enabled=False)
+    assert [n for n, o in part.observables.as_dict().items() if o.enabled] == ["third"]
+    assert part.observables.get_observation(None) == {"first": 1.0, "second": 2.0, "third": 3.0, "fourth": 4.0}
+
+
+def test_features_are_indexed_once_and_want_elements():
+    model = mjcf.from_xml_string("<mujoco><worldbody><geom name='g' size='.1' pos='1 2 3'/></worldbody></mujoco>")
+    geom = model.find("geom", "g")
+    physics = mjcf.Physics.from_mjcf_model(model)
+    feature = MJCFFeature("xpos", geom, corruptor=lambda value, random_state: -value)
+    assert feature(physics).tolist() == [-1, -2, -3]
+    assert feature[1](physics) == -2
+    assert feature[[0, 2]](physics).tolist() == [-1, -3]
+    with pytest.raises(NotImplementedError, match="already-sliced"):
+        feature[0][0]
+    with pytest.raises(ValueError, match=r"expected an `mjcf\.Element`"):
+        MJCFFeature("xpos", [geom, "g"])
+
+
+def test_the_mixin_demands_its_observables():
+    class Prop(composer.Observables, composer.FreePropObservableMixin):
+        @composer.observable
+        def position(self):
+            return Generic(lambda physics: 0.0)
+
+    with pytest.raises(TypeError, match="angular_velocity"):
+        Prop(Part())
+
+    class Abstract(composer.Observables, composer.FreePropObservableMixin):
+        position = composer.observable(lambda self: Generic(lambda physics: 0.0))
+        orientation = linear_velocity = angular_velocity = position
+
+        @composer.abstract_observable
+        def colour(self):
+            """Subclasses say."""
+
+    with pytest.raises(TypeError, match="colour"):
+        Abstract(Part())

@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+
+from sim2real import composer
+from sim2real.composer import mjcf, variation
+from sim2real.composer.variation import (
+    colors,
+    deterministic,
+    distributions,
+    math,
+    noises,
+    rotations,
+    variation_broadcaster,
+)
+
+RNG = np.random.RandomState
+
+
+def test_arithmetic_builds_variations_that_compare_and_print():
+    two, three = deterministic.Constant(2), deterministic.Constant(3)
+    value = -((two + 5 * three) ** 2) // 3
+    assert value(random_state=None) == -((2 + 15) ** 2) // 3
+    assert (8 - two) / three == (8 - two) / deterministic.Constant(3)
+    assert two + 1 != two + 2
+    assert (str(3 + three), repr(two + three)) == ("add(3, 3)", "BinaryOperation(add(Constant(2), Constant(3)))")
+    assert deterministic.Constant([4, 5])[1]() == 5
+
+
+def test_nested_values_are_evaluated():
+    structure = {"a": [deterministic.Constant(1), 2], "b": (lambda *args: 3,)}
+    assert variation.evaluate(structure, None, None, None) == {"a": [1, 2], "b": (3,)}
+    sequence = deterministic.Sequence([1, 2])
+    assert [sequence() for _ in range(3)] == [1, 2, 1]
+    assert deterministic.Identity()(1, 2, None) == 2
+
+
+@pytest.mark.parametrize(
+    ("made", "function", "args", "kwargs"),
+    [
+        (distributions.Uniform(1, 2), "uniform", (), {"low": 1, "high": 2}),
+        (distributions.UniformInteger(3), "randint", (3,), {"high": None}),
+        (distributions.UniformChoice([4, 7]), "choice", ([4, 7],), {}),
+        (distributions.Normal(1, 2), "normal", (), {"loc": 1, "scale": 2}),
+        (distributions.LogNormal(0, 1), "lognormal", (), {"mean": 0, "sigma": 1}),
+        (distributions.Exponential(2), "exponential", (), {"scale": 2}),
+        (distributions.Poisson(2), "poisson", (), {"lam": 2}),
+        (distributions.Bernoulli(0.3), "binomial", (1, 0.3), {}),
+    ],
+)
+def test_distributions_are_those_of_numpy_in_the_shape_of_the_initial_value(made, function, args, kwargs):
+    drawn = made(initial_value=np.zeros((2, 3)), random_state=RNG(1))
+    np.testing.assert_array_equal(drawn, getattr(RNG(1), function)(*args, size=(2, 3), **kwargs))
+    assert np.shape(made(random_state=RNG(1))) == ()
+
+
+def test_parameters_may_vary_and_can_be_read():
+    low = deterministic.Sequence([1.0, 5.0])
+    made = distributions.Uniform(low, low + 0.0, single_sample=True)
+    assert made.low is low
+    assert made(np.zeros(3), None, RNG(0)) == pytest.approx(3.0, abs=2.0)
+    with pytest.raises(AttributeError, match="no attribute 'scale'"):
+        _ = made.scale
+
+
+def test_a_biased_random_walk_has_its_deviation_and_timescale():
+    walk, rng = distributions.BiasedRandomWalk(stdev=0.5, timescale=5), RNG(0)
+    values = np.array([walk(random_state=rng) for _ in range(20000)])
+    assert values.std() == pytest.approx(0.5, rel=0.05)
+    assert np.corrcoef(values[:-5], values[5:])[0, 1] == pytest.approx(np.exp(-1), abs=0.05)
+    for options in ({"stdev": -1}, {"timescale": -1}):
+        with pytest.raises(ValueError, match="must be >= 0"):
+            distributions.BiasedRandomWalk(**options)
+
+
+def test_noise_builds_on_the_initial_or_the_current_value():
+    for kind, expected in ((noises.Additive, (12, 102)), (noises.Multiplicative, (20, 200))):
+        fixed, cumulative = kind(deterministic.Constant(2)), kind(deterministic.Constant(2), cumulative=True)
+        assert (fixed(10, 100, None), cumulative(10, 100, None)) == expected
+
+
+def test_rotations_are_unit_quaternions():
+    quaternion = rotations.UniformQuaternion()(random_state=RNG(0))
+    assert np.linalg.norm(quaternion) == pytest.approx(1)
+    turn = rotations.QuaternionFromAxisAngle([0, 0, 1], distributions.Uniform(np.pi / 2, np.pi / 2, single_sample=True))
+    np.testing.assert_allclose(turn(random_state=RNG(0)), [2**-0.5, 0, 0, 2**-0.5])
+    np.testing.assert_array_equal(rotations.QuaternionFromAxisAngle([0, 0, 1], 0.0)(), [1, 0, 0, 0])
+    np.testing.assert_allclose(rotations.QuaternionPreMultiply(turn)(np.array([0.0, 1, 0, 0]), None, None)[2], 2**-0.5)
+    np.testing.assert_allclose(rotations.QuaternionRotate(turn, [1.0, 0, 0])(), [0, 1, 0], atol=1e-12)
+    point = distributions.UniformPointOnSphere()(random_state=RNG(0))
+    assert np.linalg.norm(point) == pytest.approx(1)
+
+
+def test_colours_and_functions():
+    np.testing.assert_allclose(colors.HsvVariation(0.5, 1, 1)(), [0, 1, 1, 1])
+    np.testing.assert_allclose(colors.GrayVariation(0.3, alpha=0.5)(), [0.3, 0.3, 0.3, 0.5])
+    np.testing.assert_allclose(colors.RgbVariation(0.1, deterministic.Constant(0.2), 0.3)(), [0.1, 0.2, 0.3, 1])
+    assert math.Norm([deterministic.Constant(3), 4])() == 5
+    assert (math.Max([1, 2])(), math.Min([1, 2])(), math.Log(1.0)()) == (2, 1, 0)
+
+
+def test_broadcast_draws_are_the_same_for_all():
+    broadcaster = variation_broadcaster.VariationBroadcaster(distributions.Uniform())
+    first, second = broadcaster.get_proxy(), broadcaster.get_proxy()
+    rng = RNG(0)
+    ahead = [first(random_state=rng) for _ in range(3)]
+    assert [second(random_state=rng) for _ in range(3)] == ahead
+    assert len(set(ahead)) == 3
+
+
+@pytest.fixture
+def ball():
+    model = mjcf.from_xml_string(
+        """<mujoco><worldbody><body name="b"><joint name="j"/><geom name="g" size=".1" mass="2"/></body>
+          </worldbody></mujoco>"""
+    )
+    return model, model.find("geom", "g"), model.find("body", "b")
+
+
+def test_models_vary_before_they_are_compiled(ball):
+    model, geom, _ = ball
+    variator = variation.MJCFVariator()
+    variator.bind_attributes(geom, mass=noises.Additive(deterministic.Sequence([1.0, 2.0])))
+    masses = []
+    for _ in range(2):
+        variator.apply_variations(None)
+        masses.append(model.compile().body_mass[1])
+    assert masses == [3, 4]
+    variator.bind_attributes(geom, mass=None)
+    variator.apply_variations(None)
+    assert geom.mass == 4
+
+
+def test_the_compiled_model_varies_with_all_that_follows_from_it(ball):
+    model, _, body = ball
+    physics = mjcf.Physics.from_mjcf_model(model)
+    before = physics.model.dof_invweight0.copy()
+    variator = variation.PhysicsVariator()
+    variator.bind_attributes(body, mass=noises.Multiplicative(deterministic.Constant(2.0)))
+    for _ in range(2):
+        variator.apply_variations(physics, None)
+    assert physics.bind(body).mass == 4
+    assert physics.model.body_subtreemass[0] == 4
+    assert physics.model.dof_invweight0.shape == before.shape
+    variator.reset_initial_values()
+    variator.apply_variations(physics, None)
+    assert physics.bind(body).mass == 8
+
+
+def test_a_variation_is_an_initial_pose():
+    assert issubclass(distributions.Uniform, composer.Variation)
