@@ -163,3 +163,41 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
         rows = [p / s for p, (_, s) in zip((powers, slopes), c.fields, strict=False)]
         fits.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate(data), rcond=None)[0])
     return np.stack(fits)
+
+
+def beyond(
+    model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float, share: float = 0.1
+) -> list[str]:
+    """Return sentences about held-out data that goes beyond what was fitted: there, a model extrapolates.
+
+    Args:
+        model: Says which nodes and fields matter.
+        recordings: The logs.
+        spans: Fitted and held-out segments.
+        length_s: Their length [s].
+        share: How far beyond, as a share of the fitted range, is worth a word.
+    """
+    fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]
+    said = []
+    for node, field in fields:
+        ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
+        for span in spans:
+            t = measured_times(recordings[span.recording], node)
+            inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
+            if inside.any():
+                rows = recordings[span.recording].outputs[node][field][inside]
+                ends[span.fitted].append(np.stack([rows.min(axis=0), rows.max(axis=0)]).reshape(2, -1))
+        if not (ends[True] and ends[False]):
+            continue
+        (low, high), (least, most) = (
+            (np.min([e[0] for e in ends[k]], axis=0), np.max([e[1] for e in ends[k]], axis=0)) for k in (True, False)
+        )
+        room = share * (high - low) + 1e-9 * np.abs(high)
+        for i in np.flatnonzero((least < low - room) | (most > high + room))[:3]:
+            name = field if low.size == 1 else f"{field}[{i}]"
+            said.append(
+                f"held-out data extrapolates: {name!r} of {node!r} reaches [{least[i]:.3g}, {most[i]:.3g}], fitted was "
+                f"[{low[i]:.3g}, {high[i]:.3g}]"
+            )
+    return said

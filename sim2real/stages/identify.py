@@ -22,8 +22,8 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.posterior import Posterior
 from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.identify.verdict import judge
+from sim2real.identify.segments import Span, beyond
+from sim2real.identify.verdict import NO_DELAY, judge
 from sim2real.log.importer import import_file, load_mapping
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.stages import identified
@@ -82,7 +82,8 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
         errors = prediction.errors(problem, samples, list(models), config.settle_s, horizons)
         runs, free = _free_runs(model, logs, config, table, models)
-        verdict = judge(errors, spread, found.problem.table.names, check, shifted)
+        outside = beyond(model, logs.episodes, windows, config.settle_s + config.horizon_s)
+        verdict = judge(errors, spread, found.problem.table.names, check, shifted, outside)
         truth = true_values(paths[0].with_name(TRUTH), logs.episodes[0]) if config.reveal else {}
         document = identified.document(pipeline.name, logs.paths, found, spread, check, verdict, truth)
         document |= {
@@ -204,8 +205,8 @@ def _baselines(found: Fit) -> dict[str, Any]:
         return {}
     without = table.with_fixed(delays)
     if not len(without):
-        return {"no delay": as_numbers(without, np.zeros(0))}
-    return {"no delay": as_numbers(without, refit(found.problem, without, found.z))}
+        return {NO_DELAY: as_numbers(without, np.zeros(0))}
+    return {NO_DELAY: as_numbers(without, refit(found.problem, without, found.z))}
 
 
 def _nominal(model: IdentifiableModel) -> dict[str, float]:

@@ -89,3 +89,15 @@ def test_the_first_that_applies_is_the_status_and_all_are_reasons():
 def test_nothing_held_out_is_told():
     found = judge(rows(0.1, 1.0, held_out=False), spread(), NAMES, check(), shifted=False)
     assert found.reasons == ("nothing was held out: how well it predicts is not known",)
+
+
+def test_a_delay_that_is_not_needed_is_no_failure():
+    prediction = rows(0.1, 1.0, **{"no delay": 0.1})
+    found = judge(prediction, spread(), NAMES, check(), shifted=True)
+    assert found.status == "accepted"
+    assert any("does not need one" in r for r in found.reasons)
+
+
+def test_extrapolation_is_said():
+    found = judge(rows(0.1, 1.0), spread(), NAMES, check(), True, ["held-out data extrapolates: kp"])
+    assert "held-out data extrapolates: kp" in found.reasons
