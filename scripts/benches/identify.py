@@ -33,7 +33,16 @@ from sim2real.stages.pipeline import load_pipeline
 
 SETTLE_S = 0.3
 """How much of the past the initial state of the disk's free run is estimated from [s]."""
-PARTS = ("fit", "half", "sysid", "delays", "speed")
+PARTS = ("fit", "half", "others", "sysid", "delays", "speed")
+OTHERS = {
+    "kp=100": "kp=200,800",
+    "kp=800": "kp=100,200",
+    "motion=sin_sin": "motion=lift_and_drop,up_and_down,sin_time_square",
+    "motion=lift_and_drop": "motion=sin_sin,up_and_down,sin_time_square",
+    "motion=up_and_down": "motion=sin_sin,lift_and_drop,sin_time_square",
+    "motion=sin_time_square": "motion=sin_sin,lift_and_drop,up_and_down",
+}
+"""What else is held out of the XL330's recordings, one at a time, and what is fitted then."""
 DELAY_PARTS = [(5000 * i, 5000 * i + 4000) for i in range(5)]
 DELAY_STARTS_S = (0.0, 0.02, 0.04, 0.06)
 
@@ -74,6 +83,8 @@ def main(arguments: list[str]) -> dict[str, Any]:
             rows += half_step(case, found, test)
         if "sysid" in parts:
             rows += yardstick(case, fitted, test, rows)
+    if case.name == "xl330" and "others" in parts:
+        rows += others(case, options.data)
     if case.name == "disk" and "delays" in parts:
         rows += delays(case, options.data)
     if case.name == "disk" and "speed" in parts:
@@ -236,6 +247,18 @@ def half_step(case: Case, found: Sequence[Fit], test: Mapping[str, Episode]) -> 
         each = [1e3 * np.abs(errors_of(own, columns, r, "identified")).mean() for r in range(len(test))]
         maes.append(float(np.mean(each)))
     return [row("xl330/half_step_test_mae_mrad", float(np.median(maes)), "mrad", "the same with half the step")]
+
+
+def others(case: Case, data: Path) -> list[dict[str, Any]]:
+    """Return the errors where another gain, or one motion of all gains, is held out."""
+    rows = []
+    for held_out, fitted in OTHERS.items():
+        test = recordings.load("xl330", data, held_out)
+        columns = predict(case, {"identified": identify(case, recordings.load("xl330", data, fitted)).values}, test)
+        each = [1e3 * np.abs(errors_of(case, columns, r, "identified")).mean() for r in range(len(test))]
+        about = "beyond the gains that were fitted" if held_out == "kp=800" else ""
+        rows.append(row(f"xl330/held_out/{held_out}_mae_mrad", float(np.mean(each)), "mrad", about))
+    return rows
 
 
 def delays(case: Case, data: Path) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ class Aggregate:
         mean: Estimate of the mean over recordings.
         standard_error: Of the mean.
         between: Standard deviation between recordings, beyond what their own errors explain.
-        low: Lower end of the 95 % interval for one more recording.
+        low: Lower end of the 95 % interval for what one more such recording will say.
         high: Upper end.
         agree: Whether the spread between recordings is no larger than their own errors explain (chi-square, 1 %).
     """
@@ -35,8 +35,9 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
     """Combine estimates ``(K,)`` with their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
 
     A recording's own error does not know what differs between recordings: temperature, wear, the model's own error on
-    other motions. The interval is that of a further recording (Higgins, Thompson and Spiegelhalter 2009), so it tells
-    what to expect of the robot, and how much to randomise.
+    other motions. The interval is that of a further recording's estimate: the prediction interval of Higgins, Thompson
+    and Spiegelhalter (2009), and on top of it the typical error of one recording. So it holds nearly every estimate that
+    was made, and tells how much to randomise.
 
     Raises:
         UsageError: When there are fewer than two recordings.
@@ -51,7 +52,7 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
     between = max(0.0, (q - (len(x) - 1)) / surplus)
     w = 1.0 / (s**2 + between)
     mean, error = float(np.sum(w * x) / np.sum(w)), float(np.sqrt(1.0 / np.sum(w)))
-    reach = float(stdtrit(max(len(x) - 2, 1), 0.975)) * np.sqrt(between + error**2)
+    reach = float(stdtrit(max(len(x) - 2, 1), 0.975)) * np.sqrt(between + error**2 + float(np.median(s**2)))
     return Aggregate(mean, error, float(np.sqrt(between)), mean - reach, mean + reach, q <= _chi_square_99(len(x) - 1))
 
 

@@ -37,7 +37,7 @@ def test_the_between_variance_solves_the_moment_equation():
     mean = float((design.T @ np.linalg.solve(cov, x))[0]) / information
     assert found.mean == pytest.approx(mean)
     assert found.standard_error == pytest.approx(information**-0.5)
-    reach = stats.t.ppf(0.975, 5) * np.sqrt(tau2 + 1 / information)
+    reach = stats.t.ppf(0.975, 5) * np.sqrt(tau2 + 1 / information + np.median(s**2))
     assert (found.low, found.high) == (pytest.approx(mean - reach), pytest.approx(mean + reach))
 
 
