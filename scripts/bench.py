@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 BENCHES = {
     "async": "asynchronous",
+    "compose": "compose",
     "demo": "demo",
     "graph": "graph",
     "identify": "identify",

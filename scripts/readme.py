@@ -1,4 +1,4 @@
-"""Write the table of README.md from reports/demo.json: ``python scripts/readme.py``."""
+"""Write the tables of README.md from reports/: ``python scripts/readme.py``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-BEGIN, END = "<!-- demo:begin -->\n", "<!-- demo:end -->\n"
+CASES = ("disk", "xl330", "so101")
 
 
 def table(report: dict[str, Any]) -> str:
@@ -47,17 +47,46 @@ def table(report: dict[str, Any]) -> str:
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
 
-def updated(readme: str, report: dict[str, Any]) -> str:
-    """Return the README with the table between its two markers."""
-    head, _, rest = readme.partition(BEGIN)
-    _, _, tail = rest.partition(END)
-    return head + BEGIN + table(report) + END + tail
+def real_motors(reports: dict[str, dict[str, Any]]) -> str:
+    """Return the table of recordings of real motors: ours, mujoco.sysid in the same run, ours without delay."""
+    v = {r["name"].removeprefix("identify/"): r["value"] for report in reports.values() for r in report["rows"]}
+    moved = [n for n in v if n.startswith("so101/") and n.endswith("_sysid_rmse_mrad")]
+    joints = [n.replace("_sysid_rmse_mrad", "") for n in moved]
+    kinds = ("_rmse_mrad", "_sysid_rmse_mrad", "_no_delay_mrad")
+    arm = [statistics.median(v[j + kind] for j in joints) for kind in kinds]
+    disk = [1e3 * v[f"disk/{n}free_run_rmse_rad"] for n in ("", "sysid_", "no_delay_")]
+    servo = [v[f"xl330/{n}test_mae_mrad"] for n in ("", "sysid_", "no_delay_")]
+    lines = [
+        ("held-out data, whole recordings", "sim2real", "mujoco.sysid", "sim2real without delay"),
+        ("---", "---:", "---:", "---:"),
+        ("motor with eccentric mass, 125 s free run, RMSE", *(f"{x:.0f} mrad" for x in disk)),
+        ("DYNAMIXEL XL330, a gain that was not fitted, MAE", *(f"{x:.0f} mrad" for x in servo)),
+        ("SO-101 arm, joints that move, median RMSE", *(f"{x:.1f} mrad" for x in arm)),
+    ]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def updated(readme: str, tables: dict[str, str]) -> str:
+    """Return the README with each table between the two markers of its name."""
+    for name, text in tables.items():
+        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->\n"
+        head, _, rest = readme.partition(begin)
+        readme = head + begin + text + end + rest.partition(end)[2]
+    return readme
+
+
+def tables() -> dict[str, str]:
+    """Return the tables, from the committed reports."""
+    names = ("demo", *(f"identify_{c}" for c in CASES))
+    report = {n: json.loads((ROOT / "reports" / f"{n}.json").read_text()) for n in names}
+    demo = report.pop("demo")
+    return {"demo": table(demo), "real": real_motors(report)}
 
 
 def main() -> int:
     """Update README.md in place."""
     readme = ROOT / "README.md"
-    readme.write_text(updated(readme.read_text(), json.loads((ROOT / "reports" / "demo.json").read_text())))
+    readme.write_text(updated(readme.read_text(), tables()))
     return 0
 
 

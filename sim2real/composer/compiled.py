@@ -12,7 +12,6 @@ from sim2real.composer.physics import Physics
 from sim2real.composer.task import Task
 from sim2real.composer.translate import mj
 
-
 _PART_NAMES: dict[type, tuple[str, ...]] = {}
 _PLAIN = (int, float, str, bytes, mj.MjModel)
 
@@ -34,8 +33,8 @@ class Compiler:
     def start(self, legacy_step: bool) -> Physics:
         """Return the task's world in its initial state.
 
-        The ``MjModel`` and ``MjData`` are those of the last physics when it is gone, nobody holds a part of them and the
-        model is as it was compiled; else they are new.
+        The ``MjModel`` and ``MjData`` are those of the last physics when it is gone, nobody holds a part of them, and
+        the model is as it was compiled; else they are new.
         """
         model = self._task.root_entity.mjcf_model.root_model
         key = [(m, m.revision()) for m in model.all_models()]

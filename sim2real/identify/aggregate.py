@@ -36,8 +36,8 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
 
     A recording's own error does not know what differs between recordings: temperature, wear, the model's own error on
     other motions. The interval is that of a further recording's estimate: the prediction interval of Higgins, Thompson
-    and Spiegelhalter (2009), and on top of it the typical error of one recording. So it holds nearly every estimate that
-    was made, and tells how much to randomise.
+    and Spiegelhalter (2009), and on top of it the typical error of one recording. So it holds nearly every estimate
+    that was made, and tells how much to randomise.
 
     Raises:
         UsageError: When there are fewer than two recordings.

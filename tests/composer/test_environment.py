@@ -159,6 +159,54 @@ def test_a_changed_model_is_compiled_and_a_changed_physics_is_forgotten():
     np.testing.assert_array_equal(env.physics.bind(geom).rgba, [0, 1, 0, 1])
 
 
+def test_what_somebody_keeps_of_an_old_episode_is_left_alone():
+    env = composer.Environment(Swing(), random_state=0)
+    env.reset()
+    data, masses = env.physics.data, env.physics.model.body_mass[1:]
+    angle, mass = data.qpos.copy(), masses.copy()
+    env.reset()
+    env.step([1.0, 0.0])
+    env.physics.model.body_mass[1:] = 7.0
+    np.testing.assert_array_equal(data.qpos, angle)
+    np.testing.assert_array_equal(masses, mass)
+
+
+@pytest.mark.parametrize("keep", [lambda p: p.data.qpos, lambda p: p.model.geom_rgba, lambda p: p.data.contact])
+def test_a_state_is_used_again_once_nobody_holds_it(keep):
+    env = composer.Environment(Swing(), random_state=0)
+
+    def address():
+        return env.physics.data.qpos.ctypes.data
+
+    env.reset()
+    first = address()
+    env.reset()
+    env.physics.bind(env.task.hinge).qpos = 0.1
+    env.reset()
+    assert address() == first
+    kept = keep(env.physics)
+    env.reset()
+    assert address() != first
+    assert kept is not None
+
+
+def test_an_episode_in_a_used_state_is_that_of_a_new_one():
+    used, fresh = (composer.Environment(Swing(), fixed_initial_state=True, random_state=0) for _ in range(2))
+    used.reset()
+    for _ in range(20):
+        used.step([1.0, -0.3])
+    for env in (used, fresh):
+        env.reset()
+    for _ in range(20):
+        for env in (used, fresh):
+            env.step([0.7, 0.1])
+        for name in ("time", "qpos", "qvel", "qacc", "xpos", "qfrc_constraint", "sensordata", "ctrl", "qacc_warmstart"):
+            np.testing.assert_array_equal(getattr(used.physics.data, name), getattr(fresh.physics.data, name))
+    used.physics.model.opt.gravity[:] = 0
+    used.reset()
+    assert used.physics.model.opt.gravity[2] == -9.81
+
+
 def test_divergence_raises_or_ends_the_episode():
     env = composer.Environment(Swing())
     env.reset()

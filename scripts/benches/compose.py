@@ -1,0 +1,307 @@
+"""Worlds from parts against dm_control's composer, MJX against C, and a task on MJX against bare ``mjx.step``.
+
+The world is 20 robots with six links each, free to fall over one another. Without dm_control its rows are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+PARTS = ("build", "reset", "steps", "engines", "speed")
+ENTITIES, LINKS, STEPS = 20, 6, 1000
+ROW = 10
+"""Resets in a row: a single one would be timed with what the program before it left in the caches."""
+
+
+def row(name: str, value: Any, unit: str, yardstick: str, goal: str = "") -> dict[str, Any]:
+    """Return one row of a bench."""
+    return {"name": name, "value": value, "unit": unit, "yardstick": yardstick, "goal": goal}
+
+
+def kit(package: str) -> Any:
+    """Return the composer and the models of ``sim2real`` or ``dm_control``."""
+    models = "sim2real.composer.mjcf" if package == "sim2real" else "dm_control.mjcf"
+    return SimpleNamespace(
+        composer=importlib.import_module(f"{package}.composer"), mjcf=importlib.import_module(models)
+    )
+
+
+def kits() -> dict[str, Any]:
+    """Return ours and, where it is installed, dm_control's."""
+    packages = ("sim2real", "dm_control")
+    return {p: kit(p) for p in packages if importlib.util.find_spec(p)}
+
+
+def robot(k: Any, links: int = LINKS, collide: bool = True) -> Any:
+    """Return a chain of links with a position servo at every joint."""
+    root = k.mjcf.RootElement(model="robot")
+    body = root.worldbody
+    for i in range(links):
+        body = body.add("body", name=f"link{i}", pos=[0, 0, 0.2 * (i > 0)])
+        axis = [0, 1, 0] if i % 2 else [1, 0, 0]
+        body.add("joint", name=f"j{i}", type="hinge", axis=axis, damping=0.05, frictionloss=0.02, armature=0.01)
+        touch = {} if collide else {"contype": 0, "conaffinity": 0}
+        body.add("geom", name=f"g{i}", type="capsule", fromto=[0, 0, 0, 0, 0, 0.2], size=[0.02], mass=0.2, **touch)
+        root.actuator.add("position", name=f"j{i}", joint=f"j{i}", kp=2)
+    return k.composer.ModelWrapperEntity(root)
+
+
+def world(k: Any, entities: int = ENTITIES) -> Any:
+    """Return an arena with a floor and free robots on it."""
+    arena = k.composer.Arena()
+    arena.mjcf_model.option.noslip_iterations = 0
+    arena.mjcf_model.worldbody.add("geom", type="plane", size=[5, 5, 0.1])
+    for i in range(entities):
+        frame = arena.add_free_entity(robot(k))
+        frame.pos = [0.3 * i, 0, 0.3]
+    return arena
+
+
+def medians(programs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Run programs in turn, once to warm up; return the median of the seconds that each takes."""
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for i in range(repeats + 1):
+        for name, program in programs.items():
+            begin = time.perf_counter()
+            program()
+            if i:
+                times[name].append(time.perf_counter() - begin)
+    return {name: statistics.median(t) for name, t in times.items()}
+
+
+def build(repeats: int) -> list[dict[str, Any]]:
+    """Return how long it takes to build and to compile the world."""
+    worlds: dict[str, Any] = {}
+    programs: dict[str, Callable[[], Any]] = {}
+
+    def make(name: str, k: Any) -> None:
+        worlds[name] = world(k)
+
+    for name, k in kits().items():
+        programs[f"{name} build"] = lambda name=name, k=k: make(name, k)
+        programs[f"{name} compile"] = lambda name=name, k=k: k.mjcf.Physics.from_mjcf_model(worlds[name].mjcf_model)
+    ms = {name: 1e3 * s for name, s in medians(programs, repeats).items()}
+    built, compiled = ms["sim2real build"], ms["sim2real compile"]
+    rows = [
+        row("compose/build_20_entities_ms", round(built + compiled, 2), "ms", "built and compiled"),
+        row("compose/compile/build_ms", round(built, 2), "ms", "adding 240 elements and attaching 20 models"),
+        row("compose/compile/compile_ms", round(compiled, 2), "ms", "copying, attaching, MuJoCo's compiler, a state"),
+    ]
+    if "dm_control build" in ms:
+        theirs = ms["dm_control build"] + ms["dm_control compile"]
+        over = round(theirs / (built + compiled), 1)
+        told = f"dm_control: {ms['dm_control build']:.0f} + {ms['dm_control compile']:.0f} ms"
+        rows.insert(0, row("compose/build_20_entities/over_dm_control", over, "1", told, ">= 8"))
+    return rows
+
+
+def reset(repeats: int) -> list[dict[str, Any]]:
+    """Return how long it takes to start an episode."""
+    found = kits()
+    programs = {}
+    for name, k in found.items():
+        for every in (True, False):
+            env = k.composer.Environment(
+                k.composer.NullTask(world(k)), random_state=0, recompile_mjcf_every_episode=every
+            )
+            programs[name, every] = lambda env=env: [env.reset() for _ in range(ROW)]
+    ms = {key: 1e3 * s / ROW for key, s in medians(programs, repeats).items()}
+    rows = []
+    for every, name, told in (
+        (True, "reset", "recompile_mjcf_every_episode=True, the default"),
+        (False, "reset_without_recompiling", "recompile_mjcf_every_episode=False"),
+    ):
+        mine = ms["sim2real", every]
+        rows.append(row(f"compose/{name}_ms", round(mine, 3), "ms", told))
+        if "dm_control" in found:
+            theirs = ms["dm_control", every]
+            text = f"dm_control: {theirs:.3g} ms, {told}" + ("" if every else ": MuJoCo alone takes nearly all of it")
+            rows.append(row(f"compose/{name}/over_dm_control", round(theirs / mine, 1), "1", text, ">= 100"))
+    return rows
+
+
+def steps() -> list[dict[str, Any]]:
+    """Return how many steps under random controls end in the same state, bit for bit."""
+    both = [k.mjcf.Physics.from_mjcf_model(world(k).mjcf_model) for k in kits().values()]
+    if len(both) < 2:
+        return []
+    rng, equal, contacts = np.random.RandomState(0), 0, 0
+    for physics in both:
+        with physics.reset_context():
+            pass
+    for _ in range(STEPS):
+        control = rng.uniform(-1, 1, both[0].model.nu)
+        for physics in both:
+            physics.set_control(control)
+            physics.step()
+        states = [np.concatenate([p.data.qpos, p.data.qvel, p.data.sensordata, p.data.xpos.ravel()]) for p in both]
+        equal += bool(np.array_equal(*states))
+        contacts = max(contacts, both[0].data.ncon)
+    told = f"dm_control, the same world, up to {contacts} contacts"
+    return [row("compose/c_steps_bit_equal", equal, f"of {STEPS}", told, str(STEPS))]
+
+
+def drop(k: Any) -> Any:
+    """Return a task without a reward: a ball that rolls and a capsule that topples on a floor."""
+    arena = k.composer.Arena()
+    arena.mjcf_model.worldbody.add("geom", type="plane", size=[1, 1, 0.1])
+    for i, shape in enumerate((["sphere", [0.1]], ["capsule", [0.05, 0.1]])):
+        prop = k.mjcf.RootElement(model=shape[0])
+        prop.worldbody.add("geom", type=shape[0], size=shape[1])
+        frame = arena.add_free_entity(k.composer.ModelWrapperEntity(prop))
+        frame.pos, frame.euler = [0.5 * i, 0, 0.2], [0.3, 0.2, 0]
+    return k.composer.NullTask(arena)
+
+
+def difference(task: Callable[[], Any], controls: np.ndarray) -> tuple[float, int]:
+    """Return the largest difference of a state on MJX in float64 from the one on C, and the most contacts."""
+    import jax
+    import jax.numpy as jnp
+
+    from sim2real import composer
+
+    with jax.enable_x64(True):
+        environment = composer.MjxEnvironment(task())
+
+        def play(key: Any, actions: Any) -> Any:
+            def step(state: Any, action: Any) -> Any:
+                state = environment.step(state, action)
+                return state, (state.data.qpos, state.data.qvel)
+
+            return jax.lax.scan(step, environment.reset(key), actions)[1]
+
+        found = jax.jit(play)(jax.random.key(0), jnp.asarray(controls))
+        moved = np.concatenate([np.asarray(x) for x in found], axis=1)
+    env = composer.Environment(task())
+    env.reset()
+    worst, contacts = 0.0, 0
+    for mine, control in zip(moved, controls, strict=True):
+        env.step(control)
+        data = env.physics.data
+        worst = max(worst, float(np.abs(mine - np.concatenate([data.qpos, data.qvel])).max()))
+        contacts = max(contacts, data.ncon)
+    return worst, contacts
+
+
+def engines() -> list[dict[str, Any]]:
+    """Return how far MJX is from C after 300 steps."""
+    k = kit("sim2real")
+    controls = np.random.RandomState(0).uniform(-1, 1, (300, LINKS))
+    free, none = difference(lambda: k.composer.NullTask(robot(k, collide=False)), controls)
+    touching, contacts = difference(lambda: drop(k), np.zeros((300, 0)))
+    name, told = "compose/mjx_over_c_float64", "largest difference of qpos and qvel over 300 steps"
+    return [
+        row(f"{name}/contact_free", float(f"{free:.2g}"), "1", f"{told}, a six-link arm, {none} contacts", "<= 1e-10"),
+        row(f"{name}/contacts", float(f"{touching:.2g}"), "1", f"{told}, up to {contacts} contacts", "<= 1e-6"),
+    ]
+
+
+def reach() -> Any:
+    """Return a task with what tasks have: an arm, observables of which one is late, a start by chance, a reward."""
+    from sim2real import composer
+    from sim2real.composer.observation.observable import MJCFFeature
+
+    class Reach(composer.Task):
+        """Move the tip of the arm to a place."""
+
+        def __init__(self) -> None:
+            arm = robot(kit("sim2real"), collide=False)
+            self._root_entity, self.joints = arm, arm.mjcf_model.find_all("joint")
+            self.tip = arm.mjcf_model.find("body", f"link{LINKS - 1}")
+            option = arm.mjcf_model.option
+            option.iterations, option.ls_iterations = 4, 4
+            self.set_timesteps(0.02, 0.01)
+            for name, late in (("qpos", {"delay": 3, "buffer_size": 2}), ("qvel", {})):
+                arm.observables.add_observable(name, MJCFFeature(name, self.joints, **late))
+
+        def initialize_episode(self, physics: Any, random_state: Any) -> None:
+            physics.bind(self.joints).qpos = random_state.uniform(-0.1, 0.1, LINKS)
+
+        def get_reward(self, physics: Any) -> Any:
+            tip = physics.bind(self.tip).xpos
+            return physics.np.exp(-physics.np.sum((tip - physics.np.array([0.5, 0.0, 0.5])) ** 2))
+
+        def should_terminate_episode(self, physics: Any) -> Any:
+            return physics.bind(self.tip).xpos[2] < -1.0
+
+    return Reach()
+
+
+def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
+    """Return what a task costs over as many bare ``mjx.step`` in the same motion."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    from sim2real import composer
+
+    environment = composer.MjxEnvironment(reach(), time_limit=10.0)
+    model, count = environment.mjx_model, environment.substeps
+    device = jax.default_backend()
+    copies = copies or (256 if device == "cpu" else 4096)
+    length = 10 if device == "cpu" else 50
+    times = jnp.arange(length) * 0.02
+
+    def wave(t: Any, q: Any) -> Any:
+        return 0.3 * jnp.sin(3.0 * t + jnp.arange(float(LINKS))) - 0.1 * q
+
+    def task(start: Any) -> Any:
+        def step(state: Any, t: Any) -> Any:
+            state = environment.step(state, wave(t, state.data.qpos))
+            seen = sum(x.sum() for x in state.observation.values())
+            return state, (state.reward, seen, state.done)
+
+        state, outcome = jax.lax.scan(step, start, times)
+        return state.data.qpos.sum(), outcome
+
+    def bare(start: Any) -> Any:
+        def step(data: Any, t: Any) -> Any:
+            data = data.replace(ctrl=wave(t, data.qpos))
+            return jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=count)[0], None
+
+        return jax.lax.scan(step, start.data, times)[0].qpos.sum()
+
+    starts = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), copies))
+    programs, compile_s = {}, {}
+    for name, program in (("bare", bare), ("task", task)):
+        begin = time.perf_counter()
+        compiled = jax.jit(jax.vmap(program)).lower(starts).compile()
+        compile_s[name] = time.perf_counter() - begin
+        programs[name] = lambda compiled=compiled: jax.block_until_ready(compiled(starts))
+    seconds = medians(programs, repeats)
+    print(copies, seconds, file=sys.stderr)
+    rate = {name: copies * length / s for name, s in seconds.items()}
+    name, told = f"compose/{device}", f"bare mjx.step in the same motion, {copies} copies"
+    over = round(seconds["task"] / seconds["bare"], 3)
+    return [
+        row(f"{name}/mjx_env_over_bare", over, "1", told, "<= 1.15"),
+        row(f"{name}/mjx_env_steps_per_s", round(rate["task"]), "1/s", f"{rate['bare']:.3g} bare"),
+        row(f"{name}/mjx_compile_s", round(compile_s["task"], 1), "s", f"{compile_s['bare']:.1f} bare"),
+    ]
+
+
+def main(arguments: list[str]) -> dict[str, Any]:
+    """Measure; MJX's speed on the device that JAX finds."""
+    parser = argparse.ArgumentParser(prog="bench.py compose")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--copies", type=int, help="copies of the task on MJX; default: 256 on the CPU, 4096 on a GPU")
+    options = parser.parse_args(arguments)
+    parts: dict[str, Callable[[], list[dict[str, Any]]]] = {
+        "build": lambda: build(3 * options.repeats),
+        "reset": lambda: reset(options.repeats),
+        "steps": steps,
+        "engines": engines,
+        "speed": lambda: speed(options.copies, options.repeats),
+    }
+    return {"rows": [r for name in PARTS if name in options.parts for r in parts[name]()]}
