@@ -13,6 +13,7 @@ from sim2real.worlds import friction
 from sim2real.worlds.encoder import Encoder
 from sim2real.worlds.friction import FrictionParams
 from sim2real.worlds.joint import Forces, JointState, JointWorld
+from sim2real.worlds.recorded import command_delay
 
 
 @struct.dataclass
@@ -80,8 +81,7 @@ class DiskWorld(JointWorld):
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the delay of the command, where the actuator's parameters set one."""
         del rng
-        delay = getattr((graph_state or GraphState()).params.get("actuator"), "delay", None)
-        return {} if delay is None else {"actuator": delay}
+        return command_delay(graph_state)
 
     def command(self, step_state: StepState) -> Any:
         """Return the voltage during this tick [V]."""
@@ -99,27 +99,6 @@ class DiskWorld(JointWorld):
             damping=friction.damping(p.friction, velocity),
             dry=friction.dry(p.friction, velocity, radial),
         )
-
-
-@struct.dataclass
-class ActuatorParams(Base):
-    """Delay from a command's time stamp to the motor, and back to the measurement's [s]."""
-
-    delay: Any = None
-
-
-class Actuator(BaseNode):
-    """What sent the recorded voltages; it is not run."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ActuatorParams:
-        """Return no delay of its own."""
-        del rng, graph_state
-        return ActuatorParams()
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
-        """Return zero voltage."""
-        del rng, graph_state
-        return Command(action=jnp.zeros(1))
 
 
 class Sensor(BaseNode):

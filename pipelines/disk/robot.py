@@ -12,8 +12,9 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.worlds.encoder import Encoder
+from sim2real.worlds.recorded import CommandDelay, RecordedActuator
 
-from .model import Actuator, ActuatorParams, Command, DiskWorld, Sensor
+from .model import Command, DiskWorld, Sensor
 
 RATE_HZ, WORLD_HZ = 40.0, 200.0
 UNITS = {"th": "rad", "action": "V"}
@@ -66,7 +67,10 @@ class IdentifiableDisk:
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world; the world hears commands up to ``max_delay_s`` [s] late."""
-        sensor, actuator = Sensor("sensor", RATE_HZ), Actuator("actuator", RATE_HZ)
+        sensor, actuator = (
+            Sensor("sensor", RATE_HZ),
+            RecordedActuator("actuator", RATE_HZ, Command(action=jnp.zeros(1))),
+        )
         world = DiskWorld("world", WORLD_HZ)
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean")
         world.connect(actuator, skip=True, delay_dist=to_world)
@@ -78,7 +82,7 @@ class IdentifiableDisk:
         base = {
             "world": DiskWorld("world", WORLD_HZ).init_params(),
             "sensor": Encoder(),
-            "actuator": ActuatorParams(),
+            "actuator": CommandDelay(),
         }
         placed = self.parameters.placed(base, values)
         encoder = placed["sensor"]

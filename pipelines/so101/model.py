@@ -12,6 +12,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.worlds import friction
 from sim2real.worlds.friction import FrictionParams
 from sim2real.worlds.joint import Forces, JointState, JointWorld
+from sim2real.worlds.recorded import command_delay
 from sim2real.worlds.servo import saturated
 
 JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
@@ -124,8 +125,7 @@ class ArmWorld(JointWorld):
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the delay of the goals, where the actuator's parameters set one."""
         del rng
-        delay = getattr((graph_state or GraphState()).params.get("actuator"), "delay", None)
-        return {} if delay is None else {"actuator": delay}
+        return command_delay(graph_state)
 
     def command(self, step_state: StepState) -> Any:
         """Return the goals during this tick, ``(6,)`` [rad]."""
@@ -156,27 +156,6 @@ def _weight(p: ArmParams, q: Any) -> Any:
     pitch = p.gravity.shoulder * jnp.sin(upper) + elbow
     zero = jnp.zeros_like(wrist)
     return jnp.stack([zero, pitch - p.table.ratio * pushed, elbow - pushed, wrist, zero, zero])
-
-
-@struct.dataclass
-class ActuatorParams(Base):
-    """Delay from a goal's time stamp to the servo, and back to the measurement's [s]."""
-
-    delay: Any = None
-
-
-class Actuator(BaseNode):
-    """What sent the recorded goals; it is not run."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ActuatorParams:
-        """Return no delay of its own."""
-        del rng, graph_state
-        return ActuatorParams()
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Goal:
-        """Return zero."""
-        del rng, graph_state
-        return Goal(goal=jnp.zeros(6))
 
 
 class Sensor(BaseNode):

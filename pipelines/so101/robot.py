@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.delays import TrainableDist
@@ -12,8 +13,9 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.leaves import get_leaf
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.worlds.recorded import CommandDelay, RecordedActuator
 
-from .model import JOINTS, Actuator, ActuatorParams, ArmWorld, Goal, Sensor, nominal
+from .model import JOINTS, ArmWorld, Goal, Sensor, nominal
 
 RATE_HZ, WORLD_HZ = 1 / 0.02006, 4 / 0.02006
 _TICK_S = 1 / WORLD_HZ
@@ -73,7 +75,7 @@ class IdentifiableArm:
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world; the world hears goals up to ``max_delay_s`` [s] late."""
-        sensor, actuator = Sensor("sensor", RATE_HZ), Actuator("actuator", RATE_HZ)
+        sensor, actuator = Sensor("sensor", RATE_HZ), RecordedActuator("actuator", RATE_HZ, Goal(goal=jnp.zeros(6)))
         world = ArmWorld("world", WORLD_HZ, substep_s=0.0051)
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=1)
         world.connect(actuator, skip=True, delay_dist=to_world)
@@ -83,7 +85,7 @@ class IdentifiableArm:
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and initial positions and velocities ``(12,)``."""
-        base = {"world": nominal(), "actuator": ActuatorParams()}
+        base = {"world": nominal(), "actuator": CommandDelay()}
         placed = self.parameters.placed(base, values)
         return {**placed, "world": placed["world"].replace(start=start)}
 

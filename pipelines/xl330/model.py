@@ -13,6 +13,7 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.worlds.joint import Forces, JointState, JointWorld
+from sim2real.worlds.recorded import command_delay
 from sim2real.worlds.servo import motor_torque, position_duty
 
 MASS_KG, LENGTH_M, GRAVITY = 0.49, 0.10, 9.81
@@ -96,8 +97,7 @@ class ServoWorld(JointWorld):
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the delay of the goals, where the actuator's parameters set one."""
         del rng
-        delay = getattr((graph_state or GraphState()).params.get("actuator"), "delay", None)
-        return {} if delay is None else {"actuator": delay}
+        return command_delay(graph_state)
 
     def command(self, step_state: StepState) -> Command:
         """Return what the servo is told during this tick."""
@@ -115,27 +115,6 @@ class ServoWorld(JointWorld):
         inertia = MASS_KG * LENGTH_M**2 + p.armature
         brake = p.viscous + jnp.where(on, 0.0, _OPEN * p.back_emf)
         return Forces(acceleration=(motor + weight) / inertia, damping=brake / inertia, dry=rubbing / inertia)
-
-
-@struct.dataclass
-class ActuatorParams(Base):
-    """Delay from a goal's time stamp to the motor, and back to the measurement's, less the sensor's tick [s]."""
-
-    delay: Any = None
-
-
-class Actuator(BaseNode):
-    """What sent the recorded goals; it is not run."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> ActuatorParams:
-        """Return no delay of its own."""
-        del rng, graph_state
-        return ActuatorParams()
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
-        """Return torque off."""
-        del rng, graph_state
-        return Command(goal=jnp.float32(0.0), kp=jnp.float32(0.0), enabled=jnp.float32(0.0))
 
 
 class Sensor(BaseNode):

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
+
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.worlds.recorded import CommandDelay, RecordedActuator
 
-from .model import Actuator, ActuatorParams, Command, Sensor, ServoParams, ServoWorld
+from .model import Command, Sensor, ServoParams, ServoWorld
 
 RATE_HZ, WORLD_HZ = 200.0, 1000.0
 _TICK_S = 1 / WORLD_HZ
@@ -59,7 +62,10 @@ class IdentifiableServo:
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world; the world hears goals up to ``max_delay_s`` [s] late."""
-        sensor, actuator = Sensor("sensor", RATE_HZ), Actuator("actuator", _FASTEST_HZ)
+        sensor, actuator = (
+            Sensor("sensor", RATE_HZ),
+            RecordedActuator("actuator", _FASTEST_HZ, Command(jnp.float32(0.0), jnp.float32(0.0), jnp.float32(0.0))),
+        )
         world = ServoWorld("world", WORLD_HZ)
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=1)
         world.connect(actuator, skip=True, delay_dist=to_world)
@@ -69,7 +75,7 @@ class IdentifiableServo:
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and an initial angle and velocity ``(2,)``."""
-        placed = self.parameters.placed({"world": ServoParams(), "actuator": ActuatorParams()}, values)
+        placed = self.parameters.placed({"world": ServoParams(), "actuator": CommandDelay()}, values)
         return {**placed, "world": placed["world"].replace(start=start)}
 
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from sim2real.errors import UsageError
-from sim2real.graph.base import StepState
-from sim2real.graph.node import BaseWorld
+from sim2real.worlds.stepped import SteppedWorld
 
 
-class OdeWorld(BaseWorld):
+class OdeWorld(SteppedWorld):
     """Integrates ``derivative`` over a tick with the classical Runge-Kutta method of order four.
 
     Args:
@@ -28,54 +24,30 @@ class OdeWorld(BaseWorld):
     def __init__(
         self, name: str, rate: float, substep_s: float = 0.002, color: str | None = None, order: int | None = None
     ) -> None:
-        super().__init__(name, rate, color=color, order=order)
-        if not substep_s > 0:
-            raise UsageError(f"world {name!r}: substep_s must be positive, got {substep_s} s")
-        self.substeps = max(1, math.ceil(round(1.0 / (self.rate * substep_s), 9)))
+        super().__init__(name, rate, substep_s, color=color, order=order)
 
     @abstractmethod
     def derivative(self, params: Any, state: Any, command: Any) -> Any:
         """Return the time derivative of ``state``, a tree of the same structure [state's unit/s]."""
-
-    @abstractmethod
-    def command(self, step_state: StepState) -> Any:
-        """Return the command that is held during this tick."""
 
     def limit(self, params: Any, state: Any) -> Any:
         """Return the state inside its limits; called after every substep."""
         del params
         return state
 
-    def output(self, params: Any, state: Any) -> Any:
-        """Return the message that leaves at the end of the tick; default: the state."""
-        del params
-        return state
-
     def integrate(self, params: Any, state: Any, command: Any) -> Any:
         """Return the state one tick later, under a command that is held."""
-        h = 1.0 / (self.rate * self.substeps)
 
-        def substep(x: Any, _: None) -> tuple[Any, None]:
+        def substep(x: Any, h: float) -> Any:
             f = lambda y: self.derivative(params, y, command)  # noqa: E731
             k1 = f(x)
             k2 = f(_axpy(x, k1, h / 2))
             k3 = f(_axpy(x, k2, h / 2))
             k4 = f(_axpy(x, k3, h))
             move = jax.tree_util.tree_map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-            return self.limit(params, _axpy(x, move, h)), None
+            return self.limit(params, _axpy(x, move, h))
 
-        # A loop costs a GPU a kernel launch a substep. On a CPU the unrolled pendulum took 5 times as long to compile
-        # and 6 times as long to run as the loop (2 cores, jax 0.10.2, five substeps).
-        unroll = 1 if jax.default_backend() == "cpu" else self.substeps
-        start = jax.tree_util.tree_map(jnp.asarray, state)
-        return jax.lax.scan(substep, start, length=self.substeps, unroll=unroll)[0]
-
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Integrate over one tick."""
-        params = step_state.params
-        state = self.integrate(params, step_state.state, self.command(step_state))
-        new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
-        return new, self.output(params, state)
+        return self.over_substeps(substep, state)
 
 
 def _axpy(x: Any, direction: Any, factor: float) -> Any:
