@@ -64,7 +64,7 @@ class MonotonicClock:
 
 _realtime_lock = threading.Lock()
 _realtime_users = 0
-_realtime_before: tuple[bool, float] = (True, 0.005)
+_realtime_before: tuple[bool, float, bool] = (True, 0.005, False)
 
 
 @contextmanager
@@ -73,13 +73,14 @@ def realtime() -> Iterator[None]:
 
     The garbage collector runs once, what is alive is frozen, and collection is off until the exit: reference counting
     goes on, but cyclic garbage made meanwhile stays (a step as the runtime makes it leaves none). The interpreter
-    offers the lock to waiting threads after 0.5 ms instead of 5 ms. The last exit restores both.
+    offers the lock to waiting threads after 0.5 ms instead of 5 ms. The last exit restores both, unless the caller had
+    frozen objects before: what is frozen then stays so.
     """
     global _realtime_users, _realtime_before
     with _realtime_lock:
         _realtime_users += 1
         if _realtime_users == 1:
-            _realtime_before = (gc.isenabled(), sys.getswitchinterval())
+            _realtime_before = (gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0)
             gc.collect()
             gc.freeze()
             gc.disable()
@@ -90,8 +91,9 @@ def realtime() -> Iterator[None]:
         with _realtime_lock:
             _realtime_users -= 1
             if _realtime_users == 0:
-                enabled, interval = _realtime_before
-                gc.unfreeze()
+                enabled, interval, frozen = _realtime_before
+                if not frozen:
+                    gc.unfreeze()
                 if enabled:
                     gc.enable()
                 sys.setswitchinterval(interval)

@@ -242,6 +242,7 @@ def test_steps_that_do_not_fit_are_refused_before_anything_moves():
 
 
 def test_episodes_leave_the_interpreter_as_it_was():
+    gc.unfreeze()
     before = sys.getswitchinterval()
     with realtime(), realtime():
         assert not gc.isenabled()
@@ -255,6 +256,10 @@ def test_episodes_leave_the_interpreter_as_it_was():
     assert gc.isenabled()
     assert sys.getswitchinterval() == before
     assert gc.get_freeze_count() == 0
+    gc.freeze()
+    with realtime():
+        pass
+    assert gc.get_freeze_count() > 0  # the caller's own stay frozen
 
 
 def test_steps_leave_no_cyclic_garbage():
