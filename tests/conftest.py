@@ -30,8 +30,8 @@ settings.load_profile("sim2real")
 def frozen():
     """Leave what earlier modules loaded and compiled out of garbage collection.
 
-    Every wall-clock episode collects before it starts: at the end of the suite sixty of them took 60 s of collecting, by
-    themselves 4 s.
+    Every wall-clock episode collects before it starts: at the end of the suite sixty of them took 60 s of collecting,
+    by themselves 4 s.
     """
     gc.collect()
     gc.freeze()
