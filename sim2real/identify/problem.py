@@ -170,11 +170,16 @@ class Problem:
             Residuals ``(C, fields)``, scaled, and their times ``(C,)`` [s]; -1 where there is no measurement.
         """
         shift = jnp.zeros(2 * len(self.channels))
+        error, ts = self.residuals(values, eps, shift)
+        counts = ((ts >= 0) & (ts <= fit_s))[:, None]
         for _ in range(2 if self.config.initial_state == "free" else 0):
-            error, ts = self.residuals(values, eps, shift * self.prior)
             sensitivity = self.sensitivity(values, eps, shift * self.prior)
-            shift = shift + self._solve(error, ts, sensitivity, shift, fit_s)
-        return self.residuals(values, eps, shift * self.prior)
+            moved = shift + self._solve(error, ts, sensitivity, shift, fit_s)
+            after, _ = self.residuals(values, eps, moved * self.prior)
+            # Where friction sticks, or near the top, a linear step may lead astray.
+            gain = jnp.sum(jnp.where(counts, error**2 - after**2, 0.0)) + jnp.sum(shift**2 - moved**2)
+            shift, error = (jnp.where(gain > 0, new, old) for new, old in ((moved, shift), (after, error)))
+        return error, ts
 
     def losses(self, candidates: Any, around: Any, pick: Any = None) -> Any:
         """Return the loss of each candidate, ``(N,)``: half the mean square of scaled, tamed residuals, and the priors.
