@@ -268,7 +268,7 @@ def _mean_over_period(inputs: InputState, late: Any, window: int, period_s: floa
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             return now
         # Message by message, not as a product of arrays: this fuses with the physics. On two CPU cores the whole
-        # rollout of a motor with a window of five took 27 ns a tick with a dot product, and 12 ns so.
+        # rollout of a motor with a window of five took 27 ns a tick with a dot product, and 17 ns so.
         mean = leaf[0]
         for i in range(1, leaf.shape[0]):
             mean = mean + (leaf[i] - leaf[i - 1]) * share[i].astype(leaf.dtype)

@@ -58,7 +58,7 @@ def refine(
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
-    import optimistix  # 0.4 s
+    import optimistix  # 0.5 s
 
     solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
