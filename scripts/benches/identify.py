@@ -121,13 +121,13 @@ def row(name: str, value: float, unit: str, yardstick: str = "", goal: str = "")
     return {"name": f"identify/{name}", "value": rounded, "unit": unit, "yardstick": yardstick, "goal": goal}
 
 
-def identify(case: Case, fitted: Mapping[str, Episode], start: Mapping[str, float] | None = None) -> Fit:
+def identify(case: Case, fitted: Mapping[str, Episode]) -> Fit:
     """Fit as the pipeline's configuration says."""
     c, episodes = case.config, list(fitted.values())
     longer = windows(episodes, c.long_s, 0.0, c.initial_state == "free") if c.long_s else []
     length = c.settle_s + c.horizon_s
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
-    return fit(case.model, episodes, spans, length, c, None, longer, None, start)
+    return fit(case.model, episodes, spans, length, c, None, longer)
 
 
 def windows(episodes: Sequence[Episode], length_s: float, spacing_s: float, estimated: bool) -> list[Span]:

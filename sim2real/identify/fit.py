@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ class Fit:
         loss: Its loss there.
         search: What the search found; None where it was left out.
         refined: How each refinement ended, in order.
+        windows: The segments that were searched on, with those that were held out.
     """
 
     problem: Problem
@@ -42,6 +43,7 @@ class Fit:
     loss: float
     search: SearchResult | None
     refined: tuple[Refined, ...]
+    windows: Problem
 
     @property
     def values(self) -> dict[str, Any]:
@@ -67,24 +69,21 @@ def fit(
     table: ParameterTable | None = None,
     long_spans: Sequence[Span] = (),
     told: Told | None = None,
-    start: Mapping[str, float] | None = None,
 ) -> Fit:
     """Identify a model.
 
     Args:
         model: The model.
         recordings: The logs.
-        spans: Segments to search and refine on.
+        spans: Segments to search and refine on, and others to predict.
         length_s: Their length [s].
         config: How.
         table: The parameters; default: the model's.
         long_spans: Segments of ``config.long_s`` for the last refinement.
         told: Progress.
-        start: Values to start from; default: nominal ones, delays at a quarter of their bounds.
     """
-    problem = Problem(model, recordings, spans, length_s, config, table)
-    first = problem.table.start() if start is None else problem.table.encode(start)
-    starts, found = first[None], None
+    problem = windows = Problem(model, recordings, spans, length_s, config, table)
+    starts, found = problem.table.start()[None], None
     if config.generations:
         found = run_search(problem, starts[0], told)
         starts = found.finalists
@@ -97,7 +96,7 @@ def fit(
         problem = Problem(model, recordings, long_spans, config.long_s, config, table)
         refined.append(_refine(problem, z[None], told))
         z, loss = refined[-1].z, refined[-1].loss
-    return Fit(problem, centred(problem, z), loss, found, tuple(refined))
+    return Fit(problem, centred(problem, z), loss, found, tuple(refined), windows)
 
 
 def refit(problem: Problem, table: ParameterTable, near: np.ndarray, told: Told | None = None) -> np.ndarray:

@@ -23,6 +23,11 @@ _TRANSFORMS = {
 }
 
 
+def from_scale(transform: str, x: Any, numpy: Any = np) -> Any:
+    """Return values for points on a scale, in numpy or in ``jax.numpy``."""
+    return _TRANSFORMS[transform][1](x, numpy)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One quantity to identify.
@@ -182,7 +187,7 @@ class ParameterTable:
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
         found: dict[str, list[Any]] = {}
         for i, c in enumerate(self.columns):
-            found.setdefault(c.parameter.name, []).append(_TRANSFORMS[c.parameter.transform][1](x[i], jnp))
+            found.setdefault(c.parameter.name, []).append(from_scale(c.parameter.transform, x[i], jnp))
         values: dict[str, Any] = {}
         for p in self.parameters:
             own = found.get(p.name)
@@ -250,7 +255,7 @@ class ParameterTable:
     def unscale(self, x: np.ndarray) -> np.ndarray:
         """Return values for points on the parameters' scales ``(..., P)``, kept within the bounds."""
         inside = np.clip(x, self._low, self._high)
-        values = [_TRANSFORMS[c.parameter.transform][1](inside[..., i], np) for i, c in enumerate(self.columns)]
+        values = [from_scale(c.parameter.transform, inside[..., i]) for i, c in enumerate(self.columns)]
         return np.stack(values, axis=-1)
 
     def slope(self, x: np.ndarray) -> np.ndarray:

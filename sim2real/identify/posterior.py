@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.parameters import ParameterTable, Transform, from_scale
 
 _FORMAT = 1
-_BACK = {"linear": lambda v: v, "log": np.exp, "logit": lambda v: 1.0 / (1.0 + np.exp(-v))}
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Posterior:
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T
         x = np.clip(x, self.low, self.high)
-        return {n: _BACK[t](x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}
+        return {n: from_scale(t, x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}
 
     def to_json(self) -> dict[str, Any]:
         """Return the posterior as JSON takes it."""
@@ -79,7 +78,7 @@ class Posterior:
         size = len(found.names)
         shapes = {a.shape for a in (found.mean, found.low, found.high)}
         fits = shapes == {(size,)} and found.covariance.shape == (size, size) and len(found.transform) == size
-        if document.get("format") != _FORMAT or not fits or not set(found.transform) <= set(_BACK):
+        if document.get("format") != _FORMAT or not fits or not set(found.transform) <= set(get_args(Transform)):
             raise Sim2RealError("a posterior of another format or of mixed sizes", hint="identify again")
         if not all(np.isfinite(a).all() for a in arrays.values()):
             raise Sim2RealError("a posterior with an entry that is no number", hint="identify again")

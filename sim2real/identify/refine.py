@@ -58,26 +58,7 @@ def refine(
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
-    import optimistix  # 0.5 s
-
-    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
-    scale = 1.0 / np.sqrt(max(problem.measurements, 1))
-
-    def improve(z: Any) -> tuple[Any, Any]:
-        columns = problem.sensitivities(z)
-        residuals = by_jacobian(
-            problem.differentiable(
-                lambda y: (
-                    scale * jnp.concatenate([problem.stacked(y, columns).reshape(-1), problem.table.prior_residuals(y)])
-                )
-            )
-        )
-        found = optimistix.least_squares(
-            lambda y, _: residuals(y), solver, z, options={"jac": "fwd"}, max_steps=steps, throw=False
-        )
-        return found.value, found.stats["num_steps"]
-
-    improve = problem.programs.setdefault(("improve", steps), jax.jit(improve))
+    improve = problem.programs.setdefault(("improve", steps), _program(problem, steps))
     full_loss = problem.programs.setdefault("alone", jax.jit(lambda z: problem.losses(z[None], z)[0]))
     first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
     if not np.isfinite(first).any():
@@ -103,3 +84,26 @@ def refine(
             if not better or gain < 1e-4 * abs(loss):
                 break
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
+
+
+def _program(problem: Problem, steps: int) -> Callable[[Any], tuple[Any, Any]]:
+    """Return one round of Levenberg-Marquardt, compiled on its first call: ``z -> (z, steps taken)``."""
+    import optimistix  # 0.5 s
+
+    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
+    scale = 1.0 / np.sqrt(max(problem.measurements, 1))
+
+    def improve(z: Any) -> tuple[Any, Any]:
+        columns = problem.sensitivities(z)
+
+        def weighed(y: Any) -> Any:
+            residuals = problem.stacked(y, columns).reshape(-1)
+            return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
+
+        residuals = by_jacobian(problem.differentiable(weighed))
+        found = optimistix.least_squares(
+            lambda y, _: residuals(y), solver, z, options={"jac": "fwd"}, max_steps=steps, throw=False
+        )
+        return found.value, found.stats["num_steps"]
+
+    return jax.jit(improve)

@@ -170,6 +170,11 @@ def time_shift(problem: Problem) -> np.ndarray:
     return direction if free else np.zeros_like(direction)
 
 
+def shifted_delays(problem: Problem) -> set[str]:
+    """Return the delays between which time can be shifted; none where there is no such direction."""
+    return {name for name, share in zip(problem.table.names, time_shift(problem), strict=True) if share}
+
+
 def _verdict(error: float, margin: float) -> str:
     """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width."""
     if error > VAGUE:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -35,7 +35,7 @@ def judge(
     spread: Uncertainty,
     names: Sequence[str],
     check: Check,
-    shifted: bool,
+    shifted: Collection[str] = (),
     beyond: Sequence[str] = (),
 ) -> Verdict:
     """Judge an identification.
@@ -45,9 +45,34 @@ def judge(
         spread: Its uncertainty.
         names: Names of the parameters, in the order of ``spread``.
         check: What the data determines at the estimate.
-        shifted: Whether time can be shifted between delays: then only their sum counts, and that is as it should be.
+        shifted: Delays between which time can be shifted: only their sum counts, and that is as it should be.
         beyond: Where held-out data goes beyond what was fitted: sentences.
     """
+    improves, reasons = _on_held_out(prediction)
+    bounds = [n for n, v in zip(names, spread.verdict, strict=True) if v == "at a bound"]
+    groups = zip(check.undetermined, check.messages, strict=True)
+    loose = [message for group, message in groups if not set(group) <= set(shifted)]
+    reasons += beyond
+    if bounds:
+        reasons.append(f"at a bound: {', '.join(bounds)}; widen it with --bounds NAME LOW HIGH, or doubt the model")
+    reasons += loose
+    if spread.misfit > 3.0:
+        reasons.append(
+            f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
+            "part, and intervals follow how much estimates vary from block to block"
+        )
+    status: Status = "accepted"
+    if not improves:
+        status = "no improvement on held-out data"
+    elif bounds:
+        status = "hit a bound"
+    elif loose:
+        status = "not identifiable"
+    return Verdict(status, tuple(reasons))
+
+
+def _on_held_out(prediction: Sequence[Mapping[str, Any]]) -> tuple[bool, list[str]]:
+    """Return whether it beats every baseline on held-out data at the longest horizon, and what to say of it."""
     held_out = [row for row in prediction if row["held_out"] and row["rmse"] is not None]
     horizon_s = max((row["horizon_s"] for row in held_out), default=None)
     # What diverged to no number is infinitely wrong.
@@ -57,40 +82,17 @@ def judge(
         if row["horizon_s"] == horizon_s
     }
     own = last.pop("identified", None)
-    alike = [] if own is None else [m for m, e in last.items() if own >= _BETTER * e]
-    better = [m for m in alike if m != NO_DELAY]
-    bounds = [n for n, v in zip(names, spread.verdict, strict=True) if v == "at a bound"]
-    delays = {n for n in names if n.endswith("_delay")} if shifted else set()
-    loose = [(g, m) for g, m in zip(check.undetermined, check.messages, strict=True) if not set(g) <= delays]
-    reasons = []
     if own is None:
-        reasons.append("nothing was held out: how well it predicts is not known")
-    elif better:
-        reasons.append(f"{horizon_s:g} s ahead on held-out data it is no better than: {', '.join(better)}")
-    else:
-        closest = min(last, key=lambda m: last[m]) if last else None
-        if closest:
-            reasons.append(
-                f"{horizon_s:g} s ahead on held-out data its error is {own / last[closest]:.2g} times that of {closest}"
-            )
-    if NO_DELAY in alike and not better:
+        return True, ["nothing was held out: how well it predicts is not known"]
+    alike = [m for m, e in last.items() if own >= _BETTER * e]
+    better = [m for m in alike if m != NO_DELAY]
+    ahead = f"{horizon_s:g} s ahead on held-out data"
+    if better:
+        return False, [f"{ahead} it is no better than: {', '.join(better)}"]
+    reasons = []
+    if last:
+        closest = min(last, key=lambda m: last[m])
+        reasons.append(f"{ahead} its error is {own / last[closest]:.2g} times that of {closest}")
+    if alike:
         reasons.append("without any delay it predicts as well: this data does not need one")
-    reasons += beyond
-    if bounds:
-        reasons.append(f"at a bound: {', '.join(bounds)}; widen it with --bounds NAME LOW HIGH, or doubt the model")
-    reasons += [message for _, message in loose]
-    if spread.misfit > 3.0:
-        reasons.append(
-            f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
-            "part, and intervals follow how much estimates vary from block to block"
-        )
-    status: Status = (
-        "no improvement on held-out data"
-        if better
-        else "hit a bound"
-        if bounds
-        else "not identifiable"
-        if loose
-        else "accepted"
-    )
-    return Verdict(status, tuple(reasons))
+    return True, reasons

@@ -26,19 +26,15 @@ from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
 from sim2real.stages.console import note, pairs, shown, table
 from sim2real.stages.excitation import excitation as command_signal
-from sim2real.stages.identified import ROUND_TRIP
-from sim2real.stages.identify import load_log
+from sim2real.stages.identified import ROUND_TRIP, SURE_S
+from sim2real.stages.identify import load_log, reach
 from sim2real.stages.manifest import plain
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import Identifiable
 from sim2real.stages.runs import newest
 
 PLANNED = "planned excitation"
-_EDGES_S = (0.3, 0.2)
-"""What is left out at either end of a log where initial states are estimated [s]."""
 _LEAST_S = 0.3
-_SURE_S = 0.005
-"""A round trip with a larger standard error is not determined [s]; the same holds for what identify finds."""
 _MOST_SEGMENTS = 120
 """More than this many segments say nothing new: of a longer log so many are taken, evenly."""
 
@@ -197,9 +193,8 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
     Raises:
         UsageError: When the shortest recording holds none.
     """
-    first, last = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
-    reach = [(first, e.duration_s - last) for e in episodes]
-    shortest = min(end - begin for begin, end in reach)
+    usable = [reach(e, config) for e in episodes]
+    shortest = min(end - begin for begin, end in usable)
     length_s = min(config.settle_s + config.horizon_s, shortest)
     if length_s < _LEAST_S:
         raise UsageError(
@@ -208,7 +203,7 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
         )
     spans = [
         Span(r, float(b))
-        for r, (begin, end) in enumerate(reach)
+        for r, (begin, end) in enumerate(usable)
         for b in np.arange(begin, end - length_s + 1e-6, length_s)
     ]
     if len(spans) > _MOST_SEGMENTS:
@@ -332,7 +327,7 @@ def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiabi
         "nominal": None,
         "standard_error_per_minute": error(60.0),
         "percent_of_nominal": None,
-        "determined": "alone" if error(check.duration_s) < _SURE_S else "no",
+        "determined": "alone" if error(check.duration_s) < SURE_S else "no",
     }
 
 

@@ -17,7 +17,7 @@ from sim2real.stages.console import note, table
 from sim2real.stages.manifest import sha256
 
 ROUND_TRIP = "round_trip_delay"
-_SURE_S = 0.005
+SURE_S = 0.005
 """A round trip with a larger standard error is not identified [s]."""
 
 
@@ -163,6 +163,6 @@ def _round_trip(found: Fit, spread: Uncertainty, delays: list[str], truth: Mappi
         "high95": total + 1.96 * error,
         "lower": sum(parameters[n].low for n in delays),
         "upper": sum(parameters[n].high for n in delays),
-        "verdict": "accepted" if error < _SURE_S else "not identifiable",
+        "verdict": "accepted" if error < SURE_S else "not identifiable",
         "truth": truth.get(ROUND_TRIP),
     }

@@ -38,8 +38,8 @@ from sim2real.stages.truth import true_values
 _WINDOW_SPACING_S = 0.5
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 """Shares of the horizon at which prediction errors are listed."""
-_EDGE_S = 0.3
-"""What is left out at the start of a log where initial states are estimated: their estimate looks back [s]."""
+_EDGES_S = (0.3, 0.2)
+"""What is left out at either end of a log where initial states are estimated [s]."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         spread = uncertainty.from_linearised(found.problem, at := uncertainty.linearise(found.problem, found.z))
         check = identifiability.from_linearised(found.problem, at)
         seconds = time.monotonic() - begin
-        shifted = bool(uncertainty.time_shift(found.problem).any())
-        problem = Problem(model, logs.episodes, windows, config.settle_s + config.horizon_s, config, table)
+        shifted, problem = uncertainty.shifted_delays(found.problem), found.windows
         models = {"identified": found.values, **_baselines(found), "nominal": _nominal(model)}
         samples = prediction.samples(problem, models, config.settle_s)
         horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
@@ -160,7 +159,7 @@ def spans(logs: Logs, config: IdentifyConfig, length_s: float, spacing_s: float 
     """
     found: list[Span] = []
     for r, episode in enumerate(logs.episodes):
-        begin, end = _reach(episode, config)
+        begin, end = reach(episode, config)
         split = begin if r >= logs.fitted else begin + (1.0 - config.held_out) * (end - begin)
         last = end - length_s + 1e-6
         step_s = config.spacing_s or length_s
@@ -177,11 +176,11 @@ def spans(logs: Logs, config: IdentifyConfig, length_s: float, spacing_s: float 
     return found
 
 
-def _reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
+def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
     """Return from when to when a log can be cut into segments [s]."""
     if config.initial_state != "free":
         return 0.0, episode.duration_s
-    return _EDGE_S, episode.duration_s - 0.2
+    return _EDGES_S[0], episode.duration_s - _EDGES_S[1]
 
 
 def _fit(
@@ -192,9 +191,8 @@ def _fit(
     table: ParameterTable,
     told: Told | None = None,
 ) -> Fit:
-    fitted = [s for s in windows if s.fitted]
     longer = [s for s in spans(logs, config, config.long_s) if s.fitted] if config.long_s else []
-    return fit(model, logs.episodes, fitted, config.settle_s + config.horizon_s, config, table, longer, told)
+    return fit(model, logs.episodes, windows, config.settle_s + config.horizon_s, config, table, longer, told)
 
 
 def _baselines(found: Fit) -> dict[str, Any]:
@@ -224,13 +222,13 @@ def _free_runs(
     """Simulate what is held out of each log in one go; return its errors and its columns."""
     held_out = []
     for r, episode in enumerate(logs.episodes):
-        begin, end = _reach(episode, config)
+        begin, end = reach(episode, config)
         split = begin if r >= logs.fitted else begin + (1.0 - config.held_out) * (end - begin)
         if end - split > config.settle_s + config.horizon_s:
             held_out.append(Span(r, split, False))
     if not held_out or not config.free_run_s:
         return [], {}
-    length_s = min(config.free_run_s, min(_reach(logs.episodes[s.recording], config)[1] - s.begin_s for s in held_out))
+    length_s = min(config.free_run_s, min(reach(logs.episodes[s.recording], config)[1] - s.begin_s for s in held_out))
     problem = Problem(model, logs.episodes, held_out, length_s, config, table)
     columns = prediction.samples(problem, models, config.settle_s)
     return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns

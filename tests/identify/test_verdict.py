@@ -9,6 +9,7 @@ from sim2real.identify.identifiability import Check
 from sim2real.identify.verdict import judge
 
 NAMES = ("gain", "sensor_delay", "actuator_delay")
+DELAYS = NAMES[1:]
 
 
 def rows(identified, nominal, horizon_s=1.0, held_out=True, **others):
@@ -28,7 +29,7 @@ def check(*groups):
 
 
 def test_accepted():
-    found = judge(rows(0.1, 1.0, hold=0.4), spread(), NAMES, check(), shifted=True)
+    found = judge(rows(0.1, 1.0, hold=0.4), spread(), NAMES, check(), shifted=DELAYS)
     assert found.status == "accepted"
     assert len(found.reasons) == 1
     assert "1 s ahead on held-out data" in found.reasons[0]
@@ -38,7 +39,7 @@ def test_accepted():
 
 @pytest.mark.parametrize("own", [0.96, 1.0, 3.0, np.nan, np.inf])
 def test_no_improvement(own):
-    found = judge(rows(own, 5.0, hold=1.0) if own < 4 else rows(own, 1.0), spread(), NAMES, check(), shifted=False)
+    found = judge(rows(own, 5.0, hold=1.0) if own < 4 else rows(own, 1.0), spread(), NAMES, check(), shifted=())
     assert found.status == "no improvement on held-out data"
     assert found.reasons[0].startswith("1 s ahead on held-out data it is no better than: ")
     assert ("hold" if own < 4 else "nominal") in found.reasons[0]
@@ -46,58 +47,58 @@ def test_no_improvement(own):
 
 @pytest.mark.parametrize("diverged", [np.nan, np.inf])
 def test_a_baseline_that_diverges_is_no_better(diverged):
-    assert judge(rows(0.1, diverged), spread(), NAMES, check(), shifted=False).status == "accepted"
+    assert judge(rows(0.1, diverged), spread(), NAMES, check(), shifted=()).status == "accepted"
 
 
 def test_the_longest_horizon_on_held_out_data_decides():
     prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0) + rows(9.0, 1.0, 2.0, held_out=False)
-    assert judge(prediction, spread(), NAMES, check(), shifted=False).status == "accepted"
+    assert judge(prediction, spread(), NAMES, check(), shifted=()).status == "accepted"
     nothing = [{"model": "identified", "horizon_s": 3.0, "held_out": True, "rmse": None}]
-    assert judge(prediction + nothing, spread(), NAMES, check(), shifted=False).status == "accepted"
+    assert judge(prediction + nothing, spread(), NAMES, check(), shifted=()).status == "accepted"
 
 
 def test_hit_a_bound():
-    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(), shifted=False)
+    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(), shifted=())
     assert found.status == "hit a bound"
     assert any(r.startswith("at a bound: gain; widen it with --bounds") for r in found.reasons)
 
 
 def test_not_identifiable():
-    found = judge(rows(0.1, 1.0), spread(), NAMES, check(("gain",)), shifted=False)
+    found = judge(rows(0.1, 1.0), spread(), NAMES, check(("gain",)), shifted=())
     assert found.status == "not identifiable"
     assert "nothing in this data determines gain: excite it, fix it or give it a prior" in found.reasons
 
 
 def test_delays_of_which_the_sum_counts_are_as_they_should_be():
     group = check(("sensor_delay", "actuator_delay"))
-    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=True).status == "accepted"
-    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=False).status == "not identifiable"
+    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=DELAYS).status == "accepted"
+    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=()).status == "not identifiable"
     mixed = check(("gain", "actuator_delay"))
-    assert judge(rows(0.1, 1.0), spread(), NAMES, mixed, shifted=True).status == "not identifiable"
+    assert judge(rows(0.1, 1.0), spread(), NAMES, mixed, shifted=DELAYS).status == "not identifiable"
 
 
 def test_the_first_that_applies_is_the_status_and_all_are_reasons():
     found = judge(rows(1.0, 1.0), spread("at a bound", "accepted", "accepted", misfit=7.0), NAMES,
-                  check(("gain",)), shifted=False)  # fmt: skip
+                  check(("gain",)), shifted=())  # fmt: skip
     assert found.status == "no improvement on held-out data"
     assert len(found.reasons) == 4
     assert "residuals are 7 times the measurement's deviation" in found.reasons[-1]
-    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(("gain",)), shifted=False)
+    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(("gain",)), shifted=())
     assert found.status == "hit a bound"
 
 
 def test_nothing_held_out_is_told():
-    found = judge(rows(0.1, 1.0, held_out=False), spread(), NAMES, check(), shifted=False)
+    found = judge(rows(0.1, 1.0, held_out=False), spread(), NAMES, check(), shifted=())
     assert found.reasons == ("nothing was held out: how well it predicts is not known",)
 
 
 def test_a_delay_that_is_not_needed_is_no_failure():
     prediction = rows(0.1, 1.0, **{"no delay": 0.1})
-    found = judge(prediction, spread(), NAMES, check(), shifted=True)
+    found = judge(prediction, spread(), NAMES, check(), shifted=DELAYS)
     assert found.status == "accepted"
     assert any("does not need one" in r for r in found.reasons)
 
 
 def test_extrapolation_is_said():
-    found = judge(rows(0.1, 1.0), spread(), NAMES, check(), True, ["held-out data extrapolates: kp"])
+    found = judge(rows(0.1, 1.0), spread(), NAMES, check(), DELAYS, ["held-out data extrapolates: kp"])
     assert "held-out data extrapolates: kp" in found.reasons
