@@ -14,6 +14,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.bus import BusConfig
+from sim2real.hardware.drive import VoltageDrive
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
@@ -65,7 +66,7 @@ class Session:
                 opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
             gate = GateConfig(limits.limit, limits.slew_per_s, limits.command_timeout_s, limits.max_speed_rad_s)
             bus = BusConfig(port, BAUD_RATE, watchdog_s=limits.servo_watchdog_s)
-            self.rig = opening.enter_context(ServoRig(bus, gate, [SERVO_ID], SUPPLY_V))
+            self.rig = opening.enter_context(ServoRig(bus, gate, [SERVO_ID], VoltageDrive(SUPPLY_V)))
             self._stack = opening.pop_all()
 
     def __enter__(self) -> Self:

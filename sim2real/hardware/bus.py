@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-from dynamixel_sdk.group_sync_read import GroupSyncRead
 from dynamixel_sdk.group_sync_write import GroupSyncWrite
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
@@ -74,7 +73,7 @@ class ServoBus:
         self.config = config
         self._link = BusLink(config)
         self._ids: tuple[int, ...] = ()
-        self._readers: dict[tuple[int, ...], GroupSyncRead] = {}
+        self._armed = False
         self._torque_off_packet = b""
         self._halted = False
         atexit.register(self.close)
@@ -162,22 +161,19 @@ class ServoBus:
         """
         if on and self._halted:
             raise SafetyStop("torque stays off: the bus has been made safe", hint="open the bus again")
+        self._armed = False
         for servo_id in self._ids:
             if on:
                 self.write(servo_id, reg.BUS_WATCHDOG, 0)
                 self._rest_goal(servo_id)
             self.write(servo_id, reg.TORQUE_ENABLE, int(on))
             self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count if on else 0)
+        self._armed = on
 
     def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
         """Read position, velocity and load of some servos (default: all) in one transaction."""
         ids = self._ids if ids is None else tuple(ids)
-        if not ids:
-            raise UsageError("there are no servos to read", hint="call handshake first")
-        if len(ids) == 1:
-            data, transaction = self._link.read_bytes(ids[0], _STATE_ADDRESS, _STATE_BYTES, "read of the state")
-        else:
-            data, transaction = self._read_states(ids)
+        data, transaction = self._read_each(ids, _STATE_ADDRESS, _STATE_BYTES, "read of the state")
         counts = np.frombuffer(data, _STATE_DTYPE)
         return StateReading(
             position_rad=counts["position"] * reg.RAD_PER_COUNT,
@@ -217,13 +213,23 @@ class ServoBus:
         return self._link.write(servo_id, register, value)
 
     def check(self) -> None:
-        """Raise SafetyStop if a servo's watchdog has tripped or it reports a hardware error; for a slow loop.
+        """Raise SafetyStop if a servo's watchdog has tripped, or it restarted or has a hardware error; for a slow loop.
 
-        Goals written to several servos at once are not confirmed, so that nothing else would tell.
+        Goals written to several servos at once are not confirmed, so that nothing else would tell of the first two.
         """
-        for servo_id in self._ids:
-            if self.read(servo_id, reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+        armed = self._armed
+        data, _ = self._read_each(self._ids, reg.BUS_WATCHDOG.address, reg.BUS_WATCHDOG.size, "read of bus_watchdog")
+        for servo_id, byte in zip(self._ids, data, strict=True):
+            count = reg.BUS_WATCHDOG.decode(bytes((byte,)))
+            if count == reg.WATCHDOG_TRIPPED:
                 raise SafetyStop(*watchdog_message(servo_id))
+            # Before and after: another thread may be switching the torque, which changes the register.
+            if armed and self._armed and count != self.config.watchdog_count:
+                raise SafetyStop(
+                    f"servo {servo_id} has lost its settings: its bus watchdog holds {count}, "
+                    f"not {self.config.watchdog_count}",
+                    hint="did its supply fail for a moment? its torque is off now",
+                )
 
     def make_safe(self) -> None:
         """Take the torque off without waiting for anything or anyone: for signal handlers and watchdog threads.
@@ -290,19 +296,10 @@ class ServoBus:
             group.addParam(servo_id, list(register.encode(to_count(goal))))
         return self._link.exchange(lambda: ((), group.txPacket(), 0), f"write of {register.name}")[2]
 
-    def _read_states(self, ids: tuple[int, ...]) -> tuple[bytes, Transaction]:
-        """Return the state blocks of several servos, one behind the other."""
-        if ids not in self._readers:
-            self._readers[ids] = GroupSyncRead(self._link.port, self._link.packets, _STATE_ADDRESS, _STATE_BYTES)
-            for servo_id in ids:
-                self._readers[ids].addParam(servo_id)
-        group = self._readers[ids]
-
-        def attempt() -> tuple[bytes, int, int]:
-            result = group.txRxPacket()
-            return b"".join(bytes(group.data_dict[servo_id]) for servo_id in ids), result, 0
-
-        data, _, transaction = self._link.exchange(
-            attempt, f"read of the state of servos {ids}", len(ids) * _STATE_BYTES
-        )
-        return data, transaction
+    def _read_each(self, ids: tuple[int, ...], address: int, length: int, what: str) -> tuple[bytes, Transaction]:
+        """Return blocks of the servos' control tables, one behind the other."""
+        if not ids:
+            raise UsageError("there are no servos to read", hint="call handshake first")
+        if len(ids) == 1:
+            return self._link.read_bytes(ids[0], address, length, what)
+        return self._link.read_bytes_of(ids, address, length, what)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -15,23 +17,29 @@ class GateConfig:
     """What a command may be.
 
     Args:
-        limit: Largest magnitude, or (low, high), in the command's unit.
+        limit: Largest magnitude, or (low, high), in the command's unit; low and high: for all, or one per actuator.
         slew_per_s: Largest change per second; None: any.
-        command_timeout_s: A command older than this becomes zero.
+        command_timeout_s: A command older than this is stale.
         max_speed_rad_s: A measured speed beyond this stops the robot; None: not watched.
         node: Name of the actuator's node, for messages.
+        stale: What a stale command becomes: zero, or (hold) what was allowed last, where zero is a place to jump to.
     """
 
-    limit: float | tuple[float, float] = 1.0
+    limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
     slew_per_s: float | None = None
     command_timeout_s: float = 0.1
     max_speed_rad_s: float | None = None
     node: str = "actuator"
+    stale: Literal["zero", "hold"] = "zero"
 
     def __post_init__(self) -> None:
         """Refuse limits that let nothing through, or keep nothing out."""
         low, high = self.range
-        if not low <= 0.0 <= high:
+        if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
+        if not np.all(low <= high):
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
+        if self.stale == "zero" and not np.all((low <= 0.0) & (high >= 0.0)):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
         for name in ("slew_per_s", "command_timeout_s", "max_speed_rad_s"):
             value = getattr(self, name)
@@ -39,9 +47,10 @@ class GateConfig:
                 raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
 
     @property
-    def range(self) -> tuple[float, float]:
-        """The lowest and the highest command."""
-        return self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
+    def range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest command, each of shape () or (n,)."""
+        low, high = self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
+        return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
 
 @dataclass
@@ -67,27 +76,47 @@ class SafetyGate:
     Once it has stopped the robot it stays stopped: every later call raises the same SafetyStop, until `reset`.
 
     Args:
-        config: The limits, the same for every actuator.
+        config: The limits.
     """
 
     def __init__(self, config: GateConfig) -> None:
         self.config = config
+        self._low, self._high = config.range
         self.reset()
 
-    def reset(self) -> None:
-        """Start again: counts and slew limit at zero, no longer stopped."""
+    def reset(self, start: np.ndarray | None = None) -> None:
+        """Start again: counts at zero, no longer stopped.
+
+        Args:
+            start: (n,) The command that the robot obeys now, where the slew limit starts; it need not lie within the
+                limits. None: zero, which a gate that holds does not accept.
+        """
         self.counts = GateCounts()
-        self._last: np.ndarray | None = None
-        self._last_s = 0.0
+        self._last = None if start is None else np.array(start, dtype=np.float64, ndmin=1)
+        self._last_s: float | None = None
         self._stop: SafetyStop | None = None
+        if self._last is not None:
+            self._require_finite("start", self._last)
+            self._require_shape(self._last)
+
+    @property
+    def fallback(self) -> np.ndarray:
+        """What a stale command becomes now, (n,) float64; needs a `start` or a command that was allowed.
+
+        Raises:
+            UsageError: There is neither.
+        """
+        if self._last is None:
+            raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
+        return np.zeros_like(self._last) if self.config.stale == "zero" else self._last.copy()
 
     def apply(
         self, command: np.ndarray, age_s: float, now_s: float, speed_rad_s: np.ndarray | float | None = None
     ) -> np.ndarray:
         """Return the command that may be sent.
 
-        A stale command becomes zero at once, whatever the slew limit: zero is the safe command. The slew limit starts
-        from zero at the first call.
+        A stale command becomes zero at once, whatever the slew limit, if zero is the safe command; else the last one
+        stays. The slew limit starts from `reset`'s start at the first call.
 
         Args:
             command: (n,) What the policy wants.
@@ -100,15 +129,20 @@ class SafetyGate:
 
         Raises:
             SafetyStop: A value is not finite, or a speed is beyond its limit or not finite.
+            UsageError: There are more or fewer commands than limits, or nothing to hold.
         """
         if self._stop is not None:
             raise self._stop
         wanted = np.array(command, dtype=np.float64, ndmin=1)
         self._require_finite("command", wanted)
         self._require_slow(speed_rad_s)
+        if self._last is None and self.config.stale == "zero":
+            self._last = np.zeros_like(wanted)
+        fallback = self.fallback
+        self._require_shape(wanted)
         if not age_s <= self.config.command_timeout_s:
             self.counts.stale += 1
-            allowed = np.zeros_like(wanted)
+            allowed = fallback
         else:
             allowed = self._slew(self._clamp(wanted), now_s)
         self._last, self._last_s = allowed, now_s
@@ -116,18 +150,28 @@ class SafetyGate:
         return allowed.copy()
 
     def _clamp(self, wanted: np.ndarray) -> np.ndarray:
-        clamped = np.clip(wanted, *self.config.range)
+        clamped = np.clip(wanted, self._low, self._high)
         self.counts.clamped += bool(np.any(clamped != wanted))
         return clamped
 
     def _slew(self, wanted: np.ndarray, now_s: float) -> np.ndarray:
-        if self.config.slew_per_s is None:
+        if self.config.slew_per_s is None or self._last is None:
             return wanted
-        last, last_s = (np.zeros_like(wanted), now_s) if self._last is None else (self._last, self._last_s)
-        largest = self.config.slew_per_s * max(0.0, now_s - last_s)
-        slewed = np.clip(wanted, last - largest, last + largest)
+        elapsed_s = 0.0 if self._last_s is None else max(0.0, now_s - self._last_s)
+        if self.config.stale == "hold":
+            # The robot stood still while nothing came: that time earns no leap.
+            elapsed_s = min(elapsed_s, self.config.command_timeout_s)
+        largest = self.config.slew_per_s * elapsed_s
+        slewed = np.clip(wanted, self._last - largest, self._last + largest)
         self.counts.slewed += bool(np.any(slewed != wanted))
         return slewed
+
+    def _require_shape(self, values: np.ndarray) -> None:
+        for other in (self._low, self._high, self._last):
+            if other is not None and other.ndim and other.shape != values.shape:
+                raise UsageError(
+                    f"gate of {self.config.node!r}: commands of shape {values.shape}, limits or start of {other.shape}"
+                )
 
     def _require_finite(self, what: str, values: np.ndarray) -> None:
         bad = np.flatnonzero(~np.isfinite(values))

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 from sim2real.errors import UsageError
 from sim2real.hardware.truth import Kind, TruthLog
@@ -58,6 +58,25 @@ class Plant(Protocol):
         ...
 
 
+@runtime_checkable
+class ConfigurablePlant(Plant, Protocol):
+    """A plant that wants to know how its servos' position controllers are set."""
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's position controller from the plant's present time on.
+
+        It is called for every servo before time goes on from 0, with the power-up values, and when one of them changes:
+        by a write, at the time that it is complete, or by a reboot.
+
+        Args:
+            servo_id: One of `servo_ids`.
+            p_gain: Position P Gain, in the register's counts.
+            d_gain: Position D Gain, in the register's counts.
+            profile_velocity_rad_s: Speed at which the setpoint follows the goal; inf: it is the goal.
+        """
+        ...
+
+
 class PlantClock:
     """Steps a plant on a fixed grid, applies commands at grid points, and remembers what could be measured.
 
@@ -94,6 +113,11 @@ class PlantClock:
             self._index += 1
             self._plant.advance(self._index * self._step_ns * 1e-9)
             self._remember()
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's position controller now, if the plant wants to know."""
+        if isinstance(self._plant, ConfigurablePlant):
+            self._plant.configure(servo_id, p_gain, d_gain, profile_velocity_rad_s)
 
     def schedule(self, t_ns: int, t_host_ns: int, servo_id: int, mode: int, goal: float) -> None:
         """Plan a command for the grid point nearest to `t_ns`; commands of one point apply in the order given."""

@@ -20,6 +20,7 @@ WATCHDOG_UNIT_S: Final = 0.020
 WATCHDOG_MAX_COUNT: Final = 127
 WATCHDOG_TRIPPED: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
+DRIVE_REVERSED: Final = 1  # bit of Drive Mode; the others: profiles by time instead of speed, goals switch torque on
 
 MODEL_NAMES: Final[dict[int, str]] = {
     1020: "XM430-W350",
@@ -101,6 +102,7 @@ FIRMWARE_VERSION = Register("firmware_version", 6, 1, default=47, eeprom=True)
 ID = _eeprom("id", 7, 1, 0, 252, 1)
 BAUD_RATE = _eeprom("baud_rate", 8, 1, 0, 7, 3)
 RETURN_DELAY_TIME = _eeprom("return_delay_time", 9, 1, 0, 254, 250)
+DRIVE_MODE = _eeprom("drive_mode", 10, 1, 0, 13, 0)
 OPERATING_MODE = _eeprom("operating_mode", 11, 1, 0, 16, 3)
 HOMING_OFFSET = _eeprom("homing_offset", 20, 4, -1_044_479, 1_044_479, 0, signed=True)
 PWM_LIMIT = _eeprom("pwm_limit", 36, 2, 0, PWM_FULL_SCALE, PWM_FULL_SCALE)

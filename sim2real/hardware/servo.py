@@ -11,7 +11,7 @@ from sim2real.hardware.registers import OperatingMode, Register
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5
-_FIXED: Final = (reg.ID, reg.BAUD_RATE)
+_FIXED: Final = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
 _MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS)
 
 
@@ -69,6 +69,12 @@ class Servo:
             return mode, reg.rad_s_from_count(self.get(reg.GOAL_VELOCITY))
         goal_count = self.get(reg.GOAL_POSITION) - self.get(reg.HOMING_OFFSET)
         return OperatingMode.POSITION, reg.rad_from_count(goal_count)
+
+    def controller(self) -> tuple[int, int, float]:
+        """Return P gain and D gain of the position controller, in counts, and its profile velocity in rad/s."""
+        count = self.get(reg.PROFILE_VELOCITY)
+        profile_velocity_rad_s = reg.rad_s_from_count(count) if count else math.inf
+        return self.get(reg.POSITION_P_GAIN), self.get(reg.POSITION_D_GAIN), profile_velocity_rad_s
 
     def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
         """Set the Present registers from a measurement of the plant.
@@ -178,7 +184,7 @@ class Servo:
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
         if register in _FIXED and value != self.get(register):
-            return StatusError.RESULT_FAIL  # this emulation has no bus to move to
+            return StatusError.RESULT_FAIL  # this emulation has no bus to move to, and knows one drive mode
         if register == reg.TORQUE_ENABLE and value and self.alert:
             return StatusError.RESULT_FAIL  # after a shutdown only a reboot lets torque on again
         if not register.minimum <= value <= register.maximum:

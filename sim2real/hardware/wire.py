@@ -12,7 +12,7 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from sim2real.errors import UsageError
 from sim2real.hardware import registers as reg
@@ -79,12 +79,17 @@ class EmulatorConfig:
                 raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
 
 
-class _Request(NamedTuple):
-    """An instruction, when it was complete on the wire, and when its last bytes had reached the emulator."""
+@dataclass
+class _Request:
+    """An instruction, when it was complete on the wire, and when its last bytes had reached the emulator.
+
+    What it commands several servos takes effect at one instant: the delay is drawn once, when it is first needed.
+    """
 
     packet: Packet
     t_ns: int
     t_host_ns: int
+    actuation_ns: int | None = None
 
 
 class EmulatedBus:
@@ -121,6 +126,9 @@ class EmulatedBus:
             i: Servo(i, config.model_number, config.return_delay_us, config.encoder_counts)
             for i in sorted(plant.servo_ids)
         }
+        self._controllers: dict[int, tuple[int, int, float]] = {}
+        for servo in self.servos.values():
+            self._configure(servo)
         self._last_effect_ns = dict.fromkeys(self.servos, 0)
         self._parser = Parser()
         self._wire_free_ns = start_ns
@@ -268,6 +276,7 @@ class EmulatedBus:
         for servo in self._targets(request):
             self._measure(servo, request.t_ns)
             error, moves = servo.action()
+            self._configure(servo)
             if moves:
                 self._actuate(servo, request)
             self._acknowledge(servo, request, error)
@@ -276,18 +285,29 @@ class EmulatedBus:
         for servo in self._targets(request):
             self._acknowledge(servo, request, StatusError.NONE)
             servo.reboot()
+            self._configure(servo)
             self._actuate(servo, request)
 
     def _write_servo(self, servo: Servo, request: _Request, address: int, data: bytes) -> StatusError:
         self._measure(servo, request.t_ns)
         error, moves = servo.write(address, data)
+        self._configure(servo)
         if moves:
             self._actuate(servo, request)
         return error
 
+    def _configure(self, servo: Servo) -> None:
+        """Tell the plant of a position controller that is not as it was told before."""
+        controller = servo.controller()
+        if self._controllers.get(servo.servo_id) != controller:
+            self._controllers[servo.servo_id] = controller
+            self._clock.configure(servo.servo_id, *controller)
+
     def _actuate(self, servo: Servo, request: _Request) -> None:
         config = self._config
-        planned_ns = request.t_ns + self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
+        if request.actuation_ns is None:
+            request.actuation_ns = self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
+        planned_ns = request.t_ns + request.actuation_ns
         # A later command never overtakes an earlier one.
         planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
         self._last_effect_ns[servo.servo_id] = planned_ns

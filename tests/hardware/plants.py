@@ -51,6 +51,63 @@ class FirstOrder:
         return {"time_constant_s": self._time_constant_s, "top_speed_rad_s": self._top_speed_rad_s}
 
 
+class Joints:
+    """Position servos whose encoders show 2048 at 0 rad; they start elsewhere and stay where they are without torque.
+
+    A setpoint follows the goal at the profile velocity, and the joint the setpoint, the faster the higher the gain. It
+    keeps all that it was told of its controllers, in `told`.
+    """
+
+    CENTRE_RAD = math.pi
+    RATE_PER_GAIN = 0.025
+
+    def __init__(self, ids=(1, 2, 3), start_rad=(0.5, -0.8, 0.3)):
+        self.servo_ids = tuple(ids)
+        self._steps = 0
+        self._q = dict(zip(ids, start_rad, strict=True))
+        self._dq = dict.fromkeys(ids, 0.0)
+        self._setpoint = dict(self._q)
+        self._command = dict.fromkeys(ids, (0, 0.0))
+        self.told = []
+        self._controller = {}
+
+    def configure(self, servo_id, p_gain, d_gain, profile_velocity_rad_s):
+        self.told.append((self._steps * STEP_S, servo_id, p_gain, d_gain, profile_velocity_rad_s))
+        self._controller[servo_id] = (p_gain, profile_velocity_rad_s)
+
+    def advance(self, t_s):
+        for _ in range(round(t_s / STEP_S) - self._steps):
+            self._steps += 1
+            for i in self.servo_ids:
+                self._dq[i] = self._speed(i)
+                self._q[i] += STEP_S * self._dq[i]
+
+    def _speed(self, i):
+        mode, goal = self._command[i]
+        if mode != POSITION:
+            self._setpoint[i] = self._q[i]
+            return 0.0
+        p_gain, profile_rad_s = self._controller[i]
+        error = goal - self.CENTRE_RAD - self._setpoint[i]
+        self._setpoint[i] += math.copysign(min(abs(error), STEP_S * profile_rad_s), error)
+        return self.RATE_PER_GAIN * p_gain * (self._setpoint[i] - self._q[i])
+
+    def command(self, servo_id, mode, goal):
+        self._command[servo_id] = (mode, goal)
+
+    def measure(self, servo_id):
+        return self._q[servo_id] + self.CENTRE_RAD, self._dq[servo_id], 0.0
+
+    def state(self):
+        gains = {i: p_gain for i, (p_gain, _) in self._controller.items()}
+        profiles = {i: profile_rad_s for i, (_, profile_rad_s) in self._controller.items()}
+        rows = {"q": self._q, "dq": self._dq, "gain": gains, "profile": profiles}
+        return {f"{name}{i}": row.get(i, 0.0) for name, row in rows.items() for i in self.servo_ids}
+
+    def truth(self):
+        return {}
+
+
 class Ramp:
     """Position is 0.4 rad/s times time, whatever is commanded: a read tells when it was sampled."""
 

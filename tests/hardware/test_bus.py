@@ -168,6 +168,8 @@ def test_a_plant_that_raises_is_a_lost_bus_and_leaves_its_message(start_robot, o
 def test_reading_needs_servos(start_robot):
     with ServoBus(BusConfig(start_robot().port)) as bus, pytest.raises(UsageError, match="handshake"):
         bus.read_state()
+    with ServoBus(BusConfig(start_robot().port)) as bus, pytest.raises(UsageError, match="handshake"):
+        bus.check()
 
 
 def test_configurations_that_make_no_sense():
@@ -252,6 +254,37 @@ def test_overload_stops_with_its_name(start_robot, open_bus):
     time.sleep(0.5)
     with pytest.raises(SafetyStop, match="servo 1 has stopped itself: overload"):
         bus.read_state()
+
+
+def test_an_overload_is_named_among_several_servos(start_robot, open_bus):
+    bus = open_bus(start_robot(ids=[1, 2], config=EmulatorConfig(overload_after_s=0.5)), (1, 2), PWM)
+    bus.write_goal_pwm({1: 0.1, 2: 0.1})
+    time.sleep(0.5)
+    bus.write_goal_pwm({1: 0.1, 2: 0.1})  # not confirmed
+    with pytest.raises(SafetyStop, match="servo 1 has stopped itself: overload"):
+        bus.read_state()
+    with pytest.raises(SafetyStop, match="servo 2 has stopped itself: overload"):
+        bus.read_state([2])
+
+
+def test_one_lost_answer_of_several_is_asked_for_again(start_robot, open_bus):
+    robot = start_robot("Joints", EmulatorConfig(reply_loss=0.1, corrupt=0.05, seed=4))
+    bus = open_bus(robot, (1, 2, 3))
+    for _ in range(40):
+        assert bus.read_state().position_rad - np.pi == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
+        assert bus.read_state((3, 1)).position_rad - np.pi == pytest.approx([0.3, 0.5], abs=reg.RAD_PER_COUNT)
+    assert bus.retries == bus.lost_replies >= 10
+
+
+def test_a_servo_that_restarted_is_noticed(start_robot, open_bus):
+    bus = open_bus(start_robot("Joints"), (1, 2, 3), OperatingMode.POSITION)
+    bus.check()
+    with bus._link.hold():
+        bus._link.packets.reboot(bus._link.port, 2)
+    with pytest.raises(SafetyStop, match="servo 2 has lost its settings: its bus watchdog holds 0, not 50"):
+        bus.check()
+    bus.torque(False)
+    bus.check()
 
 
 def test_close_takes_torque_off_through_lost_replies(start_robot, open_bus):

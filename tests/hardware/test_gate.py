@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.gate import GateConfig, SafetyGate
@@ -80,8 +82,88 @@ def test_output_is_the_callers_own():
         {"slew_per_s": 0.0},
         {"command_timeout_s": 0.0},
         {"max_speed_rad_s": -1.0},
+        {"limit": ([-1.0, 0.1], 1.0)},
+        {"limit": ([-1.0, -1.0], [1.0, 1.0, 1.0])},
+        {"limit": ([-1.0, float("nan")], 1.0), "stale": "hold"},
+        {"limit": (0.5, 0.1), "stale": "hold"},
     ],
 )
 def test_limits_that_make_no_sense(bad):
     with pytest.raises(UsageError, match=next(iter(bad))):
         SafetyGate(GateConfig(**bad))
+
+
+def test_limits_per_actuator():
+    gate = SafetyGate(GateConfig(limit=([-1.0, -0.2], np.array([0.5, 2.0]))))
+    assert gate.apply(np.array([3.0, 3.0]), 0.0, 0.0).tolist() == [0.5, 2.0]
+    assert gate.apply(np.array([-3.0, -3.0]), 0.0, 0.0).tolist() == [-1.0, -0.2]
+    assert SafetyGate(GateConfig(limit=([-1.0, -0.2], 0.1))).apply(np.ones(2), 0.0, 0.0).tolist() == [0.1, 0.1]
+
+
+def holding(start, **config):
+    gate = SafetyGate(GateConfig(**{"limit": (0.2, 1.0), "stale": "hold", **config}))
+    gate.reset(np.array(start))
+    return gate
+
+
+def test_another_number_of_commands_than_of_limits_is_refused():
+    with pytest.raises(UsageError, match=r"shape \(1,\), limits or start of \(2,\)"):
+        SafetyGate(GateConfig(limit=([-1.0, -1.0], 1.0))).apply(np.zeros(1), 0.0, 0.0)
+    with pytest.raises(UsageError, match="shape"):
+        holding([0.5, 0.5]).apply(np.zeros(1), 0.0, 0.0)
+    with pytest.raises(UsageError, match="shape"):
+        holding([0.5, 0.5], limit=([0.0] * 3, 1.0))
+
+
+def test_a_gate_that_holds_must_know_where_it_starts():
+    with pytest.raises(UsageError, match=r"(?s)nothing to hold.*reset\(start\)"):
+        SafetyGate(GateConfig(stale="hold")).apply(np.zeros(1), 0.0, 0.0)
+    with pytest.raises(SafetyStop, match=r"start\[0\] = nan"):
+        holding([float("nan")])
+
+
+def test_stale_holds_what_was_allowed_last_and_is_counted():
+    gate = holding([0.3])
+    assert gate.apply(np.array([0.9]), 0.2, 0.0) == 0.3
+    assert gate.apply(np.array([0.9]), 0.0, 0.0) == 0.9
+    assert gate.apply(np.array([0.4]), float("nan"), 1.0) == 0.9
+    assert gate.fallback == 0.9
+    assert gate.counts.stale == 2
+    with pytest.raises(SafetyStop):
+        gate.apply(np.array([float("nan")]), 1.0, 2.0)
+
+
+def test_time_without_commands_earns_a_held_position_no_leap():
+    gate = holding([0.2], slew_per_s=1.0, command_timeout_s=0.1)
+    gate.apply(np.array([1.0]), 0.0, 0.0)
+    assert gate.apply(np.array([1.0]), 0.0, 60.0) == pytest.approx(0.3)
+
+
+def test_a_start_outside_the_limits_slews_into_them():
+    gate = holding([3.0], slew_per_s=10.0)
+    outputs = [float(gate.apply(np.array([0.5]), 0.0, 0.1 * k)[0]) for k in range(5)]
+    assert outputs == pytest.approx([3.0, 2.0, 1.0, 0.5, 0.5])
+    gate = holding([3.0], slew_per_s=10.0)
+    assert gate.apply(np.array([0.5]), 1.0, 0.0) == 3.0
+
+
+@given(
+    start=st.floats(-3.0, 3.0),
+    calls=st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(0.0, 0.2), st.floats(-0.1, 1.0)), min_size=1, max_size=30),
+)
+def test_a_gate_that_holds_never_jumps_nor_moves_away_from_its_limits(start, calls):
+    low, high, slew_per_s, timeout_s = np.array([-0.5, 0.2]), np.array([1.0, 0.4]), 2.0, 0.1
+    gate = holding([start, 0.3], limit=(low, high), slew_per_s=slew_per_s, command_timeout_s=timeout_s)
+    last, now_s = np.array([start, 0.3]), 5.0
+    for index, (wanted, age_s, elapsed_s) in enumerate(calls):
+        now_s += elapsed_s
+        allowed = gate.apply(np.array([wanted, -wanted]), age_s, now_s)
+        reach = 0.0 if index == 0 or age_s > timeout_s else slew_per_s * min(max(elapsed_s, 0.0), timeout_s)
+        assert np.all(np.abs(allowed - last) <= reach + 1e-9)
+
+        def outside(command):
+            return np.maximum(np.maximum(low - command, command - high), 0.0)
+
+        assert np.all(outside(allowed) <= outside(last))
+        last = allowed
+    assert gate.counts.passed == len(calls)

@@ -9,6 +9,7 @@ import pytest
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware import registers as reg
 from sim2real.hardware.bus import BusConfig
+from sim2real.hardware.drive import VoltageDrive
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.rig import ServoRig
@@ -28,7 +29,8 @@ def open_rig(start_robot):
         robot = start_robot("FirstOrder", config)
         # Patient with lost answers, for the machine may be busy; not with the host itself.
         bus = BusConfig(robot.port, max_consecutive_losses=50, max_silence_s=1.0, watchdog_s=watchdog_s)
-        rigs.append(ServoRig(bus, GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate}), [1], SUPPLY_V))
+        limits = GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate})
+        rigs.append(ServoRig(bus, limits, [1], VoltageDrive(SUPPLY_V)))
         return rigs[-1], robot
 
     yield open_
@@ -210,5 +212,5 @@ def test_waiting_until_still(open_rig):
 def test_a_bus_that_cannot_be_set_up_is_closed(start_robot):
     robot = start_robot("FirstOrder")
     with pytest.raises(HardwareLost, match="servo 7 does not answer"):
-        ServoRig(BusConfig(robot.port), GateConfig(), [7], SUPPLY_V)
-    ServoRig(BusConfig(robot.port), GateConfig(), [1], SUPPLY_V).close()
+        ServoRig(BusConfig(robot.port), GateConfig(), [7], VoltageDrive(SUPPLY_V))
+    ServoRig(BusConfig(robot.port), GateConfig(), [1], VoltageDrive(SUPPLY_V)).close()

@@ -41,6 +41,8 @@ def in_mode(servo, mode):
         (reg.GOAL_VELOCITY.address, (266).to_bytes(4, "little"), StatusError.DATA_LIMIT),
         (reg.ID.address, b"\x05", StatusError.RESULT_FAIL),
         (reg.ID.address, b"\x01", StatusError.NONE),
+        (reg.DRIVE_MODE.address, b"\x04", StatusError.RESULT_FAIL),  # not emulated
+        (reg.DRIVE_MODE.address, b"\x00", StatusError.NONE),
         (reg.LED.address, b"\x01", StatusError.NONE),
     ],
 )

@@ -1,10 +1,13 @@
 """Timing of the emulated bus in virtual time, where every instant can be told exactly."""
 
+import math
+
 import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
 from sim2real.hardware import registers as reg
+from sim2real.hardware.plant import ConfigurablePlant
 from sim2real.hardware.protocol import BROADCAST_ID, Instruction, build
 from sim2real.hardware.truth import Kind
 from sim2real.hardware.wire import EmulatorConfig
@@ -250,3 +253,90 @@ def test_truth_lateness_is_against_the_plan(make_bench):
 def test_configurations_that_make_no_sense(bad):
     with pytest.raises(UsageError, match=next(iter(bad))):
         EmulatorConfig(**bad)
+
+
+def write(register, value, servo_id=1):
+    return build(servo_id, Instruction.WRITE, register.address.to_bytes(2, "little") + register.encode(value))
+
+
+def sync_write(register, values):
+    head = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+    items = b"".join(bytes((servo_id,)) + register.encode(value) for servo_id, value in values.items())
+    return build(BROADCAST_ID, Instruction.SYNC_WRITE, head + items)
+
+
+def test_plants_are_told_of_their_controllers_when_those_change(make_bench):
+    bench = make_bench("Joints")
+    assert isinstance(bench.plant, ConfigurablePlant)
+    assert bench.plant.told == [(0.0, i, 640, 4000, math.inf) for i in (1, 2, 3)]
+    bench.plant.told.clear()
+    bench.send(50 * MS, sync_write(reg.POSITION_P_GAIN, {1: 800, 3: 900}))
+    bench.send(60 * MS, write(reg.POSITION_D_GAIN, 0))
+    bench.send(70 * MS, write(reg.PROFILE_VELOCITY, 100))
+    bench.send(80 * MS, write(reg.PROFILE_VELOCITY, 100), write(reg.LED, 1))
+    bench.send(90 * MS, build(1, Instruction.REG_WRITE, b"\x70\x00" + reg.PROFILE_VELOCITY.encode(50)))
+    bench.send(100 * MS, build(1, Instruction.ACTION))
+    bench.send(110 * MS, build(1, Instruction.REBOOT))
+    bench.run_until(120 * MS)
+    speed = reg.RAD_S_PER_COUNT
+    assert [told[1:] for told in bench.plant.told] == [
+        (1, 800, 4000, math.inf),
+        (3, 900, 4000, math.inf),
+        (1, 800, 0, math.inf),
+        (1, 800, 0, pytest.approx(100 * speed)),
+        (1, 800, 0, pytest.approx(50 * speed)),
+        (1, 640, 4000, math.inf),
+    ]
+    assert [told[0] for told in bench.plant.told] == pytest.approx([0.05, 0.05, 0.06, 0.07, 0.1, 0.11], abs=1e-3)
+
+
+def test_plants_need_not_care_for_controllers(make_bench):
+    bench = make_bench("FirstOrder")
+    assert not isinstance(bench.plant, ConfigurablePlant)
+    bench.send(50 * MS, write(reg.POSITION_P_GAIN, 1))
+    bench.run_until(60 * MS)
+    assert len(bench.sent) == 1
+
+
+def test_goals_of_one_instruction_take_effect_at_one_instant(make_bench):
+    bench = make_bench("Joints", EmulatorConfig(actuation_latency_s=0.01, actuation_jitter_s=0.008, seed=1))
+    bench.send(20 * MS, sync_write(reg.TORQUE_ENABLE, {1: 1, 2: 1, 3: 1}))
+    for i in range(20):
+        bench.send((50 + 20 * i) * MS, sync_write(reg.GOAL_POSITION, {1: 2048 + i, 2: 2000, 3: 2100}))
+    bench.run_until(500 * MS)
+    effects = bench.truth().of(Kind.EFFECT)
+    instants_ns = effects["t_ns"].reshape(21, 3)
+    assert np.all(instants_ns == instants_ns[:, :1])
+    assert np.ptp(instants_ns[1:, 0] - effects["t_host_ns"][3::3]) > 5 * MS
+
+
+def test_torque_on_in_position_mode_moves_nothing_until_a_goal_comes(make_bench):
+    bench = make_bench("Joints")
+    for servo_id in (1, 2, 3):
+        bench.send((10 + servo_id) * MS, write(reg.TORQUE_ENABLE, 1, servo_id))
+    bench.run_until(200 * MS)
+    assert [bench.plant.state()[f"q{i}"] for i in (1, 2, 3)] == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
+    bench.send(210 * MS, sync_write(reg.GOAL_POSITION, {1: 2048, 3: 3000}))
+    bench.run_until(1500 * MS)
+    counts = [0, -0.8 / reg.RAD_PER_COUNT, 3000 - 2048]
+    assert [bench.plant.state()[f"q{i}"] / reg.RAD_PER_COUNT for i in (1, 2, 3)] == pytest.approx(counts, abs=1)
+    bench.send(1510 * MS, sync_write(reg.TORQUE_ENABLE, {1: 0, 2: 0, 3: 0}))
+    bench.run_until(1520 * MS)
+    assert bench.truth().of(Kind.EFFECT)["values"][-3:, 0].tolist() == [0.0] * 3
+
+
+def test_watchdog_stops_position_servos_and_refuses_goals_without_a_word(make_bench):
+    bench = make_bench("Joints")
+    bench.send(10 * MS, sync_write(reg.TORQUE_ENABLE, {1: 1, 2: 1}))
+    bench.send(20 * MS, sync_write(reg.BUS_WATCHDOG, {1: 5, 2: 5}))
+    bench.send(30 * MS, sync_write(reg.GOAL_POSITION, {1: 0, 2: 4095}))
+    bench.run_until(200 * MS)
+    stopped = bench.plant.state()
+    assert [stopped["dq1"], stopped["dq2"]] == [0.0, 0.0]
+    bench.send(210 * MS, sync_write(reg.GOAL_POSITION, {1: 0, 2: 4095}))
+    bench.run_until(300 * MS)
+    assert bench.plant.state() == stopped
+    assert bench.sent == []
+    truth = bench.truth()
+    assert truth.of(Kind.WATCHDOG)["servo_id"].tolist() == [1, 2]
+    assert truth.of(Kind.EFFECT)["values"][-2:, :2].tolist() == [[16.0, 0.0]] * 2

@@ -1,0 +1,344 @@
+"""Three position servos on one bus, through the rig, on a real emulator."""
+
+import math
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.truth import Kind
+
+IDS = (1, 2, 3)
+START_RAD = np.array([0.5, -0.8, 0.3])
+DRIVE = PositionDrive(p_gain=800, profile_velocity_rad_s=20.0)
+GATE = {"limit": 1.5, "stale": "hold", "command_timeout_s": 0.1}
+COUNT_RAD = reg.RAD_PER_COUNT
+
+
+@pytest.fixture
+def open_arm(start_robot):
+    rigs = []
+
+    def open_(drive=DRIVE, watchdog_s=1.0, robot=None, **gate):
+        robot = robot or start_robot("Joints")
+        bus = BusConfig(robot.port, max_consecutive_losses=50, max_silence_s=1.0, watchdog_s=watchdog_s)
+        rigs.append(ServoRig(bus, GateConfig(**{**GATE, **gate}), IDS, drive))
+        return rigs[-1], robot
+
+    yield open_
+    for rig in rigs:
+        rig.close()
+
+
+def run(rig, goal, duration_s, period_s=0.02):
+    """Command joint angles and read for a while; return what was sent and the last reading."""
+    end = time.monotonic() + duration_s
+    sent = []
+    while not sent or time.monotonic() < end:
+        sent.append(rig.command(np.asarray(goal), 0.0, time.monotonic()))
+        reading = rig.measure()
+        time.sleep(period_s)
+    return np.array(sent), reading
+
+
+def effects(robot):
+    """Goals that reached the motors: servo, mode, joint angle or share of PWM."""
+    robot.stop()
+    rows = robot.truth().of(Kind.EFFECT)
+    modes, goals = rows["values"][:, 0], rows["values"][:, 1]
+    return rows, modes, np.where(modes == OperatingMode.POSITION, goals - math.pi, goals)
+
+
+def test_angles_count_from_the_joints_zero(open_arm):
+    rig, robot = open_arm()
+    assert rig.ids == IDS
+    assert rig.measure().position_rad == pytest.approx(START_RAD, abs=COUNT_RAD)
+    rig.close()
+    rig, _ = open_arm(PositionDrive(800, 20.0, zero_count=(2048, 1000, 3000)), robot=robot, limit=(-1.5, 1.0))
+    zeros = (np.array([2048, 1000, 3000]) - 2048) * COUNT_RAD
+    assert rig.measure().position_rad == pytest.approx(START_RAD - zeros, abs=COUNT_RAD)
+    rig.start()
+    _, reading = run(rig, [0.1, 0.2, -0.3], 0.8)
+    assert reading.position_rad == pytest.approx([0.1, 0.2, -0.3], abs=2 * COUNT_RAD)
+
+
+def test_torque_on_jumps_nowhere_and_holds_until_a_command_comes(open_arm):
+    rig, robot = open_arm()
+    rig.start()
+    for _ in range(20):
+        reading = rig.measure()
+        time.sleep(0.02)
+    assert reading.position_rad == pytest.approx(START_RAD, abs=1.5 * COUNT_RAD)
+    assert rig.timeouts == 0
+    rig.stop()
+    rows, modes, goals = effects(robot)
+    for servo_id, start_rad in zip(IDS, START_RAD, strict=True):
+        held = goals[(rows["servo_id"] == servo_id) & (modes == OperatingMode.POSITION)]
+        assert len(held) > 5
+        assert held == pytest.approx(start_rad, abs=COUNT_RAD)
+    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
+
+
+def test_goals_arrive_together_and_the_joints_with_them(open_arm):
+    rig, robot = open_arm()
+    rig.start()
+    _, reading = run(rig, [-0.4, 0.6, 1.0], 0.8)
+    assert reading.position_rad == pytest.approx([-0.4, 0.6, 1.0], abs=2 * COUNT_RAD)
+    rig.stop()
+    rows, modes, _ = effects(robot)
+    by_sync = rows[modes == OperatingMode.POSITION][3:]  # after one for each servo's torque
+    assert np.all(by_sync["t_ns"].reshape(-1, 3) == by_sync["t_ns"][::3, None])
+    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
+
+
+def test_gains_and_profile_reach_servos_and_plant(open_arm):
+    drive = PositionDrive(p_gain=1000, profile_velocity_rad_s=1.0, d_gain=7)
+    rig, robot = open_arm(drive)
+    registers = (reg.POSITION_P_GAIN, reg.POSITION_I_GAIN, reg.POSITION_D_GAIN, reg.PROFILE_ACCELERATION)
+    assert [rig.bus.read(2, register) for register in registers] == [1000, 0, 7, 0]
+    assert rig.bus.read(2, reg.OPERATING_MODE) == OperatingMode.POSITION
+    rig.start()
+    speeds = []
+    for _ in range(15):
+        _, reading = run(rig, [-0.5, -0.8, 1.3], 0.02)
+        speeds.append(reading.velocity_rad_s)
+    rig.close()
+    robot.stop()
+    _, states = robot.truth().states()
+    assert [states[f"gain{i}"][-1] for i in IDS] == [1000.0] * 3
+    assert [states[f"profile{i}"][-1] for i in IDS] == pytest.approx(
+        [round(1.0 / reg.RAD_S_PER_COUNT) * 0.02398] * 3, rel=1e-3
+    )
+    assert np.abs(speeds).max() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_rebooted_servo_gets_its_settings_again(open_arm):
+    rig, _ = open_arm()
+    with rig.bus._link.hold():
+        rig.bus._link.packets.reboot(rig.bus._link.port, 3)
+    assert rig.bus.read(3, reg.POSITION_P_GAIN) == 640
+    rig.start()
+    assert rig.bus.read(3, reg.POSITION_P_GAIN) == 800
+
+
+def test_a_setting_that_a_servo_does_not_keep_ends_it(open_arm, start_robot, monkeypatch):
+    write = ServoBus.write
+
+    def forgetful(self, servo_id, register, value):
+        if (servo_id, register) != (2, reg.POSITION_P_GAIN):
+            return write(self, servo_id, register, value)
+        return None
+
+    robot = start_robot("Joints")
+    with monkeypatch.context() as patched:
+        patched.setattr(ServoBus, "write", forgetful)
+        with pytest.raises(HardwareLost, match=r"servo 2 .* position_p_gain is 640 after 800 was written"):
+            open_arm(robot=robot)
+    open_arm(robot=robot)  # the port is free again
+
+
+def test_limits_per_joint_clamp(open_arm):
+    rig, _ = open_arm(limit=([-0.2, -1.0, -0.5], (1.0, 0.4, 0.6)))
+    rig.start()
+    sent, reading = run(rig, [-2.0, 2.0, 2.0], 0.8)
+    assert sent[-1].tolist() == [-0.2, 0.4, 0.6]
+    assert reading.position_rad == pytest.approx([-0.2, 0.4, 0.6], abs=2 * COUNT_RAD)
+    assert rig.gate.counts.clamped == len(sent)
+
+
+def test_slew_starts_where_the_joints_are_also_outside_the_limits(open_arm):
+    rig, _ = open_arm(slew_per_s=2.0, limit=([-1.0, -0.4, -1.0], 1.0))
+    for goal in ([0.0, 0.0, 0.0], [1.0, -0.4, -1.0]):
+        present = rig.measure().position_rad
+        rig.start()
+        sent, reading = run(rig, goal, 0.5)
+        assert sent[0] == pytest.approx(present, abs=1.5 * COUNT_RAD)
+        assert np.abs(np.diff(sent, axis=0)).max() <= 2.0 * 0.1
+        assert np.abs(sent[-1] - sent[0]).max() > 0.5
+        assert np.abs(reading.position_rad - sent[-1]).max() < 0.2
+        rig.stop()
+
+
+def test_a_stale_command_holds(open_arm):
+    rig, _ = open_arm()
+    rig.start()
+    run(rig, [0.4, -0.7, 0.2], 0.1)
+    assert rig.command(np.zeros(3), 0.2, time.monotonic()).tolist() == [0.4, -0.7, 0.2]
+    assert rig.gate.counts.stale == 1
+
+
+def test_a_stalled_policy_leaves_the_joints_where_they_were_sent(open_arm):
+    rig, robot = open_arm(watchdog_s=0.3)
+    rig.start()
+    run(rig, [0.1, -0.2, 0.9], 0.4)
+    stalled_ns = time.monotonic_ns()
+    for _ in range(25):
+        reading = rig.measure()
+        time.sleep(0.02)
+    assert 3 <= rig.timeouts <= 6
+    assert reading.position_rad == pytest.approx([0.1, -0.2, 0.9], abs=3 * COUNT_RAD)
+    sent, _ = run(rig, [0.0, -0.2, 0.9], 0.1)  # a loop that comes back goes on
+    assert sent[-1].tolist() == [0.0, -0.2, 0.9]
+    rig.stop()
+    rows, modes, goals = effects(robot)
+    again = (rows["t_ns"] > stalled_ns) & (rows["t_ns"] < stalled_ns + 450_000_000)
+    assert np.count_nonzero(again) >= 6
+    assert np.all(modes[again] == OperatingMode.POSITION)
+    assert goals[again].reshape(-1, 3) == pytest.approx(np.tile([0.1, -0.2, 0.9], (again.sum() // 3, 1)), abs=COUNT_RAD)
+    assert not len(robot.truth().of(Kind.WATCHDOG))
+
+
+def test_a_tripped_servo_is_noticed_although_goals_are_not_confirmed(open_arm):
+    rig, robot = open_arm(watchdog_s=0.1)
+    rig.start()
+    run(rig, [0.4, -0.7, 0.2], 0.3)
+    with rig.bus._link.hold():
+        time.sleep(0.25)
+    tripped_s = time.monotonic()
+    rig.command(np.zeros(3), 0.0, tripped_s)  # nobody refuses
+    with pytest.raises(SafetyStop, match="bus watchdog of servo 1 has tripped"):
+        run(rig, [0.0, 0.0, 0.0], 3.0)
+    assert time.monotonic() - tripped_s < 0.8
+    rig.stop()
+    rig.start()
+    run(rig, [0.4, -0.7, 0.2], 0.6)
+    rig.stop()
+    _, modes, _ = effects(robot)
+    assert np.count_nonzero(modes == OperatingMode.PWM) == 3
+
+
+def test_motors_stop_within_200_ms_of_the_hosts_kill(start_robot):
+    robot = start_robot("Joints")
+    code = f"""
+import time
+import numpy as np
+from sim2real.hardware.bus import BusConfig
+from sim2real.hardware.drive import PositionDrive
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.rig import ServoRig
+rig = ServoRig(BusConfig({robot.port!r}, watchdog_s=0.1), GateConfig(**{GATE!r}), {IDS!r}, PositionDrive(800, 20.0))
+rig.start()
+print("ready", flush=True)
+while True:
+    rig.command(np.array([0.2, 0.2, 0.2]), 0.0, time.monotonic())
+    rig.measure()
+    time.sleep(0.02)
+"""
+    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert host.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    killed_ns = time.monotonic_ns()
+    host.kill()
+    host.wait()
+    time.sleep(0.25)
+    rows, modes, goals = effects(robot)
+    assert goals[rows["t_ns"] <= killed_ns][-3:] == pytest.approx([0.2] * 3, abs=COUNT_RAD)
+    assert sorted(rows["servo_id"][-3:]) == list(IDS)
+    assert [*zip(modes[-3:], goals[-3:], strict=True)] == [(OperatingMode.PWM, 0.0)] * 3
+    assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < 0.2
+
+
+def test_an_exception_ends_with_torque_off(open_arm):
+    rig, robot = open_arm()
+
+    def fail():
+        with rig:
+            rig.start()
+            run(rig, [0.1, 0.1, 0.1], 0.1)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    _, modes, _ = effects(robot)
+    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
+
+
+def test_a_joint_outside_of_what_servos_take_keeps_its_torque_off(open_arm, start_robot):
+    robot = start_robot("Joints", start_rad=[0.0, 3.3, 0.0])
+    rig, _ = open_arm(robot=robot)
+    with pytest.raises(Sim2RealError, match=r"servo 2 refused write of .* to goal_position: the value is beyond"):
+        rig.start()
+    assert rig.bus.read(2, reg.TORQUE_ENABLE) == 0
+
+
+def test_limits_beyond_the_servos_own_are_refused(open_arm, start_robot):
+    robot = start_robot("Joints")
+    with pytest.raises(UsageError, match=r"(?s)limit 3.2 exceeds what the servos take, .*-3.142.* to .*3.14"):
+        open_arm(robot=robot, limit=3.2)
+    with ServoBus(BusConfig(robot.port)) as bus:
+        bus.handshake({2: None})
+        bus.write(2, reg.MAX_POSITION_LIMIT, 3000)
+    with pytest.raises(UsageError, match=r"to \[3.14, 1.46, 3.14\] rad"):
+        open_arm(robot=robot)
+
+
+@pytest.mark.parametrize(
+    ("drive", "gate", "message"),
+    [
+        (DRIVE, {"stale": "zero"}, "stale = 'zero' is not safe with positions"),
+        (VoltageDrive(5.0), {}, "stale = 'hold' is not safe with volts"),
+        (PositionDrive(800, 1.0, zero_count=(1, 2)), {}, "2 zero counts for 3 servos"),
+    ],
+)
+def test_gates_that_do_not_fit_are_refused_before_the_port_is_opened(drive, gate, message):
+    with pytest.raises(UsageError, match=message):
+        ServoRig(BusConfig("/dev/ttyNONE"), GateConfig(**{**GATE, **gate}), IDS, drive)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"p_gain": 20_000}, "position_p_gain = 20000 is outside"),
+        ({"d_gain": -1}, "position_d_gain = -1 is outside"),
+        ({"profile_velocity_rad_s": 0.0}, "profile_velocity_rad_s = 0.0 must be larger"),
+        ({"profile_velocity_rad_s": float("nan")}, "profile_velocity_rad_s = nan must be larger"),
+        ({"profile_velocity_rad_s": 1000.0}, "profile_velocity = .* is outside"),
+        ({"zero_count": (2048, 4096)}, "zero_count"),
+    ],
+)
+def test_drives_that_registers_cannot_hold(settings, message):
+    with pytest.raises(UsageError, match=message):
+        PositionDrive(**{"p_gain": 800, "profile_velocity_rad_s": 1.0, **settings})
+
+
+class FakeBus:
+    """Registers of one servo, as a host sees them."""
+
+    ids = (1,)
+
+    def __init__(self, **values):
+        self.values = {**{register.name: register.default for register in reg.TABLE.values()}, **values}
+
+    def read(self, servo_id, register):
+        return self.values[register.name]
+
+    def write(self, servo_id, register, value):
+        self.values[register.name] = value
+
+
+@pytest.mark.parametrize(("found", "wanted"), [(0, 0), (1, 1), (4, 0), (13, 1)])
+def test_profiles_are_by_speed_and_goals_switch_no_torque_on(found, wanted):
+    bus = FakeBus(drive_mode=found)
+    DRIVE.prepare(bus, GateConfig(**GATE))
+    assert bus.values["drive_mode"] == wanted
+
+
+@pytest.mark.parametrize("supply_v", [0.0, -5.0, float("nan"), float("inf")])
+def test_supplies_that_are_none(supply_v):
+    with pytest.raises(UsageError, match="supply_v"):
+        VoltageDrive(supply_v)
+
+
+@pytest.mark.parametrize(("speed_rad_s", "count"), [(math.inf, 0), (0.001, 1), (1.0, 42)])
+def test_a_slow_profile_is_not_rounded_to_none(open_arm, speed_rad_s, count):
+    rig, _ = open_arm(PositionDrive(800, speed_rad_s))
+    assert rig.bus.read(1, reg.PROFILE_VELOCITY) == count
