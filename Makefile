@@ -32,15 +32,15 @@ format: $(READY)
 # Where packages come from a mirror that only pip is configured for, pip installs the same versions by their hashes.
 $(READY): pyproject.toml uv.lock | $(BIN)/uv
 	@echo "setting up .venv from uv.lock" >&2
-	@$(SYNC) --all-extras || { \
+	@$(SYNC) --all-extras --no-extra warp || { \
 	  echo "uv cannot reach the package index: installing the locked versions with pip" >&2; \
-	  $(BIN)/uv export --frozen --offline --quiet --all-extras --no-dev --no-emit-project -o .venv/requirements.txt && \
+	  $(BIN)/uv export --frozen --offline --quiet --all-extras --no-extra warp --no-dev --no-emit-project -o .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps -r .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps --editable .; }
 	@touch $@
 
 $(DOCS_READY): $(READY)
-	@$(SYNC) --all-extras --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser
+	@$(SYNC) --all-extras --no-extra warp --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser
 	@touch $@
 
 $(BIN)/uv: | $(BIN)/pip

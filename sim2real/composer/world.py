@@ -24,9 +24,13 @@ class WorldParams(Base):
 
     Attributes:
         values: Name -> array, in the unit of the attribute that it sets.
+        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
+        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
     """
 
     values: Any
+    qpos: Any = None
+    qvel: Any = None
 
 
 @struct.dataclass
@@ -44,7 +48,8 @@ class ComposedWorld(BaseWorld):
     """A task that ticks in MJX as a node: its action comes from one input, its output is the observation.
 
     A tick is a control step. Delays and intervals of observables pass inside the node, those of connections between
-    nodes. The state is the environment's: data, samples that may still be read, variables of the task.
+    nodes. The state is the environment's: data, samples that may still be read, variables of the task. Subclasses may
+    send another message: see ``output``.
 
     Args:
         name: Unique in the graph.
@@ -106,20 +111,27 @@ class ComposedWorld(BaseWorld):
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> State:
         """Return the start of an episode."""
-        key = jax.random.key(0) if rng is None else rng
-        return self.environment.reset(key, self._model(self._params(graph_state)))
+        key, params = jax.random.key(0) if rng is None else rng, self._params(graph_state)
+        model = self.environment.model
+        qpos = model.qpos0 if params.qpos is None else params.qpos
+        qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
+        return self.environment.reset(key, self._model(params), (qpos, qvel))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Observations:
-        """Return the observation at the start of the episode."""
+    def output(self, state: State) -> Any:
+        """Return the message that says what a state is; default: the task's observation."""
+        return Observations(state.observation)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the message at the start of the episode."""
         state = (graph_state or GraphState()).state.get(self.name)
-        return Observations((self.init_state(rng, graph_state) if state is None else state).observation)
+        return self.output(self.init_state(rng, graph_state) if state is None else state)
 
-    def step(self, step_state: StepState) -> tuple[StepState, Observations]:
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Take a control step under the newest action."""
         action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
         state = self.environment.step(step_state.state, action, self._model(step_state.params))
         new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
-        return new, Observations(state.observation)
+        return new, self.output(state)
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:
         found = (graph_state or GraphState()).params.get(self.name)

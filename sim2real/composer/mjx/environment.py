@@ -13,11 +13,12 @@ from mujoco import mjx
 
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.hooks import Hooks
-from sim2real.composer.mjx import gate
+from sim2real.composer.mjx import gate, stepping
 from sim2real.composer.mjx.leaks import guarded
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import make_rings
+from sim2real.composer.mjx.warp import WarpEngine
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
 
@@ -72,6 +73,12 @@ class MjxEnvironment:
         max_reset_attempts: How often the initial state is drawn when hooks call ``physics.fail``.
         delayed_observation_padding: What fills buffers at first.
         legacy_step: After a step, also compute positions and velocities of the new state.
+        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``sim2real[warp]``. It computes in single precision
+            and has no derivatives. A step of it cannot begin elsewhere, so ``legacy_step`` costs a second forward
+            computation.
+        naconmax: On Warp: contacts that there is room for, of all copies together; default: a guess for one copy.
+        njmax: On Warp: rows of constraints that there is room for in each copy. Where it is too small the episode of
+            the copy ends, as where it diverged; where ``naconmax`` is, those of all copies.
         arena: The root entity of a task that has none of its own.
 
     Raises:
@@ -92,6 +99,9 @@ class MjxEnvironment:
         delayed_observation_padding: ObservationPadding = ObservationPadding.ZERO,
         legacy_step: bool = True,
         *,
+        impl: str = "jax",
+        naconmax: int | None = None,
+        njmax: int | None = None,
         arena: Any = None,
     ) -> None:
         if arena is not None:
@@ -109,23 +119,33 @@ class MjxEnvironment:
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
         self._rings = make_rings(observables, self.substeps, strip_singleton_obs_buffer_dim, initial)
-        self.mjx_model = mjx.put_model(self.model)
+        self._warp = self._make_warp(impl, naconmax, njmax)
+        self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self._changed: tuple[str, ...] = ()
         self._dry = False
         self._hooks.refresh()
         self._discover()
 
+    def _make_warp(self, impl: str, naconmax: int | None, njmax: int | None) -> WarpEngine | None:
+        if impl == "warp":
+            return WarpEngine(self.model, naconmax, njmax)
+        if impl != "jax":
+            raise UsageError(f"MJX has no implementation {impl!r}", hint="available: 'jax', 'warp'")
+        if (naconmax, njmax) != (None, None):
+            raise UsageError("naconmax and njmax are Warp's: MJX's JAX has room for every contact", hint='impl="warp"')
+        return None
+
     def _physics(self, state: State | None = None, model: Any = None) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
         model = self.mjx_model if model is None else model
         if state is None:
-            data = mjx.make_data(self.model)
-            physics = MjxPhysics(self.model, model, data, {}, self._legacy)
+            data = mjx.make_data(self.model, impl="jax") if self._warp is None else self._warp.start
+            physics = MjxPhysics(self.model, model, data, {}, self._legacy, self._warp or stepping)
             physics.is_dirty = True
             memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
             random_state = JaxRandomState(None, memory, self._registry)
         else:
-            physics = MjxPhysics(self.model, model, state.data, {}, self._legacy)
+            physics = MjxPhysics(self.model, model, state.data, {}, self._legacy, self._warp or stepping)
             random_state = JaxRandomState(state.key, {}, self._registry)
             physics.load((state.data, state.leaves, state.variables, state.key, state.memory), random_state)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
@@ -149,15 +169,19 @@ class MjxEnvironment:
                 hint="set them in initialize_episode too: a compiled program carries the same variables all along",
             )
 
-    def reset(self, key: Any, model: Any = None) -> State:
+    def reset(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None) -> State:
         """Return a copy at the start of an episode.
 
         Args:
             key: JAX key.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
+            start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
         """
         physics, random_state = self._physics(None, model)
         random_state.key = key
+        if start is not None:
+            physics.replace("data", "qpos", start[0])
+            physics.replace("data", "qvel", start[1])
 
         def attempt() -> None:
             self._hooks.run("initialize_episode", physics, random_state)
@@ -192,6 +216,7 @@ class MjxEnvironment:
         observation = {r.name: r.read(rings[r.name], now, physics, random_state) for r in self._rings}
         data, leaves, variables, key, memory = physics.tree(random_state)
         diverged = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all() & jnp.isfinite(data.qacc).all())
+        diverged = diverged if self._warp is None else diverged | self._warp.overflowed(data)
         reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
         ended = diverged | jnp.asarray(self.task.should_terminate_episode(physics), bool)
         late = jnp.zeros((), bool) if self.step_limit is None else steps >= self.step_limit

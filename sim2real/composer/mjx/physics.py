@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from sim2real.composer import layout
 from sim2real.composer.element import as_elements
-from sim2real.composer.mjx import stepping
+from sim2real.composer.mjx import stepping, warp
 from sim2real.composer.mjx.random import JaxRandomState
 from sim2real.composer.named import Named
 from sim2real.errors import UsageError
@@ -33,6 +32,8 @@ class DataView:
             raise AttributeError(name)
         data = self._physics.mjx_data
         value = getattr(data, name) if name in data.__dataclass_fields__ else getattr(data._impl, name)
+        if value is None:  # what all copies have in common on Warp
+            raise AttributeError(f"a copy has no {name!r} of its own")
         return jnp.reshape(value, (-1, 9)) if name in _MATRICES else value
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -57,7 +58,8 @@ class ModelView:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        value = getattr(self._physics.mjx_model, name, None)
+        model = self._physics.mjx_model
+        value = getattr(model, name) if name in model.__dataclass_fields__ else None
         return value if isinstance(value, jax.Array) else getattr(self.ptr, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -92,7 +94,7 @@ class MjxBinding:
     def __setattr__(self, name: str, value: Any) -> None:
         field, index = self.place(name)
         array = jnp.asarray(self._physics.read(field))
-        self._physics.replace(field.struct, field.name, array.at[index].set(value))
+        self._physics.replace(field.struct, field.name, array.at[index].set(jnp.asarray(value, array.dtype)))
 
 
 class MjxPhysics:
@@ -106,6 +108,7 @@ class MjxPhysics:
         data: The ``mjx.Data``.
         variables: What tasks keep from hook to hook: name -> array.
         legacy: After a step, also compute positions and velocities of the new state.
+        engine: What steps: the module ``stepping``, or a ``WarpEngine``.
 
     Attributes:
         np: The module that computes with this engine's arrays: ``jax.numpy``.
@@ -116,7 +119,16 @@ class MjxPhysics:
 
     np: Any = jnp
 
-    def __init__(self, host: Any, model: Any, data: Any, variables: dict[str, Any], legacy: bool = True) -> None:
+    def __init__(
+        self,
+        host: Any,
+        model: Any,
+        data: Any,
+        variables: dict[str, Any],
+        legacy: bool = True,
+        engine: Any = stepping,
+    ) -> None:
+        self._engine = engine
         self.host, self.mjx_model, self.mjx_data = host, model, data
         self.variables = variables
         self.legacy_step = legacy
@@ -145,12 +157,14 @@ class MjxPhysics:
             UsageError: When the field is a constant of compiled programs.
         """
         holder = self.mjx_model if struct == "model" else self.mjx_data
-        current = getattr(holder, name, None)
+        current = getattr(holder, name) if name in holder.__dataclass_fields__ else None
         if not isinstance(current, jax.Array):
             raise UsageError(
                 f"MJX cannot change {name!r} inside a compiled program: it is one of its constants",
                 hint="set it in the model before it is compiled, or use the C engine",
             )
+        if struct == "model" and warp.is_warp(holder):
+            warp.check_field(name)
         value = jnp.reshape(jnp.asarray(value, current.dtype), current.shape)
         if struct == "model":
             self.mjx_model = self.mjx_model.replace(**{name: value})
@@ -196,13 +210,12 @@ class MjxPhysics:
         """Advance by a time step."""
         if self.dry:
             return
-        advance = stepping.legacy_step if self.legacy_step else mjx.step
-        self.mjx_data = advance(self.mjx_model, self.mjx_data)
+        self.mjx_data = self._engine.advance(self.mjx_model, self.mjx_data, self.legacy_step)
 
     def forward(self, actuation: bool = True) -> None:
         """Compute everything that follows from the state, without advancing."""
         if not self.dry:
-            self.mjx_data = stepping.forward(self.mjx_model, self.mjx_data, actuation)
+            self.mjx_data = self._engine.forward(self.mjx_model, self.mjx_data, actuation)
         self.is_dirty = False
 
     def suppress_physics_errors(self) -> Any:
@@ -236,7 +249,7 @@ class MjxPhysics:
     def write(self, elements: Any, name: str, value: Any, index: Any) -> MjxPhysics:
         """Set a part of an attribute of elements; the same call on both engines."""
         whole = jnp.asarray(self.get(elements, name))
-        return self.set(elements, name, whole.at[index].set(value))
+        return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
 
     def fail(self, condition: Any = True) -> None:
         """Note that no acceptable initial state was found where the condition holds; another attempt follows."""

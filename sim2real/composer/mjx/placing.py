@@ -10,7 +10,9 @@ from mujoco import mjx
 
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState
+from sim2real.composer.mjx.warp import is_warp
 from sim2real.composer.variation.base import evaluate
+from sim2real.errors import UsageError
 
 
 def place(
@@ -34,7 +36,15 @@ def place(
         attempts: Poses that are tried for each prop.
         ignore_collisions: Take the first pose.
         ignored: Entities that may be touched.
+
+    Raises:
+        UsageError: On Warp, which keeps the contacts of all copies together, unless collisions are ignored.
     """
+    if is_warp(physics.mjx_model) and not ignore_collisions:
+        raise UsageError(
+            "PropPlacer looks at the contacts of a copy, and MJX-Warp keeps those of all copies together",
+            hint='use impl="jax", or ignore_collisions=True',
+        )
     numbers = [_geoms(physics, prop) for prop in props]
     passed = [n for prop in ignored for n in _geoms(physics, prop)]
     for i, prop in enumerate(props):

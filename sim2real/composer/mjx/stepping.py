@@ -7,6 +7,11 @@ from typing import Any
 from mujoco import mjx
 
 
+def advance(model: Any, data: Any, legacy: bool) -> Any:
+    """Return the data a time step later; with ``legacy``, with positions and velocities of the new state."""
+    return legacy_step(model, data) if legacy else mjx.step(model, data)
+
+
 def legacy_step(model: Any, data: Any) -> Any:
     """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
 
