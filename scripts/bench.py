@@ -19,6 +19,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 BENCHES = {
+    "arm": "arm_demo",
     "async": "asynchronous",
     "compose": "compose",
     "demo": "demo",

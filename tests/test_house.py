@@ -7,7 +7,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "sim2real"
 ROOMS = [
-    "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "identify", "train", "view", "stages", "cli",
+    "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "identify", "train", "robots",
+    "view", "stages", "cli",
 ]  # fmt: skip
 EVERYWHERE = {"errors"}
 MAX_LINES = 400

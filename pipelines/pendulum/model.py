@@ -10,6 +10,8 @@ from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.robots import devices
+from sim2real.robots.loop import delay_of
 from sim2real.worlds.ode import OdeWorld
 
 GRAVITY = 9.81  # [m/s^2]
@@ -111,66 +113,25 @@ class PendulumWorld(OdeWorld):
         return Measurement(th=state.th, thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
 
 
-@struct.dataclass
-class DelayParams(Base):
-    """The delay of a node's connection with the world [s]; None leaves the connection's own."""
-
-    delay: Any = None
-
-
-class SimSensor(BaseNode):
-    """The servo's encoder in simulation: passes the world's state on, as late as ``DelayParams`` says."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
-        """Return no delay of its own."""
-        del rng, graph_state
-        return DelayParams()
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
-        """Return the world's initial state, hanging at rest without one."""
-        del rng
-        state = (graph_state or GraphState()).state.get("world")
-        return state if state is not None else Measurement(th=jnp.float32(jnp.pi), thdot=jnp.float32(0.0))
-
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the sensing delay, where the parameters set one."""
-        return _delay(self.name, "world", graph_state)
-
-    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
-        """Measure."""
-        return step_state, step_state.inputs["world"][-1].data
-
-
-class SimActuator(BaseNode):
-    """The motor driver in simulation: passes the command on."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
-        """Return no delay of its own."""
-        del rng, graph_state
-        return DelayParams()
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
-        """Return zero voltage."""
-        del rng, graph_state
-        return Command(action=jnp.zeros(1))
-
-    def step(self, step_state: StepState) -> tuple[StepState, Command]:
-        """Apply the command."""
-        return step_state, step_state.inputs["agent"][-1].data
-
-
 class DelayedWorld(PendulumWorld):
     """The world whose actuation delay is set by the actuator's ``DelayParams``."""
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the actuation delay, where the actuator's parameters set one."""
-        return _delay("actuator", "actuator", graph_state)
+        return delay_of("actuator", "actuator", graph_state)
 
 
-def _delay(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:
-    params = (graph_state or GraphState()).params.get(node)
-    delay = getattr(params, "delay", None)
-    return {} if delay is None else {input_name: delay}
+class SimActuator(devices.SimActuator):
+    """The motor driver in simulation: passes the command on.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        **options: As of ``BaseNode``.
+    """
+
+    def __init__(self, name: str, rate: float, **options: Any) -> None:
+        super().__init__(name, rate, 1, "action", Command, **options)
 
 
 @struct.dataclass

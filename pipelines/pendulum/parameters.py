@@ -7,14 +7,14 @@ and the rest appear only in them: the model keeps its nominal J, R and length an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.robots.loop import DelayParams, delay_parameters
 
-from .model import GRAVITY, DelayParams, PendulumParams, nominal_params
+from .model import GRAVITY, PendulumParams, nominal_params
 
 
 def groups(p: PendulumParams) -> dict[str, Any]:
@@ -62,27 +62,7 @@ def table(max_delay_s: float, tick_s: float) -> ParameterTable:
         Parameter(name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1])
         for name, value in groups(nominal_params()).items()
     ]
-    # The sensor interpolates between ticks of the world: at less than a tick it would have to see the future. As only
-    # the sum of both delays can be told from a log, nothing is lost.
-    delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
-    delays = [
-        replace(
-            delay,
-            name="sensor_delay",
-            low=tick_s,
-            about="from motion to measurement's time stamp",
-            leaf="sensor.delay",
-            side="measurement",
-        ),
-        replace(
-            delay,
-            name="actuator_delay",
-            about="from command's departure to the motor",
-            leaf="actuator.delay",
-            side="command",
-        ),
-    ]
-    return ParameterTable([*dynamics, *delays])
+    return ParameterTable([*dynamics, *delay_parameters(max_delay_s, tick_s)])
 
 
 def node_params(values: Mapping[str, Any], start: Any) -> dict[str, Any]:

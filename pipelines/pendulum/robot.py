@@ -5,19 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.graph.delays import DelayDistribution, TrainableDist
+from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import ParameterTable
+from sim2real.robots.devices import SimSensor
+from sim2real.robots.loop import control_nodes, delay_bounds, recorded_loop, simulated_loop
 from sim2real.stages.config import GateLimits
 
 from . import hardware, parameters
-from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, SimActuator, SimSensor
+from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, SimActuator
 from .task import SwingUp, upright
 
 RATE_HZ = 50.0
@@ -34,8 +36,6 @@ OBSERVATION = [
 ]
 ACTION = [("voltage", "V")]
 WORLD_HZ = 100.0
-_BURST = 3
-"""After a hiccup of a thread, commands that waited for it leave at once: so many more than the rate explains."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 DELAY_SPREAD_S = 0.002
 """By how much delays vary between episodes of training, either way [s]."""
@@ -55,49 +55,13 @@ class IdentifiablePendulum:
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, with delays of up to ``max_delay_s`` [s] between them."""
-        start = max_delay_s / 4
-        sensor = SimSensor("sensor", RATE_HZ)
-        actuator = SimActuator("actuator", RATE_HZ)
         world = DelayedWorld("world", WORLD_HZ)
-        to_world = TrainableDist.create(start, 0.0, max_delay_s, "zoh_mean", burst=_BURST)
-        world.connect(actuator, skip=True, delay_dist=to_world)
-        sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s, "linear"))
-        return {n.name: n for n in (sensor, actuator, world)}
+        sensor, actuator = SimSensor("sensor", RATE_HZ, world), SimActuator("actuator", RATE_HZ)
+        return recorded_loop(sensor, actuator, world, max_delay_s)
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and an initial state ``(th, thdot)``."""
         return parameters.node_params(values, start)
-
-
-def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
-    """Connect the loop that runs on hardware and in simulation alike."""
-    agent.connect(sensor, blocking=True)
-    actuator.connect(agent, blocking=True)
-    return {n.name: n for n in (sensor, agent, actuator)}
-
-
-def simulated_nodes(
-    computation: Mapping[str, DelayDistribution],
-    delays: Mapping[str, tuple[float, float, float]] | None = None,
-) -> dict[str, BaseNode]:
-    """Return the whole loop in simulation, for training and for comparison.
-
-    Args:
-        computation: Computation delays by node; the expected ones are those of the hardware's graph.
-        delays: ``sensor_delay`` and ``actuator_delay`` as (value, min, max) [s]; None: no delays at all.
-    """
-    sensor, agent, actuator = (
-        cls(n, RATE_HZ, delay=EXPECTED_DELAY_S[n] if delays else 0.0, delay_dist=computation.get(n))
-        for cls, n in ((SimSensor, "sensor"), (Agent, "agent"), (SimActuator, "actuator"))
-    )
-    nodes = control_nodes(sensor, agent, actuator)
-    world = DelayedWorld("world", WORLD_HZ)
-    to_world = TrainableDist.create(*delays["actuator_delay"], "zoh_mean", _BURST) if delays else None
-    from_world = TrainableDist.create(*delays["sensor_delay"], "linear") if delays else None
-    world.connect(actuator, skip=True, delay_dist=to_world)
-    # The expected delay stays out of the phases: on the robot nothing waits for the world either.
-    sensor.connect(world, skip=True, delay_dist=from_world)
-    return {**nodes, "world": world}
 
 
 def connect(port: str, limits: GateLimits, truth_path: Path, seed: int) -> hardware.Session:
@@ -135,8 +99,11 @@ def prepare(session: hardware.Session, settle_s: float) -> None:
     )
 
 
-def deployment_nodes(session: hardware.Session, policy: Any) -> tuple[dict[str, BaseNode], dict[str, Any]]:
-    """Return the graph on hardware that runs a policy, and the agent's parameters."""
+def deployment_nodes(
+    session: hardware.Session, policy: Any, trial: int = 0
+) -> tuple[dict[str, BaseNode], dict[str, Any]]:
+    """Return the graph on hardware that runs a policy, and the agent's parameters; every trial is the same."""
+    del trial
     agent = Agent("agent", RATE_HZ, delay=EXPECTED_DELAY_S["agent"])
     return _on_hardware(session, agent), {"agent": AgentParams(policy=policy)}
 
@@ -160,21 +127,22 @@ def training(
         computation: Computation delays by node.
         delays: Whether there are delays; without them every message arrives at once.
     """
-    bounds = None
-    if delays:
-        # A tick less than the delay, for the sensor to interpolate; and room for the spread.
-        room = 1 / WORLD_HZ + DELAY_SPREAD_S
-        bounds = {
-            n: (values[n], max(0.0, values[n] - room), values[n] + DELAY_SPREAD_S)
-            for n in ("sensor_delay", "actuator_delay")
-        }
-    nodes = simulated_nodes(computation, bounds)
-    agent = cast(Agent, nodes["agent"])
+
+    def options(name: str) -> dict[str, Any]:
+        return {"delay": EXPECTED_DELAY_S[name] if delays else 0.0, "delay_dist": computation.get(name)}
+
+    world = DelayedWorld("world", WORLD_HZ)
+    sensor = SimSensor("sensor", RATE_HZ, world, **options("sensor"))
+    agent = Agent("agent", RATE_HZ, **options("agent"))
+    actuator = SimActuator("actuator", RATE_HZ, **options("actuator"))
+    bounds = delay_bounds(values, 1 / WORLD_HZ, DELAY_SPREAD_S) if delays else None
+    nodes = simulated_loop(sensor, agent, actuator, world, bounds)
     return nodes, SwingUp(agent, values, draws, DELAY_SPREAD_S if delays else 0.0)
 
 
-def simulation_params(values: Mapping[str, float], policy: Any) -> dict[str, Any]:
-    """Return node parameters of the loop in simulation, hanging at rest, with a policy."""
+def simulation_params(values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
+    """Return node parameters of the loop in simulation, hanging at rest, with a policy; every trial is the same."""
+    del trial
     return {**parameters.node_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
 
 

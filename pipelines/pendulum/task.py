@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
+from sim2real.robots.loop import draw_values
 
 from . import parameters
 from .model import HISTORY, Agent
@@ -48,17 +49,8 @@ class SwingUp:
 
     def params(self, key: jax.Array) -> dict[str, Any]:
         """Draw dynamics, delays and the state in which an episode starts: half of them hanging, half anywhere."""
-        keys = dict(zip(self.values, jax.random.split(key, len(self.values)), strict=True))
+        drawn = draw_values(key, self.values, self.draws, self.delay_spread_s)
         k_state, k_where = jax.random.split(jax.random.fold_in(key, 1))
-        count = min((len(d) for d in self.draws.values()), default=1)
-        row = jax.random.randint(jax.random.fold_in(key, 2), (), 0, count)
-        drawn = {}
-        for name, value in self.values.items():
-            if name.endswith("_delay"):
-                shift = jax.random.uniform(keys[name], minval=-self.delay_spread_s, maxval=self.delay_spread_s)
-                drawn[name] = jnp.maximum(value + shift, 0.0)
-            else:
-                drawn[name] = self.draws[name][row] if name in self.draws else value
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)

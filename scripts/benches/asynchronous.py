@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from sim2real.graph.node import BaseNode
+from sim2real.robots.devices import SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.stages.pipeline import load_pipeline
@@ -18,10 +19,10 @@ def loop(rate_hz: float) -> dict[str, BaseNode]:
     """Return the pendulum's four nodes at one rate."""
     model = load_pipeline("pendulum").load("model")
     delay = 0.2 / rate_hz
-    sensor = model.SimSensor("sensor", rate_hz, delay_dist=delay)
+    world = model.PendulumWorld("world", rate_hz)
+    sensor = SimSensor("sensor", rate_hz, world, delay_dist=delay)
     agent = model.Agent("agent", rate_hz, delay_dist=delay)
     actuator = model.SimActuator("actuator", rate_hz, delay_dist=delay)
-    world = model.PendulumWorld("world", rate_hz)
     sensor.connect(world)
     agent.connect(sensor, blocking=True, window=3)
     actuator.connect(agent, blocking=True)

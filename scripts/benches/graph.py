@@ -23,6 +23,7 @@ from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
+from sim2real.robots.devices import SimSensor
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
 
@@ -73,15 +74,6 @@ class CostWorld(MODEL.PendulumWorld):
         return moved.replace(state=(moved.state, cost + task_cost(moved.state, u))), output
 
 
-class Sensor(MODEL.SimSensor):
-    """The sensor of a world whose state holds the cost as well."""
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the initial angle and velocity."""
-        del rng
-        return graph_state.state["world"][0] if graph_state else MODEL.Measurement(th=jnp.pi, thdot=0.0)
-
-
 def task_cost(x: Any, u: Any) -> Any:
     """Return the seed's cost of a state under a voltage."""
     th = x.th - 2 * jnp.pi * jnp.floor((x.th + jnp.pi) / (2 * jnp.pi))
@@ -91,10 +83,10 @@ def task_cost(x: Any, u: Any) -> Any:
 def nodes(agent_hz: float = 50.0, world_hz: float = 50.0, substep_s: float = 0.01) -> dict[str, BaseNode]:
     """Return the seed's graph with the delays of its notebook."""
     dist = lambda loc, scale: StaticDist(_Normal(loc, scale))  # noqa: E731
-    sensor = Sensor("sensor", agent_hz, delay_dist=dist(0.0075, 0.003))
+    world = CostWorld("world", world_hz, substep_s=substep_s)
+    sensor = SimSensor("sensor", agent_hz, world, delay_dist=dist(0.0075, 0.003))
     agent = RandomAgent("agent", agent_hz, delay_dist=dist(0.01, 0.003))
     actuator = MODEL.SimActuator("actuator", agent_hz, delay_dist=dist(0.0075, 0.003))
-    world = CostWorld("world", world_hz, substep_s=substep_s)
     agent.connect(sensor, blocking=True, window=3, delay_dist=dist(0.002, 0.002))
     actuator.connect(agent, blocking=True, delay_dist=dist(0.002, 0.002))
     world.connect(actuator, skip=True, delay_dist=dist(0.01, 0.002))

@@ -19,6 +19,9 @@ class FitConfig:
     initial_state: Literal["free", "measured", "rest"] = "free"
     """Initial state of a segment: 'free' is estimated around the start and solved for; 'measured' is that estimate as
     it is; 'rest' is the measured position without velocity."""
+    skip_s: float = 0.0
+    """First part of a segment that is simulated but not compared: states of the model that nobody measures settle
+    there [s]."""
     loss: Loss = "huber"
     """What a residual costs; 'huber' and 'cauchy' are robust."""
     reach: float = 5.0
@@ -59,6 +62,8 @@ class FitConfig:
             raise UsageError("generations and refine are both 0: nothing would be identified")
         if not (self.reach > 0.0 and self.std > 0.0):
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
+        if not 0.0 <= self.skip_s <= 10.0:
+            raise UsageError(f"skip_s must lie in [0, 10] s, got {self.skip_s}")
         if min(self.batch, self.refine, self.refine_steps, self.long_s) < 0:
             raise UsageError("batch, refine, refine_steps and long_s must not be negative")
         if not 0 <= self.seed < 2**31:

@@ -10,22 +10,26 @@ import jax.numpy as jnp
 
 
 def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[[Any], Any]:
-    """Return ``f`` with a forward-mode derivative by central differences along the tangent.
+    """Return ``f`` with a forward-mode derivative by central differences along every entry.
 
-    Its Jacobian costs two evaluations a column, as any finite differences do; they run side by side.
+    The value and all ``2 P`` neighbours come from one batched evaluation: a rollout of MuJoCo takes 20 s to trace and
+    compile, and so it is in a program once, not three times.
 
     Args:
         f: Array ``(P,)`` -> array; it may call back to Python.
-        step: Largest change of an entry; about the cube root of float32's precision, relative to entries near 1.
+        step: Change of an entry; about the cube root of float32's precision, relative to entries near 1.
     """
     wrapped = jax.custom_jvp(f)
 
     def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
         (x,), (t,) = primals, tangents
-        size = jnp.maximum(jnp.max(jnp.abs(t)), 1e-30)
-        move = t / size * step
-        slope = (f(x + move) - f(x - move)) * (size / (2.0 * step))
-        return f(x), slope
+        n = x.size
+        moves = step * jnp.concatenate(
+            [jnp.zeros((1, n), x.dtype), jnp.eye(n, dtype=x.dtype), -jnp.eye(n, dtype=x.dtype)]
+        )
+        values = jax.vmap(f)(x + moves)
+        columns = (values[1 : n + 1] - values[n + 1 :]) / (2.0 * step)
+        return values[0], jnp.tensordot(t, columns, axes=1)
 
     wrapped.defjvp(rule)
     return wrapped

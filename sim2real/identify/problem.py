@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
 from sim2real.identify.config import FitConfig
@@ -78,9 +79,16 @@ class Problem:
         self.data = _data(cuts)
         self._recording = jnp.asarray(self.recording)
         self._ts = jnp.asarray(cuts.ts, jnp.float32)
+        # Traced once, however many programs it becomes a part of: of MuJoCo's, that takes 6 s each.
+        self._rollout = jax.jit(self._simulate)
         self._first = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[:, 0]), dict(cuts.given))
         # Before this a measurement shows the world from before the segment's start.
-        self._from_s = config.max_delay_s + 1.0 / min(n.rate for n in nodes.values())
+        self._from_s = max(config.max_delay_s + 1.0 / min(n.rate for n in nodes.values()), config.skip_s)
+        if not np.any(cuts.ts >= self._from_s):
+            raise UsageError(
+                f"segments of {length_s:g} s leave nothing to compare after their first {self._from_s:g} s",
+                hint="make them longer, or max_delay_s or skip_s smaller",
+            )
         # How far an initial state may be from its estimate. Wide: a narrow one would tell the delays apart by the
         # estimate's own bias, though shifting time between them changes nothing else.
         sigmas = [c.position_sigma for c in self.channels] + [c.velocity_sigma for c in self.channels]
@@ -109,6 +117,10 @@ class Problem:
         """
         own = self.table.of_recording(values, self._recording[eps])
         start = self._start(eps, sum(own[n] for n in self._late), data or self.data) + shift
+        return self._rollout(own, start, eps)
+
+    def _simulate(self, own: Mapping[str, Any], start: Any, eps: Any) -> tuple[Any, Any]:
+        """Simulate a segment for one recording's parameters, from an initial state."""
         gs = self.graph.init(jax.random.key(0), params=self.model.params(own, start), eps=eps)
         # Before the first recorded command it held already: nothing else is known.
         first = jax.tree_util.tree_map(lambda rows: rows[eps], self._first)
@@ -224,7 +236,7 @@ class Problem:
     def linearised(self, z: Any, columns: Any, data: Data | None = None) -> tuple[Any, Any]:
         """Return ``stacked`` and its Jacobian ``(segments, C, fields, P)``, forward or by finite differences."""
         f = self.differentiable(lambda y: self.stacked(y, columns, data))
-        return f(z), jax.jacfwd(f)(z)
+        return jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
 
     @property
     def measurements(self) -> int:

@@ -217,7 +217,7 @@ def simulate(
     """Return what the model at its nominal values would be recorded to do under the planned excitation."""
     nodes = model.nodes(config.max_delay_s)
     node, field = robot.COMMAND
-    signal = command_signal(record, robot.RATE_HZ)
+    signal = command_signal(record, robot.RATE_HZ, len(robot.ACTION))
     timeline = draw(nodes, record.duration_s, rng=record.seed)
     given, outputs = {}, {}
     for name in model.given:
@@ -226,7 +226,7 @@ def simulate(
         rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
         if name == node:
             played = signal[np.minimum(np.arange(count), len(signal) - 1)]
-            rows[field] = np.broadcast_to(played.reshape(count, *[1] * (rows[field].ndim - 1)), rows[field].shape)
+            rows[field] = played.reshape(rows[field].shape)
         leaves, kind = jax.tree_util.tree_flatten(message)
         given[name] = kind.unflatten(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode
+from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.schedule import draw
 from sim2real.hardware.truth import read_truth
@@ -51,12 +51,12 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
-            timing = [_deploy(pipeline, robot, session, policy, log, config) for log in logs]
+            timing = [_deploy(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
         print(table(*timing_rows(timing[-1])))
         real = [
             _true_states(stage.folder / TRUTH, s, read_log(log), robot) for log, s in zip(logs, timing, strict=True)
         ]
-        simulated = _simulate(robot, policy, values, read_log(logs[0]), config.duration_s)
+        simulated = _simulate(robot, policy, values, read_log(logs[0]), config.duration_s, len(logs))
         result = _compare(robot, real, simulated)
         stage.output("result", "result.json").write_text(
             json.dumps({**result, "timing": timing, "units": dict(robot.UNITS)}, indent=1)
@@ -84,11 +84,11 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
 
 
 def _deploy(
-    pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, log: Path, config: DeployConfig
+    pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, trial: int, log: Path, config: DeployConfig
 ) -> dict[str, Any]:
     note(f"waiting for the robot to come to rest, then {config.duration_s:g} s on {config.port}")
     robot.prepare(session, config.settle_s)
-    nodes, params = robot.deployment_nodes(session, policy)
+    nodes, params = robot.deployment_nodes(session, policy, trial)
     return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy")
 
 
@@ -124,17 +124,30 @@ def _true_states(
     truth: Path, summary: Mapping[str, Any], episode: Episode, robot: Robot
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
-    command = episode.outputs[robot.COMMAND[0]][robot.COMMAND[1]].reshape(len(episode.steps[robot.COMMAND[0]]), -1)[
-        :, 0
-    ]
+    sent = _sent(robot, episode.outputs[robot.SUPERVISOR], episode.outputs[robot.COMMAND[0]])
     if truth.is_file():
         t_ns, states = read_truth(truth).states()
         t_s = (t_ns - summary["monotonic_ns"]) / 1e9
         inside = (t_s >= 0) & (t_s <= episode.duration_s)
-        return t_s[inside], {**{n: s[inside] for n, s in states.items()}, "command": command}
+        return t_s[inside], {**sent, **{n: s[inside] for n, s in states.items()}}
     steps = episode.steps["sensor"]
     t_s = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) / TICKS_PER_S
-    return t_s, {**episode.outputs["sensor"], "command": command}
+    return t_s, {**sent, **_columns(episode.outputs["sensor"])}
+
+
+def _columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
+    columns = {}
+    for name, values in fields.items():
+        flat = np.asarray(values).reshape(len(values), -1)
+        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
+    return columns
+
+
+def _sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
+    field = robot.COMMAND[1]
+    return _columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})
 
 
 def _identified(pipeline: Pipeline, run_dir: Path) -> dict[str, float] | None:
@@ -147,30 +160,45 @@ def _identified(pipeline: Pipeline, run_dir: Path) -> dict[str, float] | None:
 
 
 def _simulate(
-    robot: Robot, policy: Policy, values: Mapping[str, float] | None, episode: Episode, duration_s: float
+    robot: Robot,
+    policy: Policy,
+    values: Mapping[str, float] | None,
+    episode: Episode,
+    duration_s: float,
+    episodes: int,
 ) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's."""
     if values is None:
         return None
     nodes, _ = robot.training(values, {}, computation_delays(episode)[0], True)
     graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, duration_s, _SIMULATIONS, 0))
-    params = robot.simulation_params(values, policy)
-    recorded = ("world", robot.COMMAND[0])
+    # Each deployment's own trial in turn: its simulation has the same to do.
+    trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
+    params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
+    recorded = ("world", robot.SUPERVISOR, robot.COMMAND[0])
 
-    def one(eps: jax.Array) -> Any:
+    def one(eps: jax.Array, params: Any) -> Any:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
-    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS)))
-    world, command = records["world"], records[robot.COMMAND[0]]
-    rate = nodes["world"].rate
-    runs = []
-    for e in range(_SIMULATIONS):
-        ran = command.seq[e] >= 0
-        sent = getattr(command.output, robot.COMMAND[1])[e][ran].reshape(int(ran.sum()), -1)[:, 0]
-        states = {f: np.asarray(getattr(world.output, f)[e]) for f in world.output.__dataclass_fields__}
-        when = graph.timeline.vertices[robot.COMMAND[0]].end[e][command.seq[e][ran]] / TICKS_PER_S
-        runs.append(((world.seq[e] + 1) / rate, {**states, "command": sent, "t_command": when}))
-    return runs
+    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
+    return [_run(graph, nodes["world"].rate, records, robot, e) for e in range(_SIMULATIONS)]
+
+
+def _run(
+    graph: CompiledGraph, rate_hz: float, records: Mapping[str, Any], robot: Robot, e: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return times [s] and states of one simulation."""
+
+    def sent(node: str) -> dict[str, Any]:
+        ran = records[node].seq[e] >= 0
+        return {n: np.asarray(leaf)[e][ran] for n, leaf in named_leaves(records[node].output).items()}
+
+    name = robot.COMMAND[0]
+    seq = records[name].seq[e]
+    when = graph.timeline.vertices[name].end[e][seq[seq >= 0]] / TICKS_PER_S
+    states = {n: np.asarray(leaf)[e] for n, leaf in named_leaves(records["world"].output).items()}
+    columns = {**_sent(robot, sent(robot.SUPERVISOR), sent(name)), **_columns(states)}
+    return (records["world"].seq[e] + 1) / rate_hz, {**columns, "t_command": when}
 
 
 def _compare(robot: Robot, real: list[Any], simulated: list[Any] | None) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from sim2real.errors import UsageError
 from sim2real.stages.config import RecordConfig
 
 
-def excitation(config: RecordConfig, rate_hz: float) -> np.ndarray:
-    """Return the command of every step, shape ``(N,)`` [the command's unit].
+def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.ndarray:
+    """Return the commands of every step, shape ``(N,)`` for one command, else ``(N, commands)`` [the command's unit].
 
     ``multisine`` holds twelve lines of random phase between ``low_hz`` and ``high_hz``; ``chirp`` sweeps from one to
     the other and back every 10 s; ``steps`` holds random levels for random times of half a period of these frequencies.
-    All start from zero within half a second and stay within the amplitude.
+    All start from zero within half a second and stay within the amplitude. Several commands are independent.
 
     Raises:
         UsageError: When the highest frequency is above half the rate of steps.
@@ -26,8 +26,9 @@ def excitation(config: RecordConfig, rate_hz: float) -> np.ndarray:
     rng = np.random.default_rng(config.seed)
     t = np.arange(round(config.duration_s * rate_hz)) / rate_hz
     make = {"multisine": _multisine, "chirp": _chirp, "steps": _steps}[config.excitation]
-    signal = make(t, config.low_hz, config.high_hz, rng)
-    return config.amplitude * np.clip(signal, -1.0, 1.0) * np.minimum(1.0, t / 0.5)
+    signals = np.stack([make(t, config.low_hz, config.high_hz, rng) for _ in range(commands)], axis=1)
+    played = config.amplitude * np.clip(signals, -1.0, 1.0) * np.minimum(1.0, t / 0.5)[:, None]
+    return played[:, 0] if commands == 1 else played
 
 
 def _multisine(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Generator) -> np.ndarray:

@@ -28,7 +28,8 @@ class Pipeline:
         name: The folder's name; what the command line calls it.
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
-        robot: Module in the package with the robot's parts for the stages (see ``sim2real.stages.robot.Robot``).
+        robot: Module in the package with the robot's parts for the stages (see ``sim2real.stages.robot.Robot``): its
+            functions, or an object ``ROBOT``.
         scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None draws none.
         record: Defaults of the stage; its fields become the flags.
         identify: Defaults of the stage.
@@ -51,9 +52,10 @@ class Pipeline:
         """Where the pipeline's files are."""
         return Path(str(importlib.import_module(self.package).__file__)).parent
 
-    def load(self, module: str | None = None) -> ModuleType:
-        """Import a module of the pipeline's package; default: the robot's parts."""
-        return importlib.import_module(f"{self.package}.{module or self.robot}")
+    def load(self, module: str | None = None) -> Any:
+        """Import a module of the pipeline's package; default: the robot's parts, or the ``ROBOT`` that it defines."""
+        found = importlib.import_module(f"{self.package}.{module or self.robot}")
+        return found if module else getattr(found, "ROBOT", found)
 
 
 def available() -> dict[str, Any]:

@@ -29,7 +29,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = cast(Robot, pipeline.load())
-    signal = excitation(config, robot.RATE_HZ)
+    signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
     with open_stage(root, pipeline.name, "record", config, run_dir=run_dir) as stage:
         log = stage.output("log", LOG)
         note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")

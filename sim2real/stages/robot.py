@@ -11,10 +11,10 @@ import numpy as np
 
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
+from sim2real.hardware.config import GateLimits
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.rig import ServoRig
 from sim2real.identify.model import IdentifiableModel
-from sim2real.stages.config import GateLimits
 from sim2real.train.env import Task
 
 
@@ -47,7 +47,7 @@ class Robot(Identifiable, Protocol):
     Attributes:
         RATE_HZ: Rate of the supervisor [Hz].
         SUPERVISOR: Name of the node that the policy acts for.
-        COMMAND: Node and field of the command that reaches the motors.
+        COMMAND: Node and field of the command that reaches the motors, one entry an action.
         JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
         OBSERVATION: Terms of the policy's observation in order: name, units of its entries, steps of history.
         ACTION: Names of the actions, with units, in order.
@@ -69,11 +69,16 @@ class Robot(Identifiable, Protocol):
         ...
 
     def recording_nodes(self, session: Session, signal: np.ndarray) -> dict[str, BaseNode]:
-        """Return the graph on hardware that plays a signal, one command a step ``(N,)``."""
+        """Return the graph on hardware that plays a signal, one row a step: ``(N,)``, or ``(N, actions)``."""
         ...
 
-    def deployment_nodes(self, session: Session, policy: Any) -> tuple[dict[str, BaseNode], dict[str, Any]]:
-        """Return the graph on hardware that runs a policy, and parameters of its nodes."""
+    def deployment_nodes(
+        self, session: Session, policy: Any, trial: int = 0
+    ) -> tuple[dict[str, BaseNode], dict[str, Any]]:
+        """Return the graph on hardware that runs a policy, and parameters of its nodes.
+
+        Where what there is to do differs from trial to trial, the same number stands for the same, in simulation too.
+        """
         ...
 
     def training(
@@ -86,7 +91,7 @@ class Robot(Identifiable, Protocol):
         """Return the graph in simulation and the task, whose copies take parameters from ``draws (K,)``."""
         ...
 
-    def simulation_params(self, values: Mapping[str, float], policy: Any) -> dict[str, Any]:
+    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
         """Return node parameters of the graph in simulation that starts at rest and runs a policy."""
         ...
 
@@ -95,5 +100,11 @@ class Robot(Identifiable, Protocol):
         ...
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return how well a deployment went, ``success`` among it, from states over time ``(N,)``."""
+        """Return how well a deployment went, ``success`` among it.
+
+        Args:
+            t_s: Times ``(N,)`` [s].
+            states: Fields ``(N,)``, a vector's entries as ``name[i]``; and, one a step, what the supervisor sent and
+                the command that reached the motors, ``command`` where it is one number.
+        """
         ...

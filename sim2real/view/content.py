@@ -104,7 +104,8 @@ def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series
         if index < len(commands):
             curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
         plots.setdefault(_titled(series.name, log.units), []).extend(curves)
-    motions = [_motion(f"{entity}/scene/robot", log.measured, last, ghost=False)]
+    # The motors' commands come last: where another node sent a field of that name too, theirs is drawn.
+    motions = [_motion(f"{entity}/scene/robot", log.measured, [*log.commanded, *last], ghost=False)]
     if simulated:
         states = [s for s in simulated if s.name not in commands]
         motions.append(_motion(f"{entity}/scene/simulation", states, [], ghost=True))

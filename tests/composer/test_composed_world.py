@@ -12,6 +12,7 @@ from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
+from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled import CompiledGraph
 
@@ -115,6 +116,47 @@ def test_wrong_rates_and_parameters_are_refused():
     geoms = task.root_entity.mjcf_model.find_all("geom")
     with pytest.raises(UsageError, match="cannot change 'geom_contype'"):
         composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
+
+
+class Witness(Push):
+    """Leaves the start as it is, and keeps what it finds there."""
+
+    def initialize_episode(self, physics, random_state):
+        rail = physics.bind(self.rail)
+        physics.variables["found"] = physics.np.concatenate([rail.qpos, rail.qvel])
+
+
+@pytest.fixture(scope="module")
+def witness():
+    return composer.ComposedWorld("world", Witness())
+
+
+def test_hooks_find_the_start_that_a_reset_is_given(witness):
+    environment = witness.environment
+    reset = jax.jit(lambda key, start: environment.reset(key, None, start))
+    state = reset(jax.random.key(0), (jnp.array([0.3]), jnp.array([-1.5])))
+    for found in (state.variables["found"], jnp.concatenate([state.data.qpos, state.data.qvel])):
+        np.testing.assert_array_equal(found, np.float32([0.3, -1.5]))
+    assert [np.asarray(state.observation[n]).item() for n in ("x", "v")] == [np.float32(0.3), -1.5]
+    at_rest = jax.jit(environment.reset)(jax.random.key(0))
+    np.testing.assert_array_equal(at_rest.variables["found"], [0.0, 0.0])
+
+
+def test_a_world_starts_where_its_parameters_say(witness):
+    nothing = witness.init_params()
+    assert (nothing.qpos, nothing.qvel) == (None, None)
+
+    def started(**start):
+        gs = GraphState(params={"world": nothing.replace(**start)})
+        state = jax.jit(lambda key: witness.init_state(key, gs))(jax.random.key(0))
+        shown = witness.init_output(None, gs.replace(state={"world": state})).values
+        assert [np.asarray(shown[n]).item() for n in ("x", "v")] == state.variables["found"].tolist()
+        return state.variables["found"].tolist()
+
+    assert started() == [0.0, 0.0]
+    assert started(qpos=jnp.array([0.25])) == [0.25, 0.0]
+    assert started(qvel=jnp.array([2.0])) == [0.0, 2.0]
+    assert started(qpos=jnp.array([0.25]), qvel=jnp.array([2.0])) == [0.25, 2.0]
 
 
 @pytest.fixture(scope="module")

@@ -288,3 +288,18 @@ def test_fields_and_elements_that_are_not_there_are_named():
     task.after_step = after_step.__get__(task)
     with pytest.raises(AttributeError, match="MJX has no field 'qfrc_adhesion'"):
         composer.MjxEnvironment(task)
+
+
+def test_elliptic_cones_are_no_matter_where_nothing_can_touch():
+    """MJX 3.17 raises a TypeError there: a joint limit, no contact, and the cones that arenas have."""
+    arena = composer.Arena()
+    limited = mjcf.from_xml_string(
+        '<mujoco model="flap"><worldbody><body name="b"><joint name="j" axis="0 1 0" limited="true" range="-.1 .1"/>'
+        '<geom size=".1" pos="0 0 -.2" contype="0" conaffinity="0"/></body></worldbody></mujoco>'
+    )
+    arena.attach(composer.ModelWrapperEntity(limited))
+    task = composer.NullTask(arena)
+    task.set_timesteps(control_timestep=0.02, physics_timestep=0.01)
+    environment = composer.MjxEnvironment(task)
+    state = jax.jit(environment.reset)(jax.random.key(0))
+    assert np.isfinite(jax.jit(environment.step)(state, jnp.zeros(0)).data.qpos).all()

@@ -202,3 +202,42 @@ def test_auto_takes_the_derivative_where_there_is_one(episode):
 def test_no_span_is_an_error(episode):
     with pytest.raises(UsageError, match="there is no segment"):
         Problem(Model(), [episode], [], LENGTH_S, CONFIG)
+
+
+def test_the_first_part_of_a_segment_is_simulated_but_not_compared(episode):
+    everything, rest = (Problem(Model(), [episode], SPANS, LENGTH_S, replace(CONFIG, skip_s=s)) for s in (0.0, 0.4))
+    values = {"gain": jnp.float32(1.0), "tau": jnp.float32(0.3), "offset": jnp.float32(0.0)}
+    (error, ts), (skipped, later) = (jax.jit(p.residuals)(values, 2, jnp.zeros(2)) for p in (everything, rest))
+    early = np.asarray(ts) < 0.4
+    assert early.sum() > 15
+    assert np.abs(error[early & (ts >= 0)]).max() > 1.0
+    np.testing.assert_array_equal(skipped, np.where(early[:, None], 0.0, error))
+    np.testing.assert_array_equal(later, np.where(early, -1.0, ts))
+    assert rest.measurements == sum(int((np.asarray(rest._ts[e]) >= 0.4).sum()) for e in rest.train)
+    assert rest.measurements < 0.7 * everything.measurements
+
+
+@pytest.mark.parametrize("skip_s", [-0.1, 10.5, float("nan")])
+def test_a_part_to_skip_that_makes_no_sense_is_refused(skip_s):
+    with pytest.raises(UsageError, match=r"skip_s must lie in \[0, 10\] s"):
+        FitConfig(skip_s=skip_s)
+
+
+def test_skipping_whole_segments_is_an_error(episode):
+    with pytest.raises(UsageError, match=r"segments of 1 s leave nothing to compare after their first 1\.5 s"):
+        Problem(Model(), [episode], SPANS, LENGTH_S, replace(CONFIG, skip_s=1.5))
+
+
+@pytest.mark.parametrize("outside", [False, True])
+def test_value_and_jacobian_are_those_of_the_residuals(episode, outside):
+    problem = Problem(Model(outside), [episode], SPANS[:3], LENGTH_S, CONFIG)
+    assert problem.forward == (not outside)
+    z = problem.table.start() + jnp.array([0.3, -0.2])
+    columns = jax.jit(problem.sensitivities)(z)
+    value, jacobian = jax.jit(problem.linearised)(z, columns)
+    smooth = Problem(Model(outside=False), [episode], SPANS[:3], LENGTH_S, CONFIG)
+    np.testing.assert_allclose(value, jax.jit(problem.stacked)(z, columns), rtol=1e-5, atol=1e-5)
+    exact = jax.jit(jax.jacfwd(lambda y: smooth.stacked(y, columns)))(z)
+    assert jacobian.shape == (*value.shape, 2)
+    size = np.abs(exact).max()
+    np.testing.assert_allclose(jacobian, exact, atol=(2e-3 if outside else 1e-5) * size)

@@ -8,11 +8,11 @@ from sim2real.stages.pipeline import available, load_pipeline
 INIT = "from sim2real.stages.pipeline import Pipeline\nPIPELINE = Pipeline({name!r}, {about!r}, __name__)\n"
 
 
-def write(folder, name, about="robot", calls_itself=None, text=None):
+def write(folder, name, about="robot", calls_itself=None, text=None, robot=None):
     target = folder / "pipelines" / name
     target.mkdir(parents=True)
     (target / "__init__.py").write_text(text or INIT.format(name=calls_itself or name, about=about))
-    (target / "robot.py").write_text(f"ABOUT = {about!r}\n")
+    (target / "robot.py").write_text(robot or f"ABOUT = {about!r}\n")
 
 
 def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
@@ -22,6 +22,15 @@ def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
     assert {"found_here", "pendulum"} <= set(available())
     assert load_pipeline("found_here").load().ABOUT == "robot"
     assert load_pipeline("found_here") is load_pipeline("found_here")
+
+
+def test_a_robot_may_be_an_object_of_its_module(tmp_path, monkeypatch):
+    write(tmp_path, "one_object", robot="class R:\n    ABOUT = 'object'\n\nROBOT = R()\nABOUT = 'module'\n")
+    monkeypatch.chdir(tmp_path)
+    pipeline = load_pipeline("one_object")
+    assert pipeline.load().ABOUT == "object"
+    assert pipeline.load() is pipeline.load("robot").ROBOT
+    assert pipeline.load("robot").ABOUT == "module", "by its name a module is itself"
 
 
 def test_folders_of_one_name_are_told_apart(tmp_path, monkeypatch):

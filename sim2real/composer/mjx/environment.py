@@ -114,6 +114,7 @@ class MjxEnvironment:
         gate.check_observables(observables)
         self.model = task.root_entity.mjcf_model.root_model.compile()
         gate.check_model(self.model)
+        gate.simplify_cone(self.model)
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None

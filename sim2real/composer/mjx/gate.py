@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from mujoco import mjx
+
 from sim2real.composer.observation.base import MujocoCamera, Observable
 from sim2real.composer.observation.mjcf import MJCFCamera
 from sim2real.composer.translate import mj
@@ -38,6 +40,16 @@ def check_model(model: Any) -> None:
             f"MJX has no integrator {mj.mjtIntegrator(model.opt.integrator).name}",
             hint="use Euler, RK4 or implicitfast",
         )
+
+
+def simplify_cone(model: Any) -> None:
+    """Make friction cones pyramidal where nothing can touch, and cones mean nothing.
+
+    With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
+    """
+    data: Any = mjx.make_data(model, impl="jax")
+    if model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC and data._impl.ncon == 0:
+        model.opt.cone = mj.mjtCone.mjCONE_PYRAMIDAL
 
 
 def check_observables(observables: Mapping[str, Observable]) -> None:

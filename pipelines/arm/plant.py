@@ -1,0 +1,186 @@
+"""The embedded arm's physics: C MuJoCo, with parameters that no stage of the pipeline is told.
+
+Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
+geometry is therefore written down a second time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+
+from sim2real.hardware.registers import PWM_FULL_SCALE, RAD_PER_COUNT, OperatingMode
+
+CENTRE_RAD: Final = 2048 * RAD_PER_COUNT
+"""Where the encoder stands while the joint is at 0 and the arm hangs [rad]."""
+
+NOMINAL_P_GAIN: Final = 800
+"""Position P Gain that ``gain`` is given for until the host writes another."""
+
+_STALL, _BACK_EMF, _ARMATURE, _VISCOUS, _COULOMB = 1.4, 0.22, 0.0045, 0.01, 0.03  # data sheet, at 12 V
+_P_GAIN_UNIT = 256  # counts of PWM per count of error, as the recordings in pipelines/xl330 show; the e-Manual says 128
+_STRIBECK_RAD_S = 0.1
+
+_MODEL = """
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <option timestep="{step_s}" gravity="0 0 -9.81" integrator="implicitfast">
+    <flag contact="disable"/>
+  </option>
+  <default>
+    <joint type="hinge" limited="true" armature="{armature}" damping="{viscous}"
+           solreffriction="{time_constant} 1" solimpfriction="0.999 0.999 0.001"/>
+  </default>
+  <worldbody>
+    <body name="pan" pos="0 0 0.40">
+      <joint name="pan" axis="0 0 1" range="-1.6 1.6"/>
+      <inertial pos="0.02 0 -0.02" mass="0.082" diaginertia="4e-5 6e-5 5e-5"/>
+      <body name="upper" pos="0.04 0 -0.03">
+        <joint name="shoulder" axis="0 -1 0" range="-1.6 1.6"/>
+        <inertial pos="0 0 -0.085" mass="0.097" diaginertia="1.6e-4 1.6e-4 2e-5"/>
+        <body name="fore" pos="0 0 -0.12">
+          <joint name="elbow" axis="0 -1 0" range="-1.9 1.9"/>
+          <inertial pos="0 0 -0.07" mass="0.055" diaginertia="9e-5 9e-5 8e-6"/>
+          <site name="tip" pos="0 0 -0.12"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+class _Firmware:
+    """What one servo's firmware makes of its goal: a share of the supply voltage. Angles are the joint's [rad]."""
+
+    def __init__(self) -> None:
+        self.mode = int(OperatingMode.OFF)
+        self.p_gain = NOMINAL_P_GAIN
+        self.profile_rad_s = math.inf
+        self._goal = 0.0
+        self._reference = 0.0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the winding is driven; else it is open, and there is no back-EMF."""
+        return self.mode != OperatingMode.OFF
+
+    def command(self, mode: int, goal: float, angle: float) -> None:
+        """Take a goal over; a position's reference starts from the present angle when this mode begins."""
+        if mode == OperatingMode.POSITION and self.mode != mode:
+            self._reference = angle
+        self.mode = mode if mode in (OperatingMode.POSITION, OperatingMode.PWM) else int(OperatingMode.OFF)
+        self._goal = goal - CENTRE_RAD if mode == OperatingMode.POSITION else goal
+
+    def duty(self, angle: float, step_s: float) -> float:
+        """Return the share of the supply voltage for the next step, in [-1, 1]."""
+        if self.mode == OperatingMode.PWM:
+            return self._goal
+        if self.mode != OperatingMode.POSITION:
+            return 0.0
+        reach = self.profile_rad_s * step_s
+        self._reference += min(max(self._goal - self._reference, -reach), reach)
+        error = round(self._reference / RAD_PER_COUNT) - round(angle / RAD_PER_COUNT)
+        pwm = self.p_gain / _P_GAIN_UNIT * error
+        return min(max(pwm / PWM_FULL_SCALE, -1.0), 1.0)
+
+
+class ArmPlant:
+    """A three-joint arm of X430-like servos that hangs from a gantry; all joints are at 0 while it hangs straight.
+
+    Servos 1, 2, 3 turn pan, shoulder and elbow. Modes 3 (position) and 16 (PWM) are emulated, any other one is torque
+    off. Position D Gain is not emulated, as the pipeline sets it to 0, nor are I Gain and Profile Acceleration.
+
+    Against the data sheet: a weaker motor, heavier rotors, and more friction, of which some only shows near standstill.
+
+    Args:
+        stall: Factor on the stall torque.
+        back_emf: Factor on the torque that the back-EMF takes from the motor.
+        armature: Factor on the rotors' reflected inertia.
+        coulomb: Factors on dry friction: pan, shoulder, elbow.
+        bump: Stribeck: by what share friction at standstill exceeds that at speed.
+        step_s: MuJoCo's time step [s].
+    """
+
+    servo_ids = (1, 2, 3)
+
+    def __init__(
+        self,
+        stall: float = 0.87,
+        back_emf: float = 1.1,
+        armature: float = 1.25,
+        coulomb: tuple[float, float, float] = (1.5, 1.9, 1.2),
+        bump: float = 0.2,
+        step_s: float = 0.0005,
+    ) -> None:
+        self._stall, self._back_emf, self._armature = stall * _STALL, back_emf * _BACK_EMF, armature * _ARMATURE
+        self._coulomb = [factor * _COULOMB for factor in coulomb]
+        self._bump = bump
+        # As stiff as the solver bears: at the default impedance an arm that friction should hold crawls.
+        text = _MODEL.format(step_s=step_s, armature=self._armature, viscous=_VISCOUS, time_constant=4 * step_s)
+        self.model = MjModel.from_xml_string(text)
+        self.data = MjData(self.model)
+        self._servos = [_Firmware() for _ in self.servo_ids]
+        # Kept, as looking an array up in MuJoCo's structures costs as much as reading it.
+        self._qpos, self._qvel, self._applied = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        self._friction, self._damping = self.model.dof_frictionloss, self.model.dof_damping
+        self._torques = [0.0, 0.0, 0.0]  # what drives the joints, without back-EMF [N m]
+
+    def advance(self, t_s: float) -> None:
+        """Integrate up to ``t_s`` [s]."""
+        model, data, step_s = self.model, self.data, self.model.opt.timestep
+        for _ in range(round((t_s - data.time) / step_s)):
+            angles, speeds = self._qpos.tolist(), self._qvel.tolist()
+            self._torques = [
+                self._stall * servo.duty(angle, step_s) for servo, angle in zip(self._servos, angles, strict=True)
+            ]
+            self._applied[:] = self._torques
+            self._friction[:] = [
+                level * (1.0 + self._bump * math.exp(-abs(speed) / _STRIBECK_RAD_S))
+                for level, speed in zip(self._coulomb, speeds, strict=True)
+            ]
+            mj_step(model, data)
+
+    def command(self, servo_id: int, mode: int, goal: float) -> None:
+        """Set a servo's goal: rad from the encoder's count 0 (position) or the share of the supply voltage (PWM)."""
+        joint = self.servo_ids.index(servo_id)
+        servo = self._servos[joint]
+        servo.command(mode, goal, float(self._qpos[joint]))
+        # The back-EMF brakes as damping does; there MuJoCo integrates it implicitly.
+        self._damping[joint] = _VISCOUS + (self._back_emf if servo.is_on else 0.0)
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's Position P Gain, and how fast its reference moves at most [rad/s]; inf is no limit."""
+        del d_gain  # not emulated
+        servo = self._servos[self.servo_ids.index(servo_id)]
+        servo.p_gain, servo.profile_rad_s = p_gain, profile_velocity_rad_s
+
+    def measure(self, servo_id: int) -> tuple[float, float, float]:
+        """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
+        joint = self.servo_ids.index(servo_id)
+        velocity = float(self._qvel[joint])
+        braking = self._back_emf * velocity if self._servos[joint].is_on else 0.0
+        return float(self._qpos[joint]) + CENTRE_RAD, velocity, (self._torques[joint] - braking) / self._stall
+
+    def state(self) -> dict[str, float]:
+        """Return the true joint angles [rad] and velocities [rad/s], and where the tip is [m]."""
+        mj_kinematics(self.model, self.data)  # a step leaves the site where the step began
+        rows = {"position": self._qpos, "velocity": self._qvel, "tip": self.data.site_xpos[0]}
+        return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
+
+    def truth(self) -> dict[str, Any]:
+        """Return what a log can tell: position gain [N m/rad], damping [N m s/rad], armature [kg m^2], friction [N m].
+
+        The gain is servo 1's, at the P gain that it has now; friction is the level at speed, without the bump.
+        """
+        duty_per_rad = self._servos[0].p_gain / _P_GAIN_UNIT / RAD_PER_COUNT / PWM_FULL_SCALE
+        return {
+            "gain": self._stall * duty_per_rad,
+            "damping": self._back_emf + _VISCOUS,
+            "armature": self._armature,
+            "friction_pan": self._coulomb[0],
+            "friction_shoulder": self._coulomb[1],
+            "friction_elbow": self._coulomb[2],
+        }

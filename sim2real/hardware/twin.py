@@ -1,0 +1,135 @@
+"""A plant made of a robot's own MJCF: the robot inside the computer where there is no hardware yet.
+
+Its numbers differ from the model's by factors, so that there is something to identify. It is no check of the model:
+what the MJCF has wrong, its twin has wrong, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+
+from sim2real.errors import UsageError
+from sim2real.hardware.registers import COUNTS_PER_REVOLUTION, RAD_PER_COUNT, OperatingMode
+
+_CENTRE_RAD = COUNTS_PER_REVOLUTION // 2 * RAD_PER_COUNT
+_FACTORS = ("gain", "damping", "armature", "friction")
+
+
+class TwinPlant:
+    """Position-controlled servos on a model's position actuators; see ``sim2real.hardware.plant.Plant``.
+
+    A joint is at 0 where its encoder shows its centre. With torque off the motor gives nothing, and what the model has
+    for damping goes on braking. Angles are compared in whole counts, as the firmware does.
+
+    Args:
+        mjcf: The model, with one position actuator a joint.
+        joints: Name of each joint, in the order of the servos -> its name in the model.
+        servo_ids: Their numbers on the bus.
+        p_gain: Position P Gain that the actuators' ``kp`` is for.
+        factors: By what the robot differs from the model: ``gain``, ``damping``, ``armature``, ``friction``.
+        step_s: MuJoCo's time step [s].
+
+    Raises:
+        UsageError: When a factor or a joint is unknown.
+    """
+
+    def __init__(
+        self,
+        mjcf: str,
+        joints: Mapping[str, str],
+        servo_ids: Sequence[int],
+        p_gain: int,
+        factors: Mapping[str, float] | None = None,
+        step_s: float = 0.0005,
+    ) -> None:
+        self.servo_ids = tuple(servo_ids)
+        self.joints = tuple(joints)
+        elements = [joints[name] for name in self.joints]
+        f = dict.fromkeys(_FACTORS, 1.0) | dict(factors or {})
+        if unknown := set(f) - set(_FACTORS):
+            raise UsageError(f"a twin has no factor {sorted(unknown)[0]!r}. Available: {', '.join(_FACTORS)}")
+        model = self.model = MjModel.from_xml_string(mjcf)
+        names = [model.joint(i).name for i in range(model.njnt)]
+        if lacking := [j for j in elements if j not in names]:
+            raise UsageError(f"the twin's model has no joint {lacking[0]!r}. Available: {', '.join(names)}")
+        model.opt.timestep = step_s
+        model.actuator_gainprm[:, 0] *= f["gain"]
+        model.actuator_biasprm[:, 1] *= f["gain"]
+        model.actuator_forcerange[:] *= f["gain"]
+        model.dof_damping[:] *= f["damping"]
+        model.dof_armature[:] *= f["armature"]
+        model.dof_frictionloss[:] *= f["friction"]
+        # As stiff as the solver bears: at the default what friction should hold crawls.
+        model.dof_solref[:] = (4 * step_s, 1.0)
+        model.dof_solimp[:, :3] = (0.999, 0.999, 0.001)
+        self.data = MjData(model)
+        self._p_gain, self._kp = p_gain, model.actuator_gainprm[:, 0].copy()
+        self._most = model.actuator_forcerange.copy()
+        self._qpos = [int(model.joint(j).qposadr[0]) for j in elements]
+        self._dofs = [int(model.joint(j).dofadr[0]) for j in elements]
+        driven = model.actuator_trnid[:, 0].tolist()
+        self._motors = [driven.index(int(model.joint(j).id)) for j in elements]
+        self._profiles = [float("inf")] * len(self.joints)
+        self._goals: list[float | None] = [None] * len(self.joints)
+        self._references = [0.0] * len(self.joints)
+
+    def advance(self, t_s: float) -> None:
+        """Integrate up to ``t_s`` [s]."""
+        model, data, step_s = self.model, self.data, self.model.opt.timestep
+        for _ in range(round((t_s - data.time) / step_s)):
+            for i, goal in enumerate(self._goals):
+                angle, motor = float(data.qpos[self._qpos[i]]), self._motors[i]
+                if goal is None:
+                    data.ctrl[motor] = angle
+                    continue
+                reach = self._profiles[i] * step_s
+                self._references[i] += min(max(goal - self._references[i], -reach), reach)
+                counts = round(self._references[i] / RAD_PER_COUNT) - round(angle / RAD_PER_COUNT)
+                data.ctrl[motor] = angle + counts * RAD_PER_COUNT
+            mj_step(model, data)
+
+    def command(self, servo_id: int, mode: int, goal: float) -> None:
+        """Set a servo's goal [rad from the encoder's count 0]; any mode but position is torque off."""
+        i = self.servo_ids.index(servo_id)
+        if mode == OperatingMode.POSITION and self._goals[i] is None:
+            self._references[i] = float(self.data.qpos[self._qpos[i]])
+        self._goals[i] = goal - _CENTRE_RAD if mode == OperatingMode.POSITION else None
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's Position P Gain, and how fast its reference moves at most [rad/s]; inf is no limit."""
+        del d_gain  # not emulated: a drive sets it to 0
+        i = self.servo_ids.index(servo_id)
+        motor = self._motors[i]
+        self._profiles[i] = profile_velocity_rad_s
+        kp = self._kp[motor] * p_gain / self._p_gain
+        self.model.actuator_gainprm[motor, 0], self.model.actuator_biasprm[motor, 1] = kp, -kp
+
+    def measure(self, servo_id: int) -> tuple[float, float, float]:
+        """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
+        i = self.servo_ids.index(servo_id)
+        load = float(self.data.actuator_force[self._motors[i]]) / float(self._most[self._motors[i], 1])
+        angle, speed = self.data.qpos[self._qpos[i]], self.data.qvel[self._dofs[i]]
+        return float(angle) + _CENTRE_RAD, float(speed), load
+
+    def state(self) -> dict[str, float]:
+        """Return the true joint angles [rad] and velocities [rad/s]."""
+        position = {f"position[{i}]": float(self.data.qpos[a]) for i, a in enumerate(self._qpos)}
+        return position | {f"velocity[{i}]": float(self.data.qvel[a]) for i, a in enumerate(self._dofs)}
+
+    def truth(self) -> dict[str, Any]:
+        """Return what a log can tell, under the names of ``sim2real.robots.standard``; shared ones of the first servo.
+
+        ``gain`` is that of ``p_gain``.
+        """
+        dof, motor = self._dofs[0], self._motors[0]
+        dofs = zip(self.joints, self._dofs, strict=True)
+        friction = {f"friction_{name}": float(self.model.dof_frictionloss[d]) for name, d in dofs}
+        return {
+            "gain": float(self._kp[motor]),
+            "damping": float(self.model.dof_damping[dof]),
+            "armature": float(self.model.dof_armature[dof]),
+            **friction,
+        }

@@ -1,0 +1,206 @@
+"""The nodes of a servo robot on hardware, and what holds port and torque while they run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.hardware.bus import BusConfig, StateReading
+from sim2real.hardware.drive import Drive
+from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.wire import EmulatorConfig
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """The robot inside the computer, for the port ``embedded``.
+
+    Attributes:
+        plant: ``package.module:Name`` or ``path/to/file.py:Name``.
+        emulator: Latencies and losses; its own seed does not count.
+        plant_args: Keyword arguments of the plant; must be JSON.
+    """
+
+    plant: str
+    emulator: EmulatorConfig = field(default_factory=EmulatorConfig)
+    plant_args: Mapping[str, Any] = field(default_factory=dict)
+
+
+class ServoSession:
+    """An open robot: the rig, and the embedded robot's process where that is what the port names.
+
+    Args:
+        bus: Port and limits of the bus; the port may be ``embedded``.
+        gate: The safety gate's limits.
+        ids: The servos.
+        drive: How they are driven.
+        embedded: The embedded robot; None: there is none.
+        truth_path: Where the embedded robot writes what really happened.
+        seed: Of the embedded robot's jitter and losses.
+
+    Raises:
+        UsageError: The port is ``embedded``, but the robot has none.
+        HardwareLost: The port cannot be opened, or a servo does not answer.
+    """
+
+    def __init__(
+        self,
+        bus: BusConfig,
+        gate: GateConfig,
+        ids: Sequence[int],
+        drive: Drive,
+        embedded: Embedded | None,
+        truth_path: Path,
+        seed: int,
+    ) -> None:
+        self._stack = ExitStack()
+        self.embedded: EmbeddedRobot | None = None
+        with ExitStack() as opening:
+            if bus.port == "embedded":
+                if embedded is None:
+                    raise UsageError("this robot has no embedded twin", hint="name its port with --port")
+                config = replace(embedded.emulator, seed=seed)
+                self.embedded = opening.enter_context(
+                    EmbeddedRobot(embedded.plant, config, embedded.plant_args, truth_path)
+                )
+                bus = replace(bus, port=self.embedded.port)
+                # The last command, torque off, takes its time to the motor; the truth shall show that it came.
+                opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
+            self.rig = opening.enter_context(ServoRig(bus, gate, ids, drive))
+            self._stack = opening.pop_all()
+
+    def __enter__(self) -> Self:
+        """Return the open robot, with torque off."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Make safe and close."""
+        self._stack.close()
+
+
+class ServoSensor(BaseNode):
+    """Reads all servos in one transaction; its time stamp is when the reading instruction left.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        rig: The robot.
+        message: Makes the node's message of a reading.
+        rest: The message of a robot at rest.
+        **options: As of ``BaseNode``.
+    """
+
+    jittable = False
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        rig: ServoRig,
+        message: Callable[[StateReading], Any],
+        rest: Any,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._rig, self._message, self._rest = rig, message, rest
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the robot at rest."""
+        del rng, graph_state
+        return self._rest
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Measure."""
+        reading = self._rig.measure()
+        ts = max(self.at(reading.transaction.t_sent_ns), float(step_state.ts))
+        return step_state.replace(ts=ts), self._message(reading)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class ServoActuator(BaseNode):
+    """Sends the agent's commands through the safety gate; its output is what was sent.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        rig: The robot.
+        field: Field of the agent's message that is the command, ``(servos,)``.
+        message: Makes the node's message of what was sent.
+        **options: As of ``BaseNode``.
+    """
+
+    jittable = False
+
+    def __init__(
+        self, name: str, rate: float, rig: ServoRig, field: str, message: Callable[[np.ndarray], Any], **options: Any
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._rig, self._field, self._message = rig, field, message
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return zeros."""
+        del rng, graph_state
+        return self._message(np.zeros(len(self._rig.ids)))
+
+    def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
+        """Switch the torque on."""
+        del graph_state, timeout
+        self._rig.start()
+        return True
+
+    def stop(self, timeout: float | None = None) -> bool:
+        """Switch the torque off."""
+        del timeout
+        self._rig.stop()
+        return True
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Command."""
+        message = step_state.inputs["agent"]
+        now_s = self.now()
+        age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
+        wanted = np.asarray(getattr(message.data, self._field)[-1], np.float64)
+        return step_state, self._message(self._rig.command(wanted, age_s, now_s))
+
+
+class Excitation(BaseNode):
+    """The agent's place while recording: plays a signal.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        signal: Shape ``(N, servos)``: one command a step; zeros afterwards.
+        message: Makes the node's message of a command.
+        **options: As of ``BaseNode``.
+    """
+
+    jittable = False
+
+    def __init__(
+        self, name: str, rate: float, signal: np.ndarray, message: Callable[[np.ndarray], Any], **options: Any
+    ) -> None:
+        super().__init__(name, rate, **options)
+        if not np.isfinite(signal).all():
+            raise UsageError("the excitation holds values that are no numbers")
+        self._signal, self._message = signal, message
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return zeros."""
+        del rng, graph_state
+        return self._message(np.zeros(self._signal.shape[1]))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Return the next command."""
+        seq = int(step_state.seq)
+        over = seq >= len(self._signal)
+        return step_state, self._message(np.zeros(self._signal.shape[1]) if over else self._signal[seq])

@@ -1,0 +1,54 @@
+"""A servo robot for the identify stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+
+from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import ParameterTable
+from sim2real.robots.devices import SimActuator, SimSensor
+from sim2real.robots.loop import delay_parameters, recorded_loop
+from sim2real.robots.messages import Goals
+
+if TYPE_CHECKING:
+    from sim2real.robots.servo_robot import ServoRobot
+
+
+class IdentifiableServos:
+    """Recorded goals in, joint positions and velocities out; see ``sim2real.identify.model.IdentifiableModel``.
+
+    Args:
+        robot: The robot.
+        max_delay_s: Upper bound of each delay [s].
+    """
+
+    sensor = "sensor"
+
+    def __init__(self, robot: ServoRobot, max_delay_s: float) -> None:
+        self._robot = robot
+        self.parameters = ParameterTable([*robot.dynamics(), *delay_parameters(max_delay_s, robot.tick_s)])
+        self.given: Mapping[str, Any] = {"actuator": Goals(goal="goal")}
+        sigmas = robot.position_sigma_rad, robot.velocity_sigma_rad_s
+        self.channels = tuple(
+            Channel("position", "velocity", *sigmas, index=i, label=joint)
+            for i, joint in enumerate(robot.servos.joints)
+        )
+
+    def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
+        """Return sensor, actuator and world, with delays of up to ``max_delay_s`` [s] between them."""
+        robot, world = self._robot, self._robot.make_world(resumed=True)
+        sensor = SimSensor("sensor", robot.RATE_HZ, world)
+        actuator = SimActuator("actuator", robot.RATE_HZ, len(robot.servos.joints))
+        return recorded_loop(sensor, actuator, world, max_delay_s, world.lead_s)
+
+    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+        """Return node parameters for values and initial positions, then velocities ``(2 * joints,)``."""
+        n = len(self._robot.servos.joints)
+        start = jnp.asarray(start)
+        params = self._robot.node_params(values, start[:n], start[n:], jnp.zeros(len(self._robot.aim)))
+        del params["agent"]
+        return params

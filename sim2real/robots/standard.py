@@ -1,0 +1,63 @@
+"""The parameters of robots whose servos are of one kind: what they share, and the friction of each joint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from sim2real.identify.parameters import Parameter
+from sim2real.robots.datasheet import DataSheet
+from sim2real.robots.parts import ServoDriven
+
+
+def parameters(sheet: DataSheet, joints: Sequence[str]) -> list[Parameter]:
+    """Return gain, damping, rotor inertia and each joint's friction, within factors of 3 to 8 of the data sheet."""
+    s = sheet
+    return [
+        Parameter("gain", "N m/rad", s.gain, s.gain / 3, s.gain * 3, about="torque per error, at the P gain in use"),
+        Parameter("damping", "N m s/rad", s.damping, s.damping / 4, s.damping * 4, about="back-EMF, viscous friction"),
+        Parameter("armature", "kg m^2", s.armature, s.armature / 4, s.armature * 4, about="rotor behind the gears"),
+        *(
+            Parameter(f"friction_{j}", "N m", s.friction, s.friction / 8, s.friction * 8, about="dry friction")
+            for j in joints
+        ),
+    ]
+
+
+def fields(robot: ServoDriven) -> dict[str, tuple[Any, str]]:
+    """Return where these parameters stand in a composed model: name -> (elements, attribute)."""
+    return {
+        "gain": (robot.actuators, "gainprm"),
+        "bias": (robot.actuators, "biasprm"),
+        "most": (robot.actuators, "forcerange"),
+        "damping": (robot.joints, "damping"),
+        "armature": (robot.joints, "armature"),
+        "friction": (robot.joints, "frictionloss"),
+    }
+
+
+def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str], step_s: float) -> dict[str, Any]:
+    """Return the arrays of ``fields`` for parameters by name.
+
+    Args:
+        values: Parameters by name.
+        sheet: The servo's data sheet.
+        joints: Names of the joints.
+        step_s: Of the physics [s].
+    """
+    n = len(joints)
+    gain, damping = (jnp.asarray(values[name], jnp.float32) for name in ("gain", "damping"))
+    # MuJoCo's implicit step brakes with the speed after it: as if a joint were heavier by half a step of damping. At
+    # 2.5 ms that is 6 % of the rotors' inertia of pipelines/arm, which an identification would take off.
+    armature = jnp.maximum(jnp.asarray(values["armature"]) - 0.5 * step_s * damping, 0.0)
+    return {
+        "gain": jnp.zeros((n, 10)).at[:, 0].set(gain),
+        "bias": jnp.zeros((n, 10)).at[:, 1].set(-gain),
+        # Duty ends at 1: a stronger motor pushes harder there, too.
+        "most": gain * sheet.full_rad * jnp.tile(jnp.array([[-1.0, 1.0]]), (n, 1)),
+        "damping": jnp.full(n, damping),
+        "armature": jnp.full(n, armature),
+        "friction": jnp.stack([jnp.asarray(values[f"friction_{j}"], jnp.float32) for j in joints]),
+    }

@@ -1,0 +1,230 @@
+"""The embedded arm against statics, kinematics and energy written down by hand."""
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.hardware.plant import load_plant
+from sim2real.hardware.registers import OperatingMode
+
+FILE = Path(__file__).resolve().parents[2] / "pipelines" / "arm" / "plant.py"
+ArmPlant = functools.partial(load_plant, f"{FILE}:ArmPlant")  # as the emulator gets it
+SMOOTH = {"coulomb": (0.0, 0.0, 0.0)}
+OFF, POSITION, PWM = OperatingMode.OFF, OperatingMode.POSITION, OperatingMode.PWM
+PAN, SHOULDER, ELBOW = 1, 2, 3
+CENTRE, COUNT, STEP_S, G = np.pi, 2 * np.pi / 4096, 0.0005, 9.81
+ARMATURE, VISCOUS, BACK_EMF, STALL = 0.0045 * 1.25, 0.01, 0.22 * 1.1, 1.4 * 0.87
+FRICTION = 0.03 * np.array([1.5, 1.9, 1.2])
+STATIC = FRICTION * 1.2
+
+
+def gravity(q):
+    """Torque that holds the arm at joint angles `(3,)`: the derivative of its potential energy [N m]."""
+    _, s, e = q
+    fore = 0.055 * G * 0.07 * np.sin(s + e)
+    return np.array([0.0, 0.097 * G * 0.085 * np.sin(s) + 0.055 * G * 0.12 * np.sin(s) + fore, fore])
+
+
+def energy(states):
+    """Kinetic and potential energy [J] of states `(N, 6)` while the pan joint rests."""
+    _, s, e, _, ds, de = states.T
+    w = ds + de
+    upper = 1.6e-4 + 0.097 * 0.085**2
+    speed2 = (0.12 * ds) ** 2 + (0.07 * w) ** 2 + 2 * 0.12 * 0.07 * ds * w * np.cos(e)
+    kinetic = (upper * ds**2 + 9e-5 * w**2 + 0.055 * speed2 + ARMATURE * (ds**2 + de**2)) / 2
+    return kinetic - 0.097 * G * 0.085 * np.cos(s) - 0.055 * G * (0.12 * np.cos(s) + 0.07 * np.cos(s + e))
+
+
+def pan_inertia(s, e):
+    """Moment of inertia about the pan axis [kg m^2]: rotor, and three bodies by the parallel axis theorem."""
+    inertia = ARMATURE + 5e-5 + 0.082 * 0.02**2
+    inertia += 1.6e-4 * np.sin(s) ** 2 + 2e-5 * np.cos(s) ** 2 + 0.097 * (0.04 + 0.085 * np.sin(s)) ** 2
+    reach = 0.04 + 0.12 * np.sin(s) + 0.07 * np.sin(s + e)
+    return inertia + 9e-5 * np.sin(s + e) ** 2 + 8e-6 * np.cos(s + e) ** 2 + 0.055 * reach**2
+
+
+def at(plant, *q):
+    plant.data.qpos[:] = q
+    return plant
+
+
+def command(plant, mode, goals):
+    for servo_id, goal in zip(plant.servo_ids, goals, strict=True):
+        plant.command(servo_id, mode, goal + CENTRE if mode == POSITION else goal)
+    return plant
+
+
+def trajectory(plant, duration_s):
+    """Advance and return joint angles and velocities at every step, `(N, 6)`."""
+    begin = plant.data.time
+    rows = []
+    for i in range(round(duration_s / STEP_S)):
+        rows.append(np.concatenate([plant.data.qpos, plant.data.qvel]))
+        plant.advance(begin + (i + 1) * STEP_S)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("goal", [(0.4, 0.9, -0.6), (-1.2, 1.3, 1.0), (0.0, -1.2, 0.3)])
+def test_it_droops_until_torques_balance(goal):
+    for factors, friction in (({}, STATIC), (SMOOTH, np.zeros(3))):
+        plant = command(ArmPlant(factors), POSITION, goal)
+        plant.advance(3.0)
+        q, gain = plant.data.qpos, plant.truth()["gain"]
+        # Goal and angle are rounded to counts, so that the error is known to one of them.
+        assert np.all(np.abs(gain * (np.array(goal) - q) - gravity(q)) <= friction + gain * COUNT)
+    assert abs(goal[1] - q[1]) > 0.04, "it does droop"
+
+
+def test_it_moves_no_faster_than_its_profile():
+    plant = at(ArmPlant(), -1.4, 0, 0)
+    plant.configure(PAN, 800, 0, 0.5)
+    speeds = trajectory(command(plant, POSITION, (1.4, 0, 0)), 5.0)[:, 3]
+    assert np.median(speeds) == pytest.approx(0.5, rel=0.01)
+    assert speeds.max() < 0.55
+    plant = at(ArmPlant(), -1.4, 0, 0)
+    speeds = trajectory(command(plant, POSITION, (1.4, 0, 0)), 1.0)[:, 3]
+    truth = plant.truth()
+    top = (STALL - truth["friction_pan"]) / truth["damping"]
+    assert 0.98 * top < speeds.max() < 1.001 * top
+
+
+@pytest.mark.parametrize("speed", [-2.2, -0.1, 0.2])
+def test_pwm_turns_it_at_the_speed_where_torques_balance(speed):
+    friction = FRICTION[0] * (1 + 0.2 * np.exp(-abs(speed) / 0.1))
+    duty = ((BACK_EMF + VISCOUS) * speed + np.sign(speed) * friction) / STALL
+    plant = command(at(ArmPlant(), 1.4 if speed < 0 else -1.4, 0, 0), POSITION, (0, 0, 0))
+    plant.command(PAN, PWM, duty)
+    assert trajectory(plant, 1.0)[-1, 3] == pytest.approx(speed, rel=5e-3)
+    assert plant.measure(PAN)[2] == pytest.approx(duty - BACK_EMF * plant.data.qvel[0] / STALL)
+
+
+@pytest.mark.parametrize("hold", [POSITION, OFF])
+def test_friction_sticks_rather_than_creeps(hold):
+    if hold == POSITION:
+        plant = command(ArmPlant(), POSITION, (0.5, 1.2, -0.7))
+        plant.advance(2.0)
+    else:
+        plant = at(ArmPlant(), 0.5, 0.3, 0.1)
+        assert np.all(np.abs(gravity(plant.data.qpos)) < STATIC)
+    states = trajectory(plant, 5.0)
+    assert np.ptp(states[:, :3], axis=0).max() < 1e-4
+
+
+def test_with_torque_off_it_comes_to_rest_hanging():
+    plant = command(at(ArmPlant(), 0.5, 1.4, 0.8), OFF, (0, 0, 0))
+    states = trajectory(plant, 6.0)
+    assert np.ptp(states[:, 1]) > 1.0
+    assert np.all(np.abs(gravity(states[-1, :3])) < STATIC)
+    assert np.ptp(states[-2000:, :3], axis=0).max() < 1e-4
+
+
+def test_torque_on_does_not_jump():
+    plant = command(ArmPlant(), POSITION, (-0.5, -1.0, 1.0))
+    plant.advance(1.0)
+    command(plant, OFF, (0, 0, 0))
+    at(plant, 0.3, 0.2, -0.1).data.qvel[:] = 0.0  # somebody turned it by hand
+    here = plant.data.qpos.copy()
+    assert np.ptp(trajectory(command(plant, POSITION, here), 0.5)[:, :3], axis=0).max() < 2 * COUNT
+    # Neither does a goal far away, where the profile is slow.
+    command(plant, OFF, (0, 0, 0))
+    for servo_id in plant.servo_ids:
+        plant.configure(servo_id, 800, 0, 0.2)
+    states = trajectory(command(plant, POSITION, (1.5, 1.5, 1.5)), 0.5)
+    assert np.ptp(states[:, :3], axis=0).max() < 0.2 * 0.5 + COUNT
+    assert np.abs(states[:, 3:]).max() < 0.4
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0), (0.7, 0.9, -0.4), (-1.3, -0.5, 1.8)])
+def test_the_tip_is_where_the_angles_put_it(q):
+    state = at(ArmPlant(), *q).state()
+    pan, s, e = q
+    reach = 0.04 + 0.12 * np.sin(s) + 0.12 * np.sin(s + e)
+    tip = reach * np.cos(pan), reach * np.sin(pan), 0.40 - 0.03 - 0.12 * np.cos(s) - 0.12 * np.cos(s + e)
+    assert list(state) == [f"{name}[{i}]" for name in ("position", "velocity", "tip") for i in range(3)]
+    np.testing.assert_allclose([state[f"tip[{i}]"] for i in range(3)], tip, atol=1e-9)
+    assert [state[f"position[{i}]"] for i in range(3)] == list(q)
+
+
+def test_state_is_of_now_and_not_of_a_step_ago():
+    plant = command(ArmPlant(), PWM, (1.0, 0, 0))
+    plant.advance(0.1)
+    state = plant.state()
+    assert np.arctan2(state["tip[1]"], state["tip[0]"]) == pytest.approx(state["position[0]"], abs=1e-3)
+
+
+@pytest.mark.parametrize(("s", "e"), [(0.0, 0.0), (1.4, 0.1)])
+def test_the_pan_joint_accelerates_rotor_and_arm(s, e):
+    plant = at(ArmPlant(SMOOTH), 0, s, e)
+    plant.command(PAN, PWM, 0.3)
+    states = trajectory(plant, 0.01)
+    damping = BACK_EMF + VISCOUS
+    expected = 0.3 * STALL / damping * -np.expm1(-damping * (len(states) - 1) * STEP_S / pan_inertia(s, e))
+    assert states[-1, 3] == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("factors", [{}, SMOOTH], ids=["rough", "smooth"])
+def test_energy_goes_into_friction(factors):
+    plant = command(at(ArmPlant(factors), 0, 1.4, -0.5), OFF, (0, 0, 0))
+    states = trajectory(plant, 1.0)
+    total, speed = energy(states), np.abs(states[:, 3:])
+    level = 0.0 if factors else FRICTION * (1 + 0.2 * np.exp(-speed / 0.1))
+    lost = (level * speed + VISCOUS * speed**2).sum() * STEP_S
+    assert total[0] - total[-1] == pytest.approx(lost, rel=0.02)
+    assert lost > 0.01
+
+
+def test_the_motor_brakes_only_while_torque_is_on():
+    """At a duty of 0 the winding is shorted and the back-EMF brakes; with torque off it is open."""
+    inertia = pan_inertia(0, 0)
+    for mode, damping in ((PWM, BACK_EMF + VISCOUS), (OFF, VISCOUS)):
+        plant = command(ArmPlant(SMOOTH), mode, (0, 0, 0))
+        plant.data.qvel[0] = 1.0
+        assert trajectory(plant, 0.0205)[-1, 3] == pytest.approx(np.exp(-damping * 0.02 / inertia), rel=0.02)
+
+
+def test_the_stops_hold():
+    plant = command(ArmPlant(), PWM, (1.0, 0, 0))
+    plant.advance(2.0)
+    assert plant.data.qpos[0] == pytest.approx(1.6, abs=0.02)
+
+
+def test_truth_says_what_it_is():
+    plant = ArmPlant()
+    assert plant.truth() == pytest.approx(
+        {
+            "gain": 1.4 * 0.87 * 800 / 256 * 4096 / (2 * np.pi) / 885,
+            "damping": 0.22 * 1.1 + 0.01,
+            "armature": 0.0045 * 1.25,
+            "friction_pan": 0.045,
+            "friction_shoulder": 0.057,
+            "friction_elbow": 0.036,
+        }
+    )
+    assert [plant.measure(i) for i in plant.servo_ids] == [(np.pi, 0.0, 0.0)] * 3
+
+
+def test_configure_changes_the_gain():
+    droops = []
+    for p_gain in (800, 1600):
+        plant = ArmPlant(SMOOTH)
+        before = plant.truth()["gain"]
+        for servo_id in plant.servo_ids:
+            plant.configure(servo_id, p_gain, 0, np.inf)
+        assert plant.truth()["gain"] == pytest.approx(before * p_gain / 800)
+        command(plant, POSITION, (0, 1.2, 0)).advance(3.0)
+        droops.append(1.2 - plant.data.qpos[1])
+    assert droops[0] == pytest.approx(2 * droops[1], rel=0.05)
+
+
+def test_it_imports_no_jax():
+    code = f"""
+import sys
+from sim2real.hardware.plant import load_plant
+load_plant({str(FILE) + ":ArmPlant"!r})
+sys.exit("jax" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

@@ -1,0 +1,187 @@
+"""A servo robot on hardware: the real nodes, rig and bus, on the arm's embedded robot."""
+
+from dataclasses import asdict, dataclass, replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.config import GateLimits
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.truth import Kind, read_truth
+from sim2real.log.reader import read_log
+from sim2real.robots.hardware import Excitation
+from sim2real.robots.messages import Goals
+from sim2real.stages.session import run_episode
+
+GATE = GateLimits(limit=1.5, slew_per_s=6.0, command_timeout_s=0.2, max_speed_rad_s=20.0, servo_watchdog_s=0.2)
+SIGNAL = np.concatenate([np.zeros((5, 3)), np.tile([0.3, 0.6, -0.4], (20, 1)), np.tile([0.2, 1.45, 0.1], (10, 1))])
+
+
+@dataclass(frozen=True)
+class Config:
+    seed: int = 0
+    port: str = "embedded"
+
+
+@struct.dataclass
+class Steady:
+    """A policy that moves all goals at one speed."""
+
+    action: jax.Array
+
+    def get_action(self, observation):
+        return self.action + 0.0 * jnp.sum(observation)
+
+
+def changed(pipeline, **servos):
+    """Return the arm, set up otherwise."""
+    robot = pipeline.load()
+    kind = type(robot)
+    return type("Changed", (kind,), {"servos": replace(robot.servos, **servos)})()
+
+
+def with_drive(pipeline, **settings):
+    """Return the arm with servos that are set up otherwise on the bus."""
+    sheet = pipeline.load().servos.sheet
+    drive = replace(sheet.drive, **settings)
+    kind = type("Sheet", (type(sheet),), {"drive": drive})
+    return changed(pipeline, sheet=kind(**asdict(sheet)))
+
+
+@pytest.fixture(scope="module")
+def episodes(arm, tmp_path_factory):
+    """A recording of 1 s and a deployment of 0.6 s on one open robot, and what was true."""
+    folder, robot = tmp_path_factory.mktemp("arm"), arm.load()
+    truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
+    policy = Steady(jnp.array([1.0, -0.5, 0.25]))
+    with robot.connect("embedded", GATE, truth, 3) as session:
+        range_ = session.rig.gate.config.range
+        config = Config()
+        robot.prepare(session, 5.0)
+        nodes = robot.recording_nodes(session, SIGNAL)
+        recorded = run_episode(arm, robot, session, nodes, {}, logs[0], 1.0, config, "record")
+        robot.prepare(session, 10.0)
+        nodes, params = robot.deployment_nodes(session, policy, trial=2)
+        deployed = run_episode(arm, robot, session, nodes, params, logs[1], 0.6, config, "deploy")
+        left = session.rig.wait_until_still(5.0).position_rad
+        robot.prepare(session, 10.0)
+        brought = session.rig.measure().position_rad
+    return SimpleNamespace(
+        robot=robot,
+        range=range_,
+        recorded=read_log(logs[0]),
+        deployed=read_log(logs[1]),
+        summaries=(recorded, deployed),
+        params=params,
+        left_at=left,
+        brought_to=brought,
+        truth=read_truth(truth),
+    )
+
+
+def test_the_gate_lets_through_what_both_the_robot_and_the_stage_allow(episodes):
+    low, high = episodes.range
+    np.testing.assert_allclose(low, [-1.4, -1.4, -1.5])
+    np.testing.assert_allclose(high, [1.4, 1.4, 1.5])
+
+
+def test_the_agents_place_plays_the_signal_and_then_zeros(episodes):
+    played = episodes.recorded.outputs["agent"]["goal"]
+    expected = np.concatenate([SIGNAL, np.zeros((len(played), 3))])[: len(played)]
+    assert len(played) > len(SIGNAL)
+    np.testing.assert_allclose(played, expected)
+
+
+def test_what_is_sent_is_within_the_limits_and_changes_no_faster_than_the_gate_lets_it(episodes):
+    sent = episodes.recorded.outputs["actuator"]["goal"]
+    assert sent.shape[1] == 3
+    assert np.abs(np.diff(sent, axis=0)).max() < 6.0 * 0.2 + 1e-9
+    assert sent[:, 1].max() <= 1.4 + 1e-6
+    assert episodes.summaries[0]["gate"]["clamped"] > 0
+    assert episodes.summaries[0]["gate"]["slewed"] > 0
+    wanted = SIGNAL[5]
+    np.testing.assert_allclose(sent[20], wanted, atol=1e-6)  # 15 steps on, the gate has let it get there
+
+
+def test_the_sensor_shows_where_the_joints_are_and_when_it_asked(episodes):
+    log, truth = episodes.recorded, episodes.truth
+    steps = log.steps["sensor"]
+    assert (steps.ts_overwrite >= steps.start).all()
+    assert (steps.ts_overwrite <= steps.end).all()
+    t_ns, states = truth.states()
+    t_s = (t_ns - episodes.summaries[0]["monotonic_ns"]) / 1e9
+    measured_s = steps.ts_overwrite / 1e6 - 0.006
+    for i in range(3):
+        true = np.interp(measured_s, t_s, states[f"position[{i}]"])
+        # A millisecond of jitter at a few rad/s, and half a count.
+        np.testing.assert_allclose(log.outputs["sensor"]["position"][:, i], true, atol=0.02)
+    assert np.ptp(log.outputs["sensor"]["position"], axis=0).min() > 0.2
+
+
+def test_a_policy_moves_goals_from_where_the_robot_is(episodes):
+    start, goals = np.asarray(episodes.params["agent"].start), episodes.deployed.outputs["agent"]["goal"]
+    count = np.arange(1, len(goals) + 1)[:, None]
+    expected = start + count / 50.0 * np.array([1.0, -0.5, 0.25])
+    np.testing.assert_allclose(goals, np.clip(expected, *episodes.range), atol=1e-4)
+    sent = episodes.deployed.outputs["actuator"]["goal"]
+    np.testing.assert_allclose(sent[-1], goals[: len(sent)][-1], atol=0.1)
+
+
+def test_the_log_says_what_the_episode_was_about_and_the_simulations_trial_is_the_same(episodes):
+    robot = episodes.robot
+    aims = episodes.deployed.outputs["agent"]["aim"]
+    expected = np.asarray(robot.draw_aim(jax.random.key(2)))
+    np.testing.assert_allclose(aims, np.tile(expected, (len(aims), 1)), atol=1e-6)
+    simulated = robot.simulation_params(robot.nominal(), None, trial=2)
+    np.testing.assert_array_equal(simulated["agent"].aim, expected)
+    np.testing.assert_array_equal(simulated["world"].values["target"], expected)
+
+
+def test_torque_is_on_during_episodes_and_off_at_the_end(episodes):
+    modes = episodes.truth.of(Kind.EFFECT)["values"][:, 0]
+    assert np.count_nonzero(modes == OperatingMode.POSITION) > 100
+    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
+
+
+def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes):
+    left, back = episodes.left_at, episodes.brought_to
+    assert left[0] > 0.3
+    assert np.abs(back).max() < 0.1
+
+
+@pytest.mark.parametrize("why", ["zero of the encoder", "rest that does not hold"])
+def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
+    """Brought to where it should rest, the shoulder falls."""
+    if why.startswith("zero"):
+        robot = with_drive(arm, zero_count=(2048, 2048 - 600, 2048))
+    else:
+        robot = changed(arm, rest=(0.0, 0.9, 0.0))
+    with (
+        robot.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as session,
+        pytest.raises(
+            SafetyStop, match=r"joint 'shoulder' rests at .* rad, not within 0\.4 rad of 0(\.9)? rad"
+        ) as caught,
+    ):
+        robot.prepare(session, 10.0)
+    assert "zero of its encoder" in caught.value.hint
+    modes = read_truth(tmp_path / "truth.bin").of(Kind.EFFECT)["values"][:, 0]
+    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
+
+
+def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
+    with pytest.raises(UsageError, match="has no embedded twin") as caught:
+        pair.connect("embedded", GATE, tmp_path / "truth.bin", 0)
+    assert "--port" in caught.value.hint
+    assert not (tmp_path / "truth.bin").exists()
+
+
+def test_an_excitation_of_no_numbers_is_refused():
+    signal = np.zeros((4, 3))
+    signal[2, 1] = np.nan
+    with pytest.raises(UsageError, match="no numbers"):
+        Excitation("agent", 50.0, signal, Goals)

@@ -1,0 +1,87 @@
+"""Identifying a servo robot: residuals of segments that C MuJoCo has played."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_robot import VALUES, play_on_c
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+
+MAX_DELAY_S, PERIOD_S, SEGMENT_S = 0.03, 0.02, 0.6
+SENSOR_DELAY_S = 0.01
+"""A tick: the sensor does not interpolate."""
+BEGINS_S = (0.35, 1.35)
+TRUTH = {**VALUES, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": 0.0}
+
+
+def steps(start, stamp, end):
+    none = np.zeros_like(start)
+    return Steps(scheduled=start, start=start, woken=start, ts_overwrite=stamp, end=end, drift=none)
+
+
+@pytest.fixture(scope="module")
+def episode(pair):
+    """Two seconds of the robot's own model on C: goals act from the tick after they were sent, half a step early."""
+    count = 110
+    t = PERIOD_S * np.arange(count)
+    goals = np.stack([0.6 * np.sin(4 * t), np.where(t % 1.0 < 0.5, 0.2, -0.1)], axis=1)
+    params = pair.node_params(VALUES, [0.0, 0.0], [0.0, 0.0], jnp.zeros(1))["world"]
+    _, positions, speeds, _ = play_on_c(pair, params, np.repeat(goals, 2, axis=0))
+    shown = np.concatenate([np.zeros((1, 2)), positions])[: 2 * count : 2]  # where joints are at 0, 20, 40 ms
+    fast = np.concatenate([np.zeros((1, 2)), speeds])[: 2 * count : 2]
+    slots = np.arange(count) * round(PERIOD_S * 1e6)
+    # A measurement is stamped a delay after the instant that it shows; goals leave just before their tick.
+    stamp = slots + round(SENSOR_DELAY_S * 1e6)
+    sent = np.maximum(slots - 1250 - 5, 0)
+    return Episode(
+        steps={"sensor": steps(stamp, stamp, stamp + 10), "actuator": steps(sent, np.full(count, -1), sent)},
+        messages={},
+        outputs={"sensor": {"position": shown, "velocity": fast}, "actuator": {"goal": goals}},
+    )
+
+
+@pytest.fixture(scope="module")
+def residuals(pair, episode):
+    """Residuals of both segments at the truth and with a wrong gain, from the middle of the recording."""
+    config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state="measured", jacobian="finite", skip_s=0.2)
+    spans = [Span(0, b) for b in BEGINS_S]
+    problem = Problem(pair.identifiable(MAX_DELAY_S), [episode], spans, SEGMENT_S, config)
+
+    def of(values):
+        return jax.vmap(lambda e: problem.residuals(values, e, jnp.zeros(4)))(jnp.arange(len(spans)))
+
+    run = jax.jit(of)
+    values = {n: jnp.float32(v) for n, v in TRUTH.items()}
+    found = {"true": run(values), "wrong": run({**values, "gain": 1.3 * values["gain"]})}
+    return SimpleNamespace(problem=problem, config=config, **{k: jax.tree.map(np.asarray, v) for k, v in found.items()})
+
+
+def test_its_channels_are_the_joints(residuals):
+    channels = residuals.problem.channels
+    assert [(c.position, c.index, c.label) for c in channels] == [("position", 0, "left"), ("position", 1, "right")]
+    assert [f for f, *_ in residuals.problem.fields] == ["position", "velocity"] * 2
+    assert set(residuals.problem.table.names) == set(TRUTH)
+
+
+def test_the_model_explains_what_its_own_physics_did_on_c(residuals):
+    """No profile is under way where these segments begin, but one of the joints is in full swing."""
+    error, ts = residuals.true
+    counted = ts >= 0
+    assert counted.sum() > 30
+    position = error[..., [0, 2]][counted] * 0.002
+    assert np.abs(position).max() < 0.002
+    wrong = residuals.wrong[0][..., [0, 2]][counted] * 0.002
+    assert np.sqrt(np.mean(wrong**2)) > 3 * np.sqrt(np.mean(position**2))
+
+
+def test_the_beginning_of_a_segment_is_simulated_but_does_not_count(residuals):
+    error, ts = residuals.true
+    assert np.all((ts == -1.0) | (ts >= residuals.config.skip_s))
+    assert not error[ts < 0].any()
+    assert ts.max() > SEGMENT_S - 0.05

@@ -1,0 +1,140 @@
+"""How late messages are: what is identified, what training draws, and the connections that must bear it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.graph import BaseNode
+from sim2real.graph.base import GraphState
+from sim2real.graph.node import BaseWorld
+from sim2real.identify.parameters import ParameterTable
+from sim2real.robots.loop import (
+    DELAYS,
+    DelayParams,
+    delay_bounds,
+    delay_of,
+    delay_parameters,
+    draw_values,
+    recorded_loop,
+    simulated_loop,
+)
+
+TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
+VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}
+DRAWS = {"gain": jnp.arange(10.0), "damping": 10.0 * jnp.arange(10.0)}
+
+
+@pytest.fixture
+def nodes():
+    return [*(BaseNode(name, 50.0) for name in ("sensor", "agent", "actuator")), BaseWorld("world", 1 / TICK_S)]
+
+
+def many(draws, spread_s, count):
+    draw = jax.jit(jax.vmap(lambda key: draw_values(key, VALUES, draws, spread_s)))
+    return {name: np.asarray(v) for name, v in draw(jax.random.split(jax.random.key(0), count)).items()}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Many episodes' parameters."""
+    return many(DRAWS, SPREAD_S, 500)
+
+
+def test_delays_to_identify_begin_where_the_sensor_need_not_see_the_future():
+    sensor, actuator = delay_parameters(0.06, TICK_S)
+    assert (sensor.name, actuator.name) == DELAYS
+    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (TICK_S, 0.06, 0.0, 0.06)
+    assert (sensor.side, actuator.side) == ("measurement", "command")
+    assert (sensor.leaf, actuator.leaf) == ("sensor.delay", "actuator.delay")
+    assert {sensor.kind, actuator.kind} == {"delay"}
+    assert {sensor.nominal, actuator.nominal} == {0.0}
+    table = ParameterTable([sensor, actuator])
+    for z in (-30.0, 0.0, 30.0):
+        found = table.decode(jnp.full(2, z))
+        assert TICK_S * (1 - 1e-6) <= float(found["sensor_delay"]) <= 0.06 * (1 + 1e-6)
+
+
+def test_a_delay_comes_from_the_nodes_parameters_where_they_have_one():
+    gs = GraphState(params={"sensor": DelayParams(delay=0.02), "actuator": DelayParams(), "world": object()})
+    assert delay_of("sensor", "world", gs) == {"world": 0.02}
+    for name in ("actuator", "world", "nobody"):
+        assert delay_of(name, "world", gs) == {}
+    assert delay_of("sensor", "world", None) == {}
+
+
+def test_a_row_of_draws_is_drawn_together_and_the_rest_is_fixed(drawn):
+    np.testing.assert_array_equal(drawn["damping"], 10.0 * drawn["gain"])
+    assert set(drawn["gain"].tolist()) == set(range(10))
+    assert set(drawn["friction"].tolist()) == {np.float32(0.1)}
+
+
+def test_drawn_delays_spread_around_their_values_independently_and_never_below_zero(drawn):
+    off = drawn["sensor_delay"] - VALUES["sensor_delay"]
+    assert np.abs(off).max() <= SPREAD_S * (1 + 1e-5)
+    assert np.ptp(off) > 1.9 * SPREAD_S
+    late = drawn["actuator_delay"]
+    assert late.min() == 0.0
+    assert late.max() <= VALUES["actuator_delay"] + SPREAD_S * (1 + 1e-5)
+    inside = late > 0
+    assert abs(np.corrcoef(off[inside], late[inside])[0, 1]) < 0.2
+
+
+def test_the_bounds_hold_whatever_is_drawn_and_interpolated(drawn):
+    bounds = delay_bounds(VALUES, TICK_S, SPREAD_S, LEAD_S)
+    lead = {"sensor_delay": 0.0, "actuator_delay": LEAD_S}
+    for name in DELAYS:
+        value, low, high = bounds[name]
+        assert value == pytest.approx(VALUES[name] + lead[name])
+        assert 0.0 <= low < value < high
+        used = drawn[name] + lead[name]
+        assert low - 1e-8 <= used.min()
+        assert used.max() <= high + 1e-8
+    assert bounds["sensor_delay"][1] == pytest.approx(0.013 - TICK_S - SPREAD_S)
+    assert bounds["actuator_delay"][1] == 0.0
+
+
+def test_the_same_key_draws_the_same_and_no_spread_draws_nothing():
+    one, two = (draw_values(jax.random.key(3), VALUES, DRAWS, SPREAD_S) for _ in range(2))
+    assert {k: float(v) for k, v in one.items()} == {k: float(v) for k, v in two.items()}
+    fixed = draw_values(jax.random.key(3), VALUES, {}, 0.0)
+    assert {k: float(v) for k, v in fixed.items()} == pytest.approx(VALUES)
+    assert draw_values(jax.random.key(3), {}, {}, 0.0) == {}
+
+
+def test_draws_of_unequal_length_use_rows_that_all_have():
+    draws = {"gain": jnp.arange(3.0), "damping": jnp.arange(100.0)}
+    drawn = many(draws, 0.0, 60)
+    np.testing.assert_array_equal(drawn["gain"], drawn["damping"])
+    assert set(drawn["gain"].tolist()) == {0.0, 1.0, 2.0}
+
+
+def test_the_loop_in_simulation_has_trainable_delays_at_the_world_alone(nodes):
+    sensor, agent, actuator, world = nodes
+    bounds = delay_bounds(VALUES, TICK_S, SPREAD_S, LEAD_S)
+    found = simulated_loop(sensor, agent, actuator, world, bounds)
+    assert list(found) == ["sensor", "agent", "actuator", "world"]
+    assert [agent.inputs["sensor"].blocking, actuator.inputs["agent"].blocking] == [True, True]
+    for connection, name, interp in (
+        (world.inputs["actuator"], "actuator_delay", "zoh_mean"),
+        (sensor.inputs["world"], "sensor_delay", "linear"),
+    ):
+        dist = connection.delay_dist
+        assert (dist.min, dist.max, dist.interp) == (*bounds[name][1:], interp)
+        assert float(dist.delay) == pytest.approx(bounds[name][0], rel=1e-5)
+        assert connection.skip
+        assert not connection.blocking
+
+
+def test_without_delays_the_loop_has_none(nodes):
+    found = simulated_loop(*nodes, None)
+    assert not any(c.trainable or c.delay for n in found.values() for c in n.inputs.values())
+
+
+def test_a_recorded_loop_bears_every_delay_that_may_be_identified(nodes):
+    sensor, _, actuator, world = nodes
+    found = recorded_loop(sensor, actuator, world, 0.06, LEAD_S)
+    assert list(found) == ["sensor", "actuator", "world"]
+    assert (world.inputs["actuator"].delay_dist.min, world.inputs["actuator"].delay_dist.max) == (0.0, 0.06 + LEAD_S)
+    assert (sensor.inputs["world"].delay_dist.min, sensor.inputs["world"].delay_dist.max) == (0.0, 0.06)
+    assert actuator.inputs == {}, "what it sent was recorded"

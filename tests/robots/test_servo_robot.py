@@ -1,0 +1,132 @@
+"""What a servo robot tells the stages, of a small one and of the arm."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_robot import SHEET, VALUES, PairRobot
+
+from sim2real.graph.base import InputState, StepState
+from sim2real.graph.episode import named_leaves
+from sim2real.robots.agent import AgentParams
+from sim2real.robots.datasheet import DataSheet
+from sim2real.robots.messages import Decision, JointReading
+
+
+class Slouching(PairRobot):
+    """Shows features of its own, no past, and hangs askew."""
+
+    servos = replace(PairRobot.servos, rest=(0.1, -0.2))
+    features = (("error", ("rad", "rad")),)
+    history = 0
+
+    def observe(self, reading, goal, aim):
+        return goal - reading.position
+
+
+class Aimless(PairRobot):
+    aim = ()
+
+    def draw_aim(self, key):
+        return jnp.zeros(0)
+
+
+def observation_of(robot):
+    """Return what the policy sees in the first step of the loop in simulation."""
+    nodes, task = robot.training(robot.nominal(), {}, {}, False)
+    agent, n, one = nodes["agent"], len(robot.servos.joints), jnp.zeros(1)
+    reading = JointReading(jnp.zeros((1, n)), jnp.zeros((1, n)))
+    params = AgentParams(aim=jnp.zeros(len(robot.aim)), start=jnp.zeros(n))
+    step_state = StepState(
+        state=agent.init_state(), params=params, inputs={"sensor": InputState(one.astype(int), one, one, reading)}
+    )
+    return task, task.observe(step_state)
+
+
+@pytest.mark.parametrize("kind", [PairRobot, Slouching, Aimless, "arm"])
+def test_an_observation_has_as_many_entries_as_the_robot_announces(kind, arm):
+    robot = arm.load() if kind == "arm" else kind()
+    task, seen = observation_of(robot)
+    announced = sum(len(units) * history for _, units, history in robot.OBSERVATION)
+    assert seen.shape == (announced,) == (task.observation_size,)
+    assert all(units and history > 0 for _, units, history in robot.OBSERVATION)
+
+
+def test_it_names_its_units_joints_and_actions(pair):
+    assert pair.UNITS == {"position": "rad", "velocity": "rad/s", "goal": "rad", "aim[0]": "rad"}
+    assert pair.JOINTS == {
+        "sensor": {
+            "left": {"position": "position[0]", "velocity": "velocity[0]"},
+            "right": {"position": "position[1]", "velocity": "velocity[1]"},
+        }
+    }
+    assert pair.ACTION == [("speed of left's goal", "rad/s"), ("speed of right's goal", "rad/s")]
+    assert [(name, len(units), steps) for name, units, steps in pair.OBSERVATION] == [
+        ("position", 2, 1),
+        ("velocity", 2, 1),
+        ("goal", 2, 1),
+        ("aim", 1, 1),
+        ("past position, velocity, goal", 6, 2),
+    ]
+    assert pair.COMMAND[1] in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
+    assert pair.tick_s == 0.01
+
+
+def test_a_data_sheets_gain_is_the_torque_of_a_step_of_error():
+    sheet = DataSheet(stall=1.4, damping=0.23, armature=0.0045, friction=0.03, p_gain=800)
+    counts = 885 / (800 / 256)
+    assert sheet.full_rad == pytest.approx(counts * 2 * np.pi / 4096, rel=1e-6)
+    assert sheet.gain == pytest.approx(1.4 / sheet.full_rad)
+    assert (sheet.drive.p_gain, sheet.drive.profile_velocity_rad_s, sheet.drive.d_gain) == (800, 5.0, 0)
+
+
+def test_nominal_values_are_the_data_sheets_without_delays(pair):
+    assert pair.nominal() == {
+        "gain": pytest.approx(SHEET.gain),
+        "damping": 0.2,
+        "armature": 0.01,
+        "friction_left": 0.02,
+        "friction_right": 0.02,
+    }
+    for p in pair.dynamics():
+        assert p.low < p.nominal < p.high
+
+
+def test_parameters_land_in_the_nodes_that_need_them(pair):
+    values = {**VALUES, "sensor_delay": 0.012, "actuator_delay": 0.02}
+    params = pair.node_params(values, [0.1, 0.2], [1.0, 2.0], jnp.array([0.4]), policy="policy")
+    world = params["world"]
+    np.testing.assert_array_equal(world.qpos, np.float32([0.1, 0.2]))
+    np.testing.assert_array_equal(world.qvel, [1.0, 2.0])
+    assert (params["sensor"].delay, params["actuator"].delay) == (0.012, 0.02)
+    agent = params["agent"]
+    np.testing.assert_array_equal(agent.start, world.qpos)
+    assert (agent.policy, float(agent.aim[0])) == ("policy", pytest.approx(0.4))
+    for name in ("sensor", "actuator"):
+        assert pair.node_params(VALUES, [0, 0], [0, 0], jnp.zeros(1))[name].delay is None
+    compiled = pair.make_world().init_params()
+    shapes = {k: (v.shape, v.dtype) for k, v in compiled.values.items()}
+    assert {k: (v.shape, v.dtype) for k, v in world.values.items()} == shapes
+
+
+def test_numbers_of_the_data_sheet_are_those_of_the_compiled_model(pair):
+    """But for the inertia, which MuJoCo's implicit step adds to by half a step of damping."""
+    compiled = pair.make_world().init_params().values
+    placed = pair.place(pair.nominal(), jnp.zeros(1))
+    for name in set(compiled) - {"armature"}:
+        np.testing.assert_allclose(placed[name], compiled[name], rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(placed["armature"], compiled["armature"] - 0.5 * 0.005 * 0.2, rtol=1e-5)
+    light = pair.place({**pair.nominal(), "armature": 1e-4}, jnp.zeros(1))["armature"]
+    np.testing.assert_array_equal(light, [0.0, 0.0])
+
+
+def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
+    robot = Slouching()
+    params = [robot.simulation_params(robot.nominal(), None, trial) for trial in (0, 1, 1)]
+    np.testing.assert_array_equal(params[0]["world"].qpos, np.float32([0.1, -0.2]))
+    np.testing.assert_array_equal(params[0]["world"].qvel, [0.0, 0.0])
+    aims = [float(p["agent"].aim[0]) for p in params]
+    assert aims[0] != aims[1] == aims[2]
+    assert aims[1] == float(robot.draw_aim(jax.random.key(1))[0])

@@ -1,0 +1,80 @@
+"""The nodes of a servo robot in simulation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_robot import SHEET
+
+from sim2real.composer.mjx.environment import State
+from sim2real.composer.world import ComposedWorld
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.robots.agent import AgentParams
+from sim2real.robots.loop import DelayParams
+from sim2real.robots.messages import Decision, Goals, JointReading
+from sim2real.robots.simulated import SimActuator, SimSensor
+
+
+def heard(sender, message):
+    one = jnp.zeros(1)
+    row = jax.tree_util.tree_map(lambda x: jnp.asarray(x)[None], message)
+    return {sender: InputState(jnp.zeros(1, jnp.int32), one, one, row)}
+
+
+def test_an_episode_starts_where_the_parameters_say(played):
+    np.testing.assert_allclose(played.first.position, [0.3, -0.2], atol=1e-7)
+    # A leapfrog's speed, half a step on: the joints fall and brake meanwhile.
+    np.testing.assert_allclose(played.first.velocity, [0.0, 0.5], atol=0.03)
+
+
+def test_references_begin_where_the_joints_are(played):
+    reach = 0.01 * SHEET.profile_rad_s
+    expected = np.clip(played.goals[0], played.params.qpos - reach, played.params.qpos + reach)
+    np.testing.assert_allclose(played.references[0], expected, atol=1e-6)
+    assert np.abs(played.goals[0] - expected).max() > 0.2, "these goals were far"
+
+
+def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair, monkeypatch):
+    """What nobody measures is where profiles were up to; later ticks leave references alone."""
+    monkeypatch.setattr(ComposedWorld, "step", lambda self, step_state: (step_state, None))
+    goal, before = jnp.array([0.7, -0.4]), jnp.array([0.1, 0.2])
+    for resumed, tick, expected in ((True, 0, goal), (True, 1, before), (False, 0, before)):
+        world = pair.make_world(resumed)
+        state = State(*[None] * 13).replace(
+            steps=jnp.int32(tick), variables={"goal": before, "reference": before, "other": before}
+        )
+        after, _ = world.step(StepState(state=state, inputs=heard("actuator", Goals(goal))))
+        np.testing.assert_array_equal(after.state.variables["reference"], expected)
+        np.testing.assert_array_equal(after.state.variables["goal"], before)
+        np.testing.assert_array_equal(after.state.variables["other"], before)
+
+
+def test_the_world_is_half_a_step_behind_its_commands(played):
+    world = played.world
+    assert world.lead_s == 0.0025
+    gs = GraphState(params={"actuator": DelayParams(delay=0.02), "sensor": DelayParams(delay=0.005)})
+    assert world.init_delays(None, gs) == {"actuator": pytest.approx(0.0225)}
+    for params in ({}, {"actuator": DelayParams()}):
+        assert world.init_delays(None, GraphState(params=params)) == {}
+
+
+def test_the_sensor_passes_on_what_the_world_shows_with_its_own_delay(played):
+    sensor = SimSensor("sensor", 50.0, played.world)
+    message = JointReading(jnp.array([0.1, 0.2]), jnp.array([1.0, 2.0]))
+    _, passed = sensor.step(StepState(inputs=heard("world", message)))
+    np.testing.assert_array_equal(passed.position, message.position)
+    np.testing.assert_array_equal(passed.velocity, message.velocity)
+    gs = GraphState(params={"actuator": DelayParams(delay=0.02), "sensor": DelayParams(delay=0.005)})
+    assert sensor.init_delays(None, gs) == {"world": 0.005}
+    assert sensor.init_delays(None, GraphState()) == {}
+    assert sensor.init_params().delay is None
+
+
+def test_the_actuator_passes_goals_on_and_holds_the_start_before():
+    actuator = SimActuator("actuator", 50.0, 2)
+    _, goals = actuator.step(StepState(inputs=heard("agent", Decision(jnp.array([0.3, 0.4]), jnp.zeros(1)))))
+    np.testing.assert_array_equal(goals.goal, np.float32([0.3, 0.4]))
+    at_rest = actuator.init_output(None, GraphState())
+    np.testing.assert_array_equal(at_rest.goal, [0.0, 0.0])
+    gs = GraphState(params={"agent": AgentParams(start=jnp.array([0.5, -0.1]))})
+    np.testing.assert_array_equal(actuator.init_output(None, gs).goal, np.float32([0.5, -0.1]))

@@ -1,0 +1,104 @@
+"""Training on a servo robot: what episodes are given, and the loop in simulation that they are played in."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_robot import VALUES
+
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.train.env import GraphEnvironment
+
+DELAYED = {**VALUES, "sensor_delay": 0.015, "actuator_delay": 0.012}
+DRAWS = {"gain": np.array([3.0, 4.0, 5.0]), "damping": np.array([0.1, 0.2, 0.3])}
+SPEEDS = jnp.array([1.5, -1.0])
+
+
+@pytest.fixture(scope="module")
+def trained(pair):
+    """The loop with delays, and half a second in which the goals move at one speed."""
+    nodes, task = pair.training(DELAYED, DRAWS, {}, True)
+    graph = CompiledGraph(nodes, pair.SUPERVISOR, draw(nodes, 0.5))
+    env = GraphEnvironment(graph, task)
+
+    def run(key):
+        def step(state, _):
+            made = env.step(state, SPEEDS, key)
+            world = made.state.graph.state["world"]
+            kept = {"reward": made.reward, "seen": made.observation, "goal": made.state.graph.state["agent"].goal}
+            return made.state, {**kept, "joints": world.data.qpos, "of_task": world.reward}
+
+        first, seen = env.reset(key)
+        return first.graph.params, seen, jax.lax.scan(step, first, length=env.length)[1]
+
+    params, first, rows = jax.jit(run)(jax.random.key(5))
+    return SimpleNamespace(nodes=nodes, task=task, params=params, first=first, rows=jax.tree.map(np.asarray, rows))
+
+
+@pytest.fixture(scope="module")
+def drawn(trained):
+    """The parameters of many episodes."""
+    keys = jax.random.split(jax.random.key(0), 400)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(trained.task.params))(keys))
+
+
+def test_half_of_the_episodes_start_from_rest_and_half_from_anywhere(pair, drawn):
+    starts = drawn["world"].qpos
+    resting = np.all(starts == 0.0, axis=1)
+    assert 0.4 < resting.mean() < 0.6
+    low, high = np.array(pair.servos.low), np.array(pair.servos.high)
+    assert np.all((starts >= low) & (starts <= high))
+    assert np.all(np.ptp(starts[~resting], axis=0) > 0.9 * (high - low))
+    np.testing.assert_array_equal(drawn["agent"].start, starts)
+    assert not drawn["world"].qvel.any()
+
+
+def test_dynamics_are_drawn_together_and_delays_and_aims_vary(drawn):
+    gain, damping = drawn["world"].values["gain"][:, 0, 0], drawn["world"].values["damping"][:, 0]
+    assert set(np.round(gain, 3).tolist()) == {3.0, 4.0, 5.0}
+    np.testing.assert_allclose(damping, 0.1 * (gain - 2.0), rtol=1e-5)
+    for name, value in (("sensor", 0.015), ("actuator", 0.012)):
+        off = drawn[name].delay - value
+        assert np.abs(off).max() <= 0.002 * (1 + 1e-5)
+        assert np.ptp(off) > 0.0035
+    aims = drawn["agent"].aim[:, 0]
+    assert -0.4 <= aims.min() < -0.3
+    assert 0.7 < aims.max() <= 0.8
+
+
+def test_the_actions_are_speeds_of_the_goals(pair, trained):
+    np.testing.assert_array_equal(trained.task.action_low, [-2.0, -2.0])
+    np.testing.assert_array_equal(trained.task.action_high, [2.0, 2.0])
+    start, goals = np.asarray(trained.params["agent"].start), trained.rows["goal"]
+    count = np.arange(1, len(goals) + 1)[:, None]
+    expected = np.clip(start + count / 50.0 * np.asarray(SPEEDS), pair.servos.low, pair.servos.high)
+    np.testing.assert_allclose(goals, expected, atol=1e-5)
+
+
+def test_the_joints_follow_and_the_policy_sees_them_late(trained):
+    joints, seen = trained.rows["joints"], trained.rows["seen"]
+    goals = trained.rows["goal"]
+    assert np.abs(np.ptp(goals, axis=0)).min() > 0.2
+    lag = goals[10:] - joints[10:]
+    assert np.all(lag * np.sign(np.asarray(SPEEDS)) > -0.05)
+    assert np.abs(lag).max() < 0.3
+    # A row ends with the next policy step: what it sees is 15 ms old.
+    age = np.abs(seen[10:, :2] - joints[10:])
+    assert 0.0 < age.max() < 0.06
+    np.testing.assert_allclose(seen[:, 4:6], goals, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 6], float(trained.params["agent"].aim[0]), atol=1e-6)
+
+
+def test_the_first_observation_is_of_the_start(trained):
+    start = np.asarray(trained.params["agent"].start)
+    np.testing.assert_allclose(trained.first[:2], start, atol=1e-4)
+    np.testing.assert_allclose(trained.first[4:6], start, atol=1e-6)
+    assert not np.asarray(trained.first[7:]).any(), "no history yet"
+
+
+def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
+    price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.servos.speed) ** 2)
+    np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)

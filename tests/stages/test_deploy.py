@@ -1,0 +1,67 @@
+"""What a deployment's states are called, for scores and for pages."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.stages import deploy
+from sim2real.stages.pipeline import load_pipeline
+
+ARM = load_pipeline("arm").load()
+
+
+def steps(count, stamped=True):
+    at = 20_000 * np.arange(count)
+    stamp = at + 500 if stamped else np.full(count, -1)
+    return Steps(scheduled=at, start=at, woken=at, ts_overwrite=stamp, end=at + 900, drift=0 * at)
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory):
+    """The states of a deployment of the arm without an embedded robot."""
+    rows = np.arange(50.0)[:, None] + np.array([0.0, 0.1, 0.2])
+    outputs = {
+        "sensor": {"position": 0.01 * rows, "velocity": rows},
+        "agent": {"goal": 2 * rows[:49], "aim": 0 * rows[:49] + [0.1, 0.2, 0.3]},
+        "actuator": {"goal": 3 * rows[:48]},
+    }
+    episode = Episode(
+        steps={n: steps(len(next(iter(o.values())))) for n, o in outputs.items()}, messages={}, outputs=outputs
+    )
+    nowhere = tmp_path_factory.mktemp("deploy") / "truth.bin"
+    return outputs, *deploy._true_states(nowhere, {}, episode, ARM)
+
+
+def test_vectors_become_columns(states):
+    outputs, t_s, found = states
+    for field in ("position", "velocity"):
+        for i in range(3):
+            np.testing.assert_array_equal(found[f"{field}[{i}]"], outputs["sensor"][field][:, i])
+    np.testing.assert_allclose(t_s, 0.02 * np.arange(50) + 0.0005)
+
+
+def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
+    outputs, _, found = states
+    for i in range(3):
+        np.testing.assert_array_equal(found[f"command[{i}]"], outputs["actuator"]["goal"][:, i])
+        assert set(found[f"aim[{i}]"]) == {0.1 * (i + 1)} or np.allclose(found[f"aim[{i}]"], 0.1 * (i + 1))
+    names = [f"{field}[{i}]" for field in ("aim", "command", "position", "velocity") for i in range(3)]
+    assert sorted(found) == sorted(names), "what the agent wanted is not what was sent: it is left out"
+
+
+def test_the_arms_score_reads_them(states):
+    _, t_s, found = states
+    assert set(ARM.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
+
+
+def test_numbers_keep_their_names():
+    robot = SimpleNamespace(COMMAND=("actuator", "action"))
+    sent = deploy._sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
+    assert {n: v.tolist() for n, v in sent.items()} == {"command": [0.0, 1.0, 2.0, 3.0]}
+    columns = deploy._columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})
+    assert {n: v.tolist() for n, v in columns.items()} == {
+        "th": [0, 1, 2],
+        **{f"pose[{i}]": [i, 4 + i, 8 + i] for i in range(4)},
+    }
