@@ -77,7 +77,7 @@ def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
     def reached(key: str) -> str:
         distances = seed[key]
         good = sum(d < CLOSE_M for d in distances)
-        return f"{good} of {len(distances)} deployments, in the middle {1e3 * statistics.median(distances):.0f} mm off"
+        return f"{good} of {len(distances)} deployments, median {1e3 * statistics.median(distances):.1f} mm off"
 
     truth = seed["round_trip_ms"] - seed["round_trip_error_ms"]
     stages = ", ".join(f"{stage} {seed[f'{stage}_s']:.0f}" for stage in ("record", "identify", "train", "deploy"))
@@ -89,7 +89,7 @@ def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
         ("within 2 cm of the target", reached("distances_m")),
         ("the same without identification", reached("nominal_distances_m")),
         ("time", f"{seed['total_s']:.0f} s on two CPU cores ({stages} s)"),
-        ("training on a GPU", f"{trained['train_s']:.0f} s after {trained['compile_s']:.0f} s of compilation ({device})"),
+        ("training on a GPU", f"{trained['train_s']:.0f} s, and {trained['compile_s']:.0f} s to compile ({device})"),
     ]
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
