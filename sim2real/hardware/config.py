@@ -12,11 +12,11 @@ class GateLimits:
     """The safety gate: what no command gets past."""
 
     limit: float = 2.0
-    """Largest command in either direction [the actuator's unit; V for the pendulum]."""
+    """Largest command in either direction [the actuator's unit: V for the pendulum, rad for the arm]."""
     slew_per_s: float = 400.0
     """Fastest change of the command [unit/s]."""
     command_timeout_s: float = 0.1
-    """A command older than this becomes zero [s]."""
+    """A command older than this becomes zero volts; servos in position mode hold where they are [s]."""
     max_speed_rad_s: float = 60.0
     """Joint speed above which the robot is stopped [rad/s]."""
     servo_watchdog_s: float = 0.1

@@ -322,6 +322,12 @@ class ServoRobot(ABC):
         rest = self.servos.at_rest
         return self.node_params(values, rest, np.zeros_like(rest), self.draw_aim(jax.random.key(trial)), policy)
 
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str:
+        """Return the robot's model with what was found, as MJCF."""
+        s, task = self.servos, self.task
+        text = task.root_entity.mjcf_model.root_model.to_xml_string()
+        return standard.identified_mjcf(text, task.robot, values, s.sheet, s.joints)
+
     def nominal(self) -> dict[str, float]:
         """Return the data sheet's values, without delays."""
         return {p.name: p.nominal for p in self.dynamics()}

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from sim2real.composer.translate import mj
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.parts import ServoDriven
@@ -61,3 +62,27 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str], st
         "armature": jnp.full(n, armature),
         "friction": jnp.stack([jnp.asarray(values[f"friction_{j}"], jnp.float32) for j in joints]),
     }
+
+
+def identified_mjcf(
+    mjcf: str, robot: ServoDriven, values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str]
+) -> str:
+    """Return a model's MJCF with these parameters in it, for any tool that reads it.
+
+    Args:
+        mjcf: The composed model.
+        robot: The robot in it.
+        values: Parameters by name.
+        sheet: The servo's data sheet.
+        joints: Names of the joints.
+    """
+    spec: Any = mj.MjSpec.from_string(mjcf)
+    gain = float(values["gain"])
+    for name, element, actuator in zip(joints, robot.joints, robot.actuators, strict=True):
+        joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
+        joint.damping = [float(values["damping"]), *joint.damping[1:]]
+        joint.armature, joint.frictionloss = float(values["armature"]), float(values[f"friction_{name}"])
+        motor.gainprm, motor.biasprm = [gain, *motor.gainprm[1:]], [0.0, -gain, *motor.biasprm[2:]]
+        motor.forcerange = [-gain * sheet.full_rad, gain * sheet.full_rad]
+    spec.compile()
+    return spec.to_xml()

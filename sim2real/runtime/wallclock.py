@@ -81,6 +81,11 @@ class WallClockRun:
     def begin(self, timeout_s: float) -> None:
         """Start the nodes up, each in its thread, and then the clock."""
         self._shared.timeout_s = timeout_s
+        with self._stop_lock:
+            self._refuse_if_stopped()
+            # Before the startups, which may switch torque on: collecting garbage holds every thread up, for half a
+            # second in a large process, and a servo's watchdog would trip.
+            self._process.enter_context(realtime())
         deadline = time.monotonic() + timeout_s
         for thread in self._threads.values():
             thread.start()
@@ -94,9 +99,7 @@ class WallClockRun:
                 )
         self.check()
         with self._stop_lock:
-            if self._stopped:
-                raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
-            self._process.enter_context(realtime())
+            self._refuse_if_stopped()
         self._clock.begin(_LEAD_S)
         for node in self._nodes.values():
             node.set_clock(self._clock.now_s, self._clock.origin_ns)
@@ -104,6 +107,10 @@ class WallClockRun:
             ahead_ns = self._clock.origin_ns - time.monotonic_ns()
             self._recorder.start(time.time_ns() + ahead_ns, self._clock.origin_ns)
         self._shared.go.set()
+
+    def _refuse_if_stopped(self) -> None:
+        if self._stopped:
+            raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
 
     def check(self) -> None:
         """Stop and raise the failure, if there was one that nobody has heard of."""

@@ -159,3 +159,15 @@ def test_the_command_line_tells_about_it(capsys, tmp_path):
     assert "three-joint arm" in said
     assert "skip" in said
     assert PIPELINE.identify.skip_s == 0.3
+
+
+def test_what_was_found_is_written_as_mjcf():
+    found = {"gain": 2.8, "damping": 0.25, "armature": 0.0056, "sensor_delay": 0.01}
+    found |= {f"friction_{joint}": 0.03 + 0.01 * i for i, joint in enumerate(ROBOT.servos.joints)}
+    model = mujoco.MjModel.from_xml_string(ROBOT.identified_mjcf(found))
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 2.8)
+    np.testing.assert_allclose(model.actuator_biasprm[:, 1], -2.8)
+    np.testing.assert_allclose(model.actuator_forcerange[:, 1], 2.8 * ROBOT.servos.sheet.full_rad, rtol=1e-5)
+    np.testing.assert_allclose(model.dof_damping, 0.25)
+    np.testing.assert_allclose(model.dof_armature, 0.0056)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.03, 0.04, 0.05])
