@@ -1,6 +1,7 @@
 """What goes wrong on the wall clock: exceptions, silence, every order of calls."""
 
 import contextlib
+import gc
 import threading
 import time
 
@@ -225,3 +226,19 @@ def test_any_order_of_calls(clock, sequences):
     if clock is Clock.WALL_CLOCK:
         assert sensor.calls == ["startup", "stop"] * (len(sensor.calls) // 2)
         assert len(sensor.calls) > 20
+
+
+def test_garbage_is_collected_before_a_startup_may_switch_torque_on():
+    """Collecting holds up every thread, the one that feeds a servo's watchdog too."""
+
+    class Watches(Plain):
+        def startup(self, graph_state, timeout=None):
+            self.collecting = gc.isenabled()
+            return super().startup(graph_state, timeout)
+
+    sensor, agent = pair(Watches)
+    was = gc.isenabled()
+    run(sensor, agent, 0.1)
+    assert was
+    assert not sensor.collecting
+    assert gc.isenabled()
