@@ -280,8 +280,14 @@ class ServoRobot(ABC):
             )
 
     def recording_nodes(self, session: ServoSession, signal: np.ndarray) -> dict[str, BaseNode]:
-        """Return the graph on hardware that plays goals, one row a step ``(N, joints)`` [rad]."""
+        """Return the graph on hardware that plays goals, one row a step ``(N, joints)`` [rad].
+
+        A joint that stands elsewhere comes to its signal slowly, at 1 rad/s, instead of in a leap.
+        """
         signal = np.asarray(signal, np.float64).reshape(-1, len(self.servos.joints))
+        away = session.rig.measure().position_rad - signal[0]
+        gone = np.arange(len(signal))[:, None] * _HOME_RAD_S / self.RATE_HZ
+        signal = signal + np.sign(away) * np.maximum(np.abs(away) - gone, 0.0)
         agent = Excitation("agent", self.RATE_HZ, signal, Goals, delay=EXPECTED_DELAY_S["agent"])
         return self._on_hardware(session, agent)
 

@@ -1,6 +1,7 @@
 """What a servo robot tells the stages, of a small one and of the arm."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -130,3 +131,16 @@ def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
     aims = [float(p["agent"].aim[0]) for p in params]
     assert aims[0] != aims[1] == aims[2]
     assert aims[1] == float(robot.draw_aim(jax.random.key(1))[0])
+
+
+def test_a_recording_begins_where_the_joints_are(pair):
+    reading = SimpleNamespace(position_rad=np.array([1.0, -0.3]))
+    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
+    signal = 0.2 * np.sin(np.arange(100))[:, None] * np.ones(2)
+    agent = pair.recording_nodes(session, signal)["agent"]
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
+    np.testing.assert_allclose(played[0], reading.position_rad)
+    off = np.abs(played - signal)
+    assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.RATE_HZ + 1e-9
+    np.testing.assert_array_equal(played[51:], signal[51:])
+    np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])
