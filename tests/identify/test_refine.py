@@ -119,9 +119,10 @@ def test_the_pendulum_is_where_scipy_finds_it(fitted, refined):
 
     start = refined.z + np.array([0.1, -0.1, 0.1, -0.1, 0.05, 0.0])
     found = optimize.least_squares(lambda z: at(z)[0], start, jac=lambda z: at(z)[1], x_scale="jac")
-    # Friction and late commands make kinks: from one start or another, and by the last bit of the rollout, either may
-    # end up to 2 % above the other.
-    assert found.cost / problem.measurements == pytest.approx(refined.loss, rel=0.03)
+    # Kinks of friction and late commands make local optima 2 % apart: from the same start ours must not be the worse.
+    refined = refine(problem, start[None])
+    assert refined.loss < 1.005 * found.cost / problem.measurements
+    assert refined.loss > 0.97 * found.cost / problem.measurements
     decode = problem.table.decode
     theirs, ours = decode(jnp.asarray(found.x, jnp.float32)), decode(jnp.asarray(refined.z))
     for group in ("gain", "gravity", "damping", "friction"):
