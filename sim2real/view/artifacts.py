@@ -99,14 +99,14 @@ def _unit(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _of_episode(arrays: Mapping[str, np.ndarray], number: int) -> list[Series]:
-    """Return the series of one simulated episode: fields ``NAME_i`` at the times ``t_NAME_i``, else ``t_i``."""
+    """Return the series of one simulated episode: fields ``NAME_i`` at times ``t_NAME_i``, else ``t_i``."""
     suffix = f"_{number}"
     own = {n.removesuffix(suffix): v for n, v in arrays.items() if n.endswith(suffix)}
     found: list[Series] = []
     for name, values in own.items():
         if name == "t" or name.startswith("t_"):
             continue
-        t_s = own.get(f"t_{name}", own["t"])
+        t_s = own.get(f"t_{name.partition('[')[0]}", own["t"])  # a vector's entries share their times
         if len(t_s) != len(values):
             # Commands have a rate of their own: evenly over the same time, if nothing says when they were sent.
             t_s = np.arange(len(values)) * (float(own["t"][-1]) / len(values))
