@@ -18,7 +18,7 @@ test: $(READY)
 	$(BIN)/python -m pytest
 
 bench: $(READY)
-	for bench in graph train async demo; do $(BIN)/python scripts/bench.py $$bench || exit 1; done
+	for bench in graph train async log demo; do $(BIN)/python scripts/bench.py $$bench || exit 1; done
 
 docs: $(DOCS_READY)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html docs docs/_build/html

@@ -1,8 +1,11 @@
 """Benchmarks: each against a named yardstick in the same run.
 
     python scripts/bench.py demo --seeds 0 1 2 3 4 --json reports/demo.json
+    python scripts/bench.py graph --help
+    python scripts/bench.py train --quick
 
-prints a table and writes machine, versions and rows: ``{"name", "value", "unit", "yardstick", "goal"}``.
+prints a table and, with --json, writes a report: rows (``{"name", "value", "unit", "yardstick", "goal"}``), flags,
+machine, versions, and the state of the code that was measured.
 """
 
 from __future__ import annotations
@@ -13,20 +16,14 @@ import json
 import os
 import platform
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-BENCHES = {
-    "arm": "arm_demo",
-    "async": "asynchronous",
-    "compose": "compose",
-    "demo": "demo",
-    "graph": "graph",
-    "identify": "identify",
-    "train": "train",
-}
+from benches.catalogue import BENCHES, measures
+from benches.provenance import ROOT, state
 
 
 def machine() -> dict[str, Any]:
@@ -36,26 +33,65 @@ def machine() -> dict[str, Any]:
     if cpuinfo.is_file():
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
         model = names[0] if names else model
-    return {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+    found = {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+    if "jax" in sys.modules:
+        import jax
+
+        found["devices"] = sorted({d.device_kind for d in jax.devices()})
+    return found
 
 
-def main() -> int:
+def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
+    """Return the bench's module, and its flags."""
+    listed = "\n".join(f"  {name:10}{about.summary}" for name, about in BENCHES.items())
+    raw = argparse.RawDescriptionHelpFormatter
+    every = argparse.ArgumentParser(
+        prog="bench.py", description=__doc__, epilog=f"benches:\n{listed}", formatter_class=raw
+    )
+    every.add_argument("bench", choices=BENCHES, metavar="BENCH", help="one of those below")
+    every.add_argument("flags", nargs=argparse.REMAINDER, metavar="...", help="its flags: BENCH --help lists them")
+    chosen = every.parse_args(arguments)
+    module = importlib.import_module(f"benches.{BENCHES[chosen.bench].module}")
+    parser = argparse.ArgumentParser(
+        prog=f"bench.py {chosen.bench}", description=module.__doc__, formatter_class=raw, allow_abbrev=False
+    )
+    parser.set_defaults(bench=chosen.bench)
+    module.add_flags(parser)
+    parser.add_argument(
+        "--quick", action="store_true", help="tiny sizes, in seconds: shows that it runs, measures nothing"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write a report")
+    parser.add_argument("--commit", help="the commit of this copy of the code, where the copy has no git history")
+    if "--quick" in chosen.flags:
+        parser.set_defaults(**module.QUICK)
+    return module, parser.parse_args(chosen.flags)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run one bench."""
+    module, options = parse(arguments)
+    from sim2real.errors import Sim2RealError
     from sim2real.stages.console import table
-    from sim2real.stages.manifest import versions
+    from sim2real.stages.manifest import plain, versions
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bench", choices=BENCHES)
-    parser.add_argument("--json", type=Path, help="write the rows, machine and versions to this file")
-    known, rest = parser.parse_known_args()
-    result = importlib.import_module(f"benches.{BENCHES[known.bench]}").main(rest)
+    flags = {n: v for n, v in vars(options).items() if n not in ("bench", "quick", "json", "commit")}
+    about = {"bench": options.bench, "quick": options.quick, "flags": flags}
+    # What is measured is what lies there now: a long run must not report files that were edited meanwhile.
+    about |= state(measures(options.bench, flags), ROOT, options.commit)
+    try:
+        result = module.run(options)
+    except Sim2RealError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
     headers = ["name", "value", "unit", "yardstick", "goal"]
     print(table([[row.get(h) for h in headers] for row in result["rows"]], headers))
-    if known.json:
-        known.json.parent.mkdir(parents=True, exist_ok=True)
-        document = {"machine": machine(), "versions": versions(), **result}
-        known.json.write_text(json.dumps(document, indent=1) + "\n")
-        print(f"wrote {known.json}")
+    if options.quick:
+        print("quick: tiny sizes, these figures measure nothing", file=sys.stderr)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        document = plain({**about, "machine": machine(), "versions": versions(), **result})
+        options.json.write_text(json.dumps(document, indent=1) + "\n")
+        print(f"wrote {options.json}", file=sys.stderr)
     return 0
 
 

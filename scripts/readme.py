@@ -1,23 +1,37 @@
-"""Write the tables of README.md from reports/: ``python scripts/readme.py``."""
+"""Write the tables of README.md from reports/: ``python scripts/readme.py``.
+
+A report that is of another state of the code than this one is refused, unless it is named after --stale-ok.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import statistics
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parent.parent
-CASES = ("disk", "xl330", "so101")
+sys.path.insert(0, str(Path(__file__).parent))
+
+from benches.catalogue import measures
+from benches.provenance import ROOT, why_stale
+
+TABLES = {
+    "demo": ("demo",),
+    "arm": ("arm_cpu", "arm_h200"),
+    "real": ("identify_disk", "identify_xl330", "identify_so101"),
+}
+"""Tables of README.md, and the reports that each is made of."""
 CLOSE_M = 0.02
 """How near the arm's tip must come to its target [m]."""
 
 
-def table(report: dict[str, Any]) -> str:
+def demo(report: dict[str, Any]) -> str:
     """Return the table: one line a figure, the worst of all seeds first."""
     seeds = report["seeds"]
-    worst = {n: max(abs(s["group_errors"][n]) for s in seeds) for n in seeds[0]["group_errors"]}
+    worst = {n: max(abs(s["errors"][n]) for s in seeds) for n in seeds[0]["errors"]}
     name = max(worst, key=lambda n: worst[n])
     ours = [d for s in seeds for d in s["deployments"]]
     nominal = [d for s in seeds for d in s["nominal_deployments"]]
@@ -49,7 +63,7 @@ def table(report: dict[str, Any]) -> str:
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
 
-def real_motors(reports: dict[str, dict[str, Any]]) -> str:
+def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
     """Return the table of recordings of real motors: ours, mujoco.sysid in the same run, ours without delay."""
     v = {r["name"].removeprefix("identify/"): r["value"] for report in reports.values() for r in report["rows"]}
     moved = [n for n in v if n.startswith("so101/") and n.endswith("_sysid_rmse_mrad")]
@@ -94,7 +108,14 @@ def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
 
-def updated(readme: str, tables: dict[str, str]) -> str:
+def origin(reports: Mapping[str, dict[str, Any]]) -> str:
+    """Return the line below a table: which state of the code each of its reports is of."""
+    commits = {name: (report.get("commit") or "")[:7] for name, report in reports.items()}
+    listed = ", ".join(f"{f'`{sha}`' if sha else 'not recorded'} ({name})" for name, sha in commits.items())
+    return f"\nCommit that was measured: {listed}.\n"
+
+
+def updated(readme: str, tables: Mapping[str, str]) -> str:
     """Return the README with each table between the two markers of its name."""
     for name, text in tables.items():
         begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->\n"
@@ -103,18 +124,51 @@ def updated(readme: str, tables: dict[str, str]) -> str:
     return readme
 
 
-def tables() -> dict[str, str]:
-    """Return the tables, from the committed reports."""
-    names = ("demo", "arm_cpu", "arm_h200", *(f"identify_{c}" for c in CASES))
-    report = {n: json.loads((ROOT / "reports" / f"{n}.json").read_text()) for n in names}
-    demo, cpu, gpu = (report.pop(n) for n in ("demo", "arm_cpu", "arm_h200"))
-    return {"demo": table(demo), "arm": arm(cpu, gpu), "real": real_motors(report)}
+def read_reports() -> dict[str, dict[str, Any]]:
+    """Return the committed reports that the tables are made of, by name."""
+    names = [name for table in TABLES.values() for name in table]
+    return {name: json.loads((ROOT / "reports" / f"{name}.json").read_text()) for name in names}
 
 
-def main() -> int:
+def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
+    """Return the tables."""
+    own = {table: {name: reports[name] for name in names} for table, names in TABLES.items()}
+    text = {
+        "demo": demo(own["demo"]["demo"]),
+        "arm": arm(own["arm"]["arm_cpu"], own["arm"]["arm_h200"]),
+        "real": real_motors(own["real"]),
+    }
+    return {table: text[table] + origin(own[table]) for table in TABLES}
+
+
+def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str, str]:
+    """Return why reports do not speak of the code as it is, by name."""
+    found = {}
+    for name, report in reports.items():
+        paths = measures(report["bench"], report["flags"]) if "bench" in report else ()
+        if why := why_stale(report, paths, root):
+            found[name] = why
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Update README.md in place."""
+    parser = argparse.ArgumentParser(prog="readme.py", description=__doc__)
+    names = [name for table in TABLES.values() for name in table]
+    parser.add_argument(
+        "--stale-ok", nargs="+", default=[], choices=names, metavar="REPORT",
+        help=f"take these reports although what they measure has changed since: {', '.join(names)}",
+    )  # fmt: skip
+    accepted = parser.parse_args(arguments).stale_ok
+    reports = read_reports()
+    refused = {name: why for name, why in stale(reports).items() if name not in accepted}
+    for name, why in refused.items():
+        print(f"error: reports/{name}.json: {why}", file=sys.stderr)
+    if refused:
+        print(f"\nhint: measure again, or --stale-ok {' '.join(refused)}", file=sys.stderr)
+        return 1
     readme = ROOT / "README.md"
-    readme.write_text(updated(readme.read_text(), tables()))
+    readme.write_text(updated(readme.read_text(), tables(reports)))
     return 0
 
 

@@ -1,97 +1,105 @@
-"""A six-hinge arm on MJX in a graph, against the same number of bare ``mjx.step`` in the same motion."""
+"""The arm's whole run for several seeds, and beside it the same training on the nominal model without delays.
+
+On an accelerator, the training alone, in a run folder that holds a recording and an identification:
+
+    python scripts/bench.py arm --train RUN -- --ppo.num-envs 1024
+"""
 
 from __future__ import annotations
 
-import sys
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
-from benches.graph import EPISODES, MODEL, compare, row, unroll_of
-from sim2real.graph.base import GraphState, StepState
-from sim2real.graph.node import BaseNode
-from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
+from benches import demo, stages
+from benches.figures import row
 
-
-def arm() -> tuple[Any, dict[str, BaseNode]]:
-    """Return a six-hinge arm with friction loss on MJX, and its graph with a policy at 50 Hz over a world at 100 Hz."""
-    import mujoco
-
-    from sim2real.worlds.mjx import MjxWorld
-
-    link = (
-        '<body pos="0 0 {z}"><joint name="j{i}" axis="{axis}" damping=".05" frictionloss=".02" armature=".01"/>'
-        '<geom type="capsule" fromto="0 0 0 0 0 .2" size=".02" mass=".2" contype="0" conaffinity="0"/>'
-    )
-    bodies = "".join(link.format(z=0.2 * (i > 0), i=i, axis="0 1 0" if i % 2 else "1 0 0") for i in range(6))
-    motors = "".join(f'<position joint="j{i}" kp="2"/>' for i in range(6))
-    text = (
-        '<mujoco><option timestep="0.01" iterations="4" ls_iterations="4"/><worldbody>'
-        f"{bodies}{'</body>' * 6}</worldbody><actuator>{motors}</actuator></mujoco>"
-    )
-    world = MjxWorld("world", 100.0, mujoco.MjModel.from_xml_string(text))
-    agent = ArmAgent("actuator", 50.0, delay_dist=0.002)
-    agent.connect(world, skip=True, delay_dist=0.01)
-    world.connect(agent, skip=True, delay_dist=0.012)
-    return world, {"actuator": agent, "world": world}
+CLOSE_M = 0.02
+SETTLE_S = 0.3
+"""How long a prediction is simulated before it is compared [s]."""
+QUICK = demo.QUICK
 
 
-class ArmAgent(BaseNode):
-    """Waves six joints."""
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the joints at zero."""
-        del rng, graph_state
-        return MODEL.Command(action=jnp.zeros(6))
-
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Return the next set points, and lean on what the joints do."""
-        return step_state, MODEL.Command(action=wave(step_state.ts, step_state.inputs["world"][-1].data.qpos))
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--keep", type=Path, help="keep the run folders here")
+    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+    parser.add_argument("--train", type=Path, metavar="RUN", help="only train, on an accelerator, in this run folder")
+    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run arm`, with --train of `train arm`")
 
 
-def wave(t: Any, q: Any) -> Any:
-    """Return the arm's set points at a time [s] and at joint angles ``(6,)`` [rad]."""
-    return 0.3 * jnp.sin(3.0 * t + jnp.arange(6.0)) - 0.1 * q
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Run the arm once a seed, or train it; return the rows and a record of every seed."""
+    if options.train:
+        return {"rows": train_rows(options.train.resolve(), options.flags)}
+    with tempfile.TemporaryDirectory() as scratch:
+        root = (options.keep or Path(scratch)).resolve()
+        seeds = [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
+    return {"rows": rows(seeds), "seeds": seeds}
 
 
-def mjx_case(device: str, copies: int, repeats: int) -> list[dict]:
-    """Measure the arm's graph against the same number of bare ``mjx.step``."""
-    from mujoco import mjx
+def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Run the arm, and the baseline where that is asked for, and collect what the stages measured."""
+    run_dir, result = stages.whole_run("arm", seed, runs, options.flags)
+    result["mae_mrad"] = held_out_mae_mrad(stages.done(run_dir, "identify").output("predictions"))
+    # How far the tip was from the target in the last half second of each deployment.
+    result["distances_m"] = stages.deployed(run_dir, "distance_m")
+    if not options.no_nominal:
+        baseline = stages.nominal_run("arm", seed, runs, run_dir)
+        result["nominal_distances_m"] = stages.deployed(baseline, "distance_m")
+    return result
 
-    world, graph_nodes = arm()
-    graph = CompiledGraph(graph_nodes, "actuator", draw(graph_nodes, 1.0, EPISODES, 0))
-    ticks = graph.rows * graph.wiring.ticks
 
-    def start(key: Any) -> Any:
-        # Every copy from a place of its own: XLA would compute equal copies only once.
-        params = world.init_params()
-        return params.replace(qpos=params.qpos + jax.random.uniform(key, (6,), minval=-0.1, maxval=0.1))
+def held_out_mae_mrad(predictions: Path) -> float:
+    """Return the mean absolute error of predicted joint positions on held-out data [mrad]."""
+    samples = np.load(predictions)
+    ahead = samples["held_out"] & (samples["into"] > SETTLE_S)
+    joints = [n.removesuffix("_measured") for n in samples.files if n.endswith("_measured") and "velocity" not in n]
+    errors = [np.abs(samples[f"{j}_identified"] - samples[f"{j}_measured"])[ahead].mean() for j in joints]
+    return 1e3 * float(np.mean(errors))
 
-    def in_graph(key: Any) -> Any:
-        eps = jax.random.randint(key, (), 0, graph.episodes)
-        return graph.rollout(graph.init(key, {"world": start(key)}, eps=eps))[0].state["world"].qpos.sum()
 
-    def bare(key: Any) -> Any:
-        params = start(key)
-        data = world.init_state(key, GraphState(params={"world": params}))
+def train_rows(run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
+    """Train in a run folder that holds a recording and an identification; return how long that took."""
+    import jax
 
-        def step(d: Any, t: Any) -> tuple[Any, None]:
-            # The same motion as in the graph: the solver's iterations depend on what the arm does.
-            return mjx.step(params.model, d.replace(ctrl=wave(t, d.qpos))), None
-
-        moved, _ = jax.lax.scan(step, data, jnp.arange(ticks) / world.rate, unroll=unroll_of(graph.wiring.ticks))
-        return moved.qpos.sum()
-
-    seconds, compile_s = compare({"bare": bare, "graph": in_graph}, copies, repeats)
-    name = f"graph/{device}/mjx_arm/{copies}"
-    print(name, seconds, graph.report(), file=sys.stderr)
-    rate = copies * ticks / seconds["graph"]
-    bare_rate = copies * ticks / seconds["bare"]
-    over = round(seconds["graph"] / seconds["bare"], 3)
-    return [
-        row(f"{name}/over_bare", over, "1", "bare mjx.step in the same motion", "<= 1.1"),
-        row(f"{name}/ticks_per_s", round(rate), "1/s", f"{bare_rate:.3g} bare"),
-        row(f"{name}/compile_s", round(compile_s["graph"], 1), "s", f"{compile_s['bare']:.1f} bare"),
+    begin = time.monotonic()
+    stages.sim2real("train", "arm", "--run", str(run_dir), "--runs", str(run_dir.parent.parent), *flags)
+    total_s = time.monotonic() - begin
+    history = json.loads(stages.done(run_dir, "train").output("history").read_text())
+    success = np.max(history["success"], axis=1)
+    good = np.flatnonzero(success >= 0.95)
+    first_s = history["seconds"][int(good[0])] if good.size else None
+    found = [
+        ("compile_s", history["compile_s"], "s", ""),
+        ("train_s", history["train_s"], "s", ""),
+        ("time_to_0.95_s", first_s, "s", "< 180"),
+        ("total_s", total_s, "s", ""),
+        ("success", float(success.max()), "1", ""),
+        ("env_steps_per_s", history["env_steps_per_s"], "1/s", ""),
     ]
+    how = f"{jax.devices()[0].device_kind} {' '.join(flags)}"
+    return [row(f"arm/train/{n}", v, unit, how, goal) for n, v, unit, goal in found]
+
+
+def rows(seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return every figure, one value a seed."""
+    found = stages.rows("arm", seeds, {"total_s": "< 900"})
+    mae = [round(s["mae_mrad"], 2) for s in seeds]
+    found.append(row("arm/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
+    for key, label in (("distances_m", "identified"), ("nominal_distances_m", "nominal")):
+        if key in seeds[0]:
+            reached = [int(np.sum(np.array(s[key]) < CLOSE_M)) for s in seeds]
+            goal = "9 of 10" if label == "identified" else ""
+            found.append(
+                row(f"arm/reached/{label}", reached, f"of {len(seeds[0][key])}", "within 2 cm at the end", goal)
+            )
+            middle = [round(1e3 * float(np.median(s[key])), 1) for s in seeds]
+            found.append(row(f"arm/distance/{label}", middle, "mm", "median"))
+    return found

@@ -8,11 +8,16 @@ from typing import Any
 
 import jax
 
+from benches.figures import row
 from sim2real.graph.node import BaseNode
 from sim2real.robots.devices import SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.stages.pipeline import load_pipeline
+
+WARM_S = 0.5
+"""The wall clock runs so long before it is measured [s]."""
+QUICK = {"seconds": 0.2, "rate": 100.0, "steps": 20}
 
 
 def loop(rate_hz: float) -> dict[str, BaseNode]:
@@ -42,14 +47,9 @@ def simulated(steps: int) -> list[dict[str, Any]]:
         for _ in range(steps):
             state, _ = graph.step(state)
         seconds = time.perf_counter() - begin
+    rate = round(steps / seconds)
     return [
-        {
-            "name": "graph/simulated/steps_per_s",
-            "value": round(steps / seconds),
-            "unit": "supervisor steps/s",
-            "yardstick": "the seed's framework: 115 to 204",
-            "goal": ">= 1000",
-        }
+        row("graph/simulated/steps_per_s", rate, "supervisor steps/s", "the seed's framework: 115 to 204", ">= 1000")
     ]
 
 
@@ -61,7 +61,7 @@ def wall_clock(rate_hz: float, seconds: float) -> list[dict[str, Any]]:
     graph.warmup(state)
     with graph:
         graph.start(state)
-        graph.run_for(0.5)
+        graph.run_for(WARM_S)
         begin = time.process_time()
         graph.run_for(seconds)
         cpu = (time.process_time() - begin) / seconds
@@ -69,17 +69,19 @@ def wall_clock(rate_hz: float, seconds: float) -> list[dict[str, Any]]:
     for name, node in graph.statistics().items():
         late = [round(1e3 * q, 3) for q in node.lateness_s]
         what = f"async/{rate_hz:g}_hz/{name}"
-        rows.append({"name": f"{what}/lateness_ms", "value": late, "unit": "ms", "yardstick": "p50, p99, max"})
-        rows.append({"name": f"{what}/overruns", "value": node.overruns, "unit": f"of {node.steps}"})
-    rows.append({"name": f"async/{rate_hz:g}_hz/cpu", "value": round(cpu, 3), "unit": "cores", "goal": "< 0.5"})
+        rows.append(row(f"{what}/lateness_ms", late, "ms", "p50, p99, max"))
+        rows.append(row(f"{what}/overruns", node.overruns, f"of {node.steps}"))
+    rows.append(row(f"async/{rate_hz:g}_hz/cpu", round(cpu, 3), "cores", goal="< 0.5"))
     return rows
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
-    """Measure both clocks."""
-    parser = argparse.ArgumentParser(prog="bench.py async")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the run on the wall clock")
     parser.add_argument("--rate", type=float, default=200.0, help="rate of every node [Hz]")
     parser.add_argument("--steps", type=int, default=5000, help="supervisor steps on the simulated clock")
-    options = parser.parse_args(arguments)
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure both clocks."""
     return {"rows": [*simulated(options.steps), *wall_clock(options.rate, options.seconds)]}

@@ -8,24 +8,20 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
-import statistics
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from benches.figures import compare, medians, row
+
 PARTS = ("build", "reset", "steps", "engines", "speed")
-ENTITIES, LINKS, STEPS = 20, 6, 1000
-ROW = 10
-"""Resets in a row: a single one would be timed with what the program before it left in the caches."""
-
-
-def row(name: str, value: Any, unit: str, yardstick: str, goal: str = "") -> dict[str, Any]:
-    """Return one row of a bench."""
-    return {"name": name, "value": value, "unit": unit, "yardstick": yardstick, "goal": goal}
+ENTITIES, LINKS = 20, 6
+SCENES = {"contact_free": "<= 1e-10", "contacts": "<= 1e-6"}
+"""Where MJX is compared with C, and how near it should come."""
+QUICK = {"repeats": 1, "copies": 2, "steps": 10, "links": 1, "resets": 1, "scenes": ["contact_free"]}
 
 
 def kit(package: str) -> Any:
@@ -67,18 +63,6 @@ def world(k: Any, entities: int = ENTITIES) -> Any:
     return arena
 
 
-def medians(programs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Run programs in turn, once to warm up; return the median of the seconds that each takes."""
-    times: dict[str, list[float]] = {name: [] for name in programs}
-    for i in range(repeats + 1):
-        for name, program in programs.items():
-            begin = time.perf_counter()
-            program()
-            if i:
-                times[name].append(time.perf_counter() - begin)
-    return {name: statistics.median(t) for name, t in times.items()}
-
-
 def build(repeats: int) -> list[dict[str, Any]]:
     """Return how long it takes to build and to compile the world."""
     worlds: dict[str, Any] = {}
@@ -105,7 +89,7 @@ def build(repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def reset(repeats: int) -> list[dict[str, Any]]:
+def reset(repeats: int, row_of: int) -> list[dict[str, Any]]:
     """Return how long it takes to start an episode."""
     found = kits()
     programs = {}
@@ -114,8 +98,8 @@ def reset(repeats: int) -> list[dict[str, Any]]:
             env = k.composer.Environment(
                 k.composer.NullTask(world(k)), random_state=0, recompile_mjcf_every_episode=every
             )
-            programs[name, every] = lambda env=env: [env.reset() for _ in range(ROW)]
-    ms = {key: 1e3 * s / ROW for key, s in medians(programs, repeats).items()}
+            programs[name, every] = lambda env=env: [env.reset() for _ in range(row_of)]
+    ms = {key: 1e3 * s / row_of for key, s in medians(programs, repeats).items()}
     rows = []
     for every, name, told in (
         (True, "reset", "recompile_mjcf_every_episode=True, the default"),
@@ -130,7 +114,7 @@ def reset(repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def steps() -> list[dict[str, Any]]:
+def steps(count: int) -> list[dict[str, Any]]:
     """Return how many steps under random controls end in the same state, bit for bit."""
     both = [k.mjcf.Physics.from_mjcf_model(world(k).mjcf_model) for k in kits().values()]
     if len(both) < 2:
@@ -139,7 +123,7 @@ def steps() -> list[dict[str, Any]]:
     for physics in both:
         with physics.reset_context():
             pass
-    for _ in range(STEPS):
+    for _ in range(count):
         control = rng.uniform(-1, 1, both[0].model.nu)
         for physics in both:
             physics.set_control(control)
@@ -148,7 +132,7 @@ def steps() -> list[dict[str, Any]]:
         equal += bool(np.array_equal(*states))
         contacts = max(contacts, both[0].data.ncon)
     told = f"dm_control, the same world, up to {contacts} contacts"
-    return [row("compose/c_steps_bit_equal", equal, f"of {STEPS}", told, str(STEPS))]
+    return [row("compose/c_steps_bit_equal", equal, f"of {count}", told, str(count))]
 
 
 def drop(k: Any) -> Any:
@@ -193,20 +177,27 @@ def difference(task: Callable[[], Any], controls: np.ndarray) -> tuple[float, in
     return worst, contacts
 
 
-def engines() -> list[dict[str, Any]]:
-    """Return how far MJX is from C after 300 steps."""
-    k = kit("sim2real")
-    controls = np.random.RandomState(0).uniform(-1, 1, (300, LINKS))
-    free, none = difference(lambda: k.composer.NullTask(robot(k, collide=False)), controls)
-    touching, contacts = difference(lambda: drop(k), np.zeros((300, 0)))
-    name, told = "compose/mjx_over_c_float64", "largest difference of qpos and qvel over 300 steps"
-    return [
-        row(f"{name}/contact_free", float(f"{free:.2g}"), "1", f"{told}, a six-link arm, {none} contacts", "<= 1e-10"),
-        row(f"{name}/contacts", float(f"{touching:.2g}"), "1", f"{told}, up to {contacts} contacts", "<= 1e-6"),
-    ]
+def engines(length: int, links: int, scenes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return how far MJX is from C after 300 steps, or fewer."""
+    k, length = kit("sim2real"), min(length, 300)
+    controls = {
+        "contact_free": np.random.RandomState(0).uniform(-1, 1, (length, links)),
+        "contacts": np.zeros((length, 0)),
+    }
+    tasks = {
+        "contact_free": lambda: k.composer.NullTask(robot(k, links, collide=False)),
+        "contacts": lambda: drop(k),
+    }
+    rows = []
+    for scene in scenes:
+        worst, contacts = difference(tasks[scene], controls[scene])
+        told = f"largest difference of qpos and qvel over {length} steps, up to {contacts} contacts"
+        goal = SCENES[scene]
+        rows.append(row(f"compose/mjx_over_c_float64/{scene}", float(f"{worst:.2g}"), "1", told, goal))
+    return rows
 
 
-def reach() -> Any:
+def reach(links: int) -> Any:
     """Return a task with what tasks have: an arm, observables of which one is late, a start by chance, a reward."""
     from sim2real import composer
     from sim2real.composer.observation.observable import MJCFFeature
@@ -215,9 +206,9 @@ def reach() -> Any:
         """Move the tip of the arm to a place."""
 
         def __init__(self) -> None:
-            arm = robot(kit("sim2real"), collide=False)
+            arm = robot(kit("sim2real"), links, collide=False)
             self._root_entity, self.joints = arm, arm.mjcf_model.find_all("joint")
-            self.tip = arm.mjcf_model.find("body", f"link{LINKS - 1}")
+            self.tip = arm.mjcf_model.find("body", f"link{links - 1}")
             option = arm.mjcf_model.option
             option.iterations, option.ls_iterations = 4, 4
             self.set_timesteps(0.02, 0.01)
@@ -225,7 +216,7 @@ def reach() -> Any:
                 arm.observables.add_observable(name, MJCFFeature(name, self.joints, **late))
 
         def initialize_episode(self, physics: Any, random_state: Any) -> None:
-            physics.bind(self.joints).qpos = random_state.uniform(-0.1, 0.1, LINKS)
+            physics.bind(self.joints).qpos = random_state.uniform(-0.1, 0.1, links)
 
         def get_reward(self, physics: Any) -> Any:
             tip = physics.bind(self.tip).xpos
@@ -237,7 +228,7 @@ def reach() -> Any:
     return Reach()
 
 
-def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
+def speed(copies: int | None, repeats: int, links: int) -> list[dict[str, Any]]:
     """Return what a task costs over as many bare ``mjx.step`` in the same motion."""
     import jax
     import jax.numpy as jnp
@@ -245,7 +236,7 @@ def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
 
     from sim2real import composer
 
-    environment = composer.MjxEnvironment(reach(), time_limit=10.0)
+    environment = composer.MjxEnvironment(reach(links), time_limit=10.0)
     model, count = environment.mjx_model, environment.substeps
     device = jax.default_backend()
     copies = copies or (256 if device == "cpu" else 4096)
@@ -253,7 +244,7 @@ def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
     times = jnp.arange(length) * 0.02
 
     def wave(t: Any, q: Any) -> Any:
-        return 0.3 * jnp.sin(3.0 * t + jnp.arange(float(LINKS))) - 0.1 * q
+        return 0.3 * jnp.sin(3.0 * t + jnp.arange(float(links))) - 0.1 * q
 
     def task(start: Any) -> Any:
         def step(state: Any, t: Any) -> Any:
@@ -272,13 +263,7 @@ def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
         return jax.lax.scan(step, start.data, times)[0].qpos.sum()
 
     starts = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), copies))
-    programs, compile_s = {}, {}
-    for name, program in (("bare", bare), ("task", task)):
-        begin = time.perf_counter()
-        compiled = jax.jit(jax.vmap(program)).lower(starts).compile()
-        compile_s[name] = time.perf_counter() - begin
-        programs[name] = lambda compiled=compiled: jax.block_until_ready(compiled(starts))
-    seconds = medians(programs, repeats)
+    seconds, compile_s = compare({"bare": bare, "task": task}, starts, repeats)
     print(copies, seconds, file=sys.stderr)
     rate = {name: copies * length / s for name, s in seconds.items()}
     name, told = f"compose/{device}", f"bare mjx.step in the same motion, {copies} copies"
@@ -290,18 +275,26 @@ def speed(copies: int | None, repeats: int) -> list[dict[str, Any]]:
     ]
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
-    """Measure; MJX's speed on the device that JAX finds."""
-    parser = argparse.ArgumentParser(prog="bench.py compose")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--steps", type=int, default=1000, help="steps that are compared with dm_control's")
+    parser.add_argument(
+        "--scenes", nargs="+", choices=SCENES, default=list(SCENES), help="where MJX is compared with C"
+    )
+    parser.add_argument("--links", type=int, default=LINKS, help="links of the arm on MJX")
+    parser.add_argument("--resets", type=int, default=10, help="in a row: one alone would be timed with cold caches")
     parser.add_argument("--copies", type=int, help="copies of the task on MJX; default: 256 on the CPU, 4096 on a GPU")
-    options = parser.parse_args(arguments)
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure; MJX's speed on the device that JAX finds."""
     parts: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "build": lambda: build(3 * options.repeats),
-        "reset": lambda: reset(options.repeats),
-        "steps": steps,
-        "engines": engines,
-        "speed": lambda: speed(options.copies, options.repeats),
+        "reset": lambda: reset(options.repeats, options.resets),
+        "steps": lambda: steps(options.steps),
+        "engines": lambda: engines(options.steps, options.links, options.scenes),
+        "speed": lambda: speed(options.copies, options.repeats, options.links),
     }
     return {"rows": [r for name in PARTS if name in options.parts for r in parts[name]()]}

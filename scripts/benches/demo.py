@@ -3,110 +3,75 @@
 from __future__ import annotations
 
 import argparse
-import json
-import shutil
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benches import stages
+from benches.figures import row
 from sim2real.log.reader import read_log
 from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.runs import finished
 from sim2real.stages.truth import true_values
 
 SETTLE_S = 0.3
+QUICK = {
+    "seeds": [0],
+    "no_nominal": True,
+    "flags": [
+        *("--record.duration-s=6", "--identify.generations=10", "--identify.population=8"),
+        *("--train.episode-s=2", "--train.timelines=4", "--train.ppo.total-steps=512", "--train.ppo.num-envs=16"),
+        *("--train.ppo.minibatches=2", "--train.ppo.evaluations=1", "--train.ppo.eval-envs=4"),
+        *("--deploy.episodes=1", "--deploy.duration-s=1"),
+    ],
+}
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
-    """Run the demo once a seed; return the rows and a record of every seed."""
-    parser = argparse.ArgumentParser(prog="bench.py demo")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--keep", type=Path, help="keep the run folders here")
-    options = parser.parse_args(arguments)
+    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run pendulum`")
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Run the demo once a seed; return the rows and a record of every seed."""
     with tempfile.TemporaryDirectory() as scratch:
-        root = options.keep or Path(scratch)
-        seeds = [run_seed(seed, root.resolve()) for seed in options.seeds]
+        root = (options.keep or Path(scratch)).resolve()
+        seeds = [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
     return {"rows": rows(seeds), "seeds": seeds}
 
 
-def run_seed(seed: int, root: Path) -> dict[str, Any]:
+def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Run demo and baseline for one seed and collect what the stages measured."""
-    runs = root / f"seed{seed}"
-    begin = time.monotonic()
-    _sim2real("demo", "--seed", str(seed), "--runs", str(runs))
-    total_s = time.monotonic() - begin
-    run_dir = next((runs / "pendulum").iterdir())
-    result: dict[str, Any] = {"seed": seed, "total_s": total_s}
-    for stage in ("record", "identify", "train", "deploy"):
-        done = finished(run_dir, stage)
-        if done is None:
-            raise SystemExit(f"{stage} did not finish in {run_dir}")
-        result[f"{stage}_s"] = done.manifest["duration_s"]
-    result |= _identification(run_dir) | {"deployments": _deployments(run_dir)}
-    baseline = runs / "nominal"
-    shutil.copytree(run_dir, baseline)
-    for flags in (["train", "pendulum", "--model", "nominal"], ["deploy", "pendulum"]):
-        _sim2real(*flags, "--seed", str(seed), "--run", str(baseline), "--runs", str(runs))
-    result["nominal_deployments"] = _deployments(baseline)
+    run_dir, result = stages.whole_run("pendulum", seed, runs, options.flags)
+    record, identify = stages.done(run_dir, "record"), stages.done(run_dir, "identify")
+    ratio, ours, theirs = prediction_ratio(record.output("log"), record.output("truth"), identify.output("predictions"))
+    result |= {
+        "prediction_rmse_rad": ours,
+        "true_model_rmse_rad": theirs,
+        "prediction_over_true_model": ratio,
+        "deployments": stages.deployed(run_dir, "success"),
+    }
+    if not options.no_nominal:
+        baseline = stages.nominal_run("pendulum", seed, runs, run_dir)
+        result["nominal_deployments"] = stages.deployed(baseline, "success")
     return result
 
 
 def rows(seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the worst and the middle of every figure over the seeds."""
-    found = []
-
-    def add(name: str, values: list[float], unit: str, yardstick: str, goal: str) -> None:
-        found.append({"name": name, "value": values, "unit": unit, "yardstick": yardstick, "goal": goal})
-
-    for stage in ("record", "identify", "train", "deploy", "total"):
-        goal = {"train": "< 90", "total": "< 240"}.get(stage, "")
-        add(f"demo/{stage}_s", [round(s[f"{stage}_s"], 1) for s in seeds], "s", "", goal)
-    add("demo/round_trip_error_ms", [round(s["round_trip_error_ms"], 2) for s in seeds], "ms", "true latency", "+-3")
-    for name in seeds[0]["group_errors"]:
-        values = [round(100 * s["group_errors"][name], 2) for s in seeds]
-        add(f"demo/{name}_error", values, "%", "true parameter", "+-5")
+    """Return every figure, one value a seed; of deployments, one each."""
+    found = stages.rows("demo", seeds, {"train_s": "< 90", "total_s": "< 240", "error": "+-5"})
     ratio = [round(s["prediction_over_true_model"], 2) for s in seeds]
-    add("demo/prediction_over_true_model", ratio, "1", "true model, same commands", "< 1.5")
+    found.append(row("demo/prediction_over_true_model", ratio, "1", "true model, same commands", "< 1.5"))
     for key, label in (("deployments", "identified"), ("nominal_deployments", "nominal")):
-        values = [round(d, 3) for s in seeds for d in s[key]]
-        add(f"demo/upright/{label}", values, "share of the last 5 s", "", "> 0.9 in 9 of 10" if key[0] == "d" else "")
+        if key in seeds[0]:
+            values = [round(d, 3) for s in seeds for d in s[key]]
+            goal = "> 0.9 in 9 of 10" if label == "identified" else ""
+            found.append(row(f"demo/upright/{label}", values, "share of the last 5 s", "", goal))
     return found
-
-
-def _sim2real(*arguments: str) -> None:
-    print("sim2real", *arguments, file=sys.stderr)
-    subprocess.run([sys.executable, "-m", "sim2real.cli", *arguments], check=True, stdout=subprocess.DEVNULL)
-
-
-def _deployments(run_dir: Path) -> list[float]:
-    deploy = finished(run_dir, "deploy")
-    if deploy is None:
-        raise SystemExit(f"deploy did not finish in {run_dir}")
-    return [e["real"]["success"] for e in json.loads(deploy.output("result").read_text())["episodes"]]
-
-
-def _identification(run_dir: Path) -> dict[str, Any]:
-    record, identify = finished(run_dir, "record"), finished(run_dir, "identify")
-    if record is None or identify is None:
-        raise SystemExit(f"record and identify did not finish in {run_dir}")
-    document = json.loads(identify.output("parameters").read_text())
-    by_name = {p["name"]: p for p in document["parameters"]}
-    groups = {n: p["estimate"] / p["truth"] - 1 for n, p in by_name.items() if p["kind"] == "dynamics"}
-    trip = by_name["round_trip_delay"]
-    ratio, ours, theirs = prediction_ratio(record.output("log"), record.output("truth"), identify.output("predictions"))
-    return {
-        "group_errors": groups,
-        "round_trip_ms": 1e3 * trip["estimate"],
-        "round_trip_error_ms": 1e3 * (trip["estimate"] - trip["truth"]),
-        "prediction_rmse_rad": ours,
-        "true_model_rmse_rad": theirs,
-        "prediction_over_true_model": ratio,
-    }
 
 
 def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, float, float]:

@@ -7,17 +7,16 @@ past observations and actions, two Runge-Kutta substeps of 10 ms, 4 s, delays as
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benches.figures import compare, row
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
@@ -25,11 +24,19 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.robots.devices import SimSensor
 from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.wiring import wire
 from sim2real.stages.pipeline import load_pipeline
 
 MODEL = load_pipeline("pendulum").load("model")
 DURATION_S = 4.0
 EPISODES = 32
+CASES = {
+    "plain": ((50.0, 50.0, 0.01), (1,)),
+    "hiccups": ((50.0, 50.0, 0.01), (1,)),
+    "30_over_100_hz": ((30.0, 100.0, 0.005), (3, 3, 4)),
+}
+"""Kinds of timelines: rates of agent and world [Hz], the world's substep [s]; world ticks after each policy step."""
+QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"], "build": [10], "mjx": 2, "links": 1}
 
 
 class _Normal:
@@ -199,24 +206,6 @@ def tick(world: Any, p: Any, x: Any, cost: Any, u: Any) -> tuple[Any, Any]:
     return x, cost + task_cost(x, u)
 
 
-def compare(programs: dict[str, Callable[[Any], Any]], copies: int, repeats: int) -> tuple[dict, dict]:
-    """Time programs in turn; return median seconds of a call, and seconds to compile."""
-    keys = jax.random.split(jax.random.key(0), copies)
-    compiled, compile_s, times = {}, {}, {}
-    for name, program in programs.items():
-        begin = time.perf_counter()
-        compiled[name] = jax.jit(jax.vmap(program)).lower(keys).compile()
-        compile_s[name] = time.perf_counter() - begin
-        jax.block_until_ready(compiled[name](keys))
-        times[name] = []
-    for _ in range(repeats):
-        for name, program in compiled.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(program(keys))
-            times[name].append(time.perf_counter() - begin)
-    return {n: statistics.median(t) for n, t in times.items()}, compile_s
-
-
 def bytes_per_copy(graph: CompiledGraph) -> int:
     """Return what a copy carries from row to row, parameters left out as copies may share them."""
     gs = jax.eval_shape(lambda: graph.init(jax.random.key(0), {"world": params()})).replace(params={})
@@ -225,9 +214,11 @@ def bytes_per_copy(graph: CompiledGraph) -> int:
     )
 
 
-def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repeats: int, hiccup: bool) -> list[dict]:
+def case(device: str, kind: str, copies: int, repeats: int) -> list[dict]:
     """Measure one kind of timelines at one number of copies."""
-    graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, hiccup))
+    rates, ticks = CASES[kind]
+    graph_nodes = nodes(*rates)
+    graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, kind == "hiccups"))
     world = graph_nodes["world"]
     total = graph.rows * graph.wiring.ticks
     pattern_rows = total // sum(ticks)
@@ -238,17 +229,17 @@ def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repe
         "unrolled": hand_program(pattern_rows, ticks, world, unroll_of(1) if len(ticks) == 1 else 1),
         "graph": graph_program(graph),
     }
-    seconds, compile_s = compare(programs, copies, repeats)
+    seconds, compile_s = compare(programs, jax.random.split(jax.random.key(0), copies), repeats)
     # The programs may differ by a tick or two in length: compared per tick.
     per_tick = {n: s / (total if n == "graph" else pattern_rows * sum(ticks)) for n, s in seconds.items()}
     policy_steps = float(graph.timeline.vertices["agent"].count.mean())
     report = graph.report()
-    print(name, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
+    print(kind, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
     over = {b: per_tick["graph"] / per_tick[b] for b in ("hand", "unrolled", "bare")}
     rate = copies * policy_steps / seconds["graph"]
     hand_rate = copies * pattern_rows * len(ticks) / seconds["hand"]
-    label = f"{name}/{copies}"
-    goal = "<= 1.2" if name.count("/") == 1 else "<= 1.15 times the plain timelines"
+    label = f"{device}/{copies}" if kind == "plain" else f"{device}/{kind}/{copies}"
+    goal = "<= 1.2" if kind == "plain" else "<= 1.15 times the plain timelines"
     return [
         row(f"{label}/over_hand", round(over["hand"], 3), "1", "hand-written", goal),
         row(f"{label}/over_hand_unrolled", round(over["unrolled"], 3), "1", "hand-written, loop unrolled as ours"),
@@ -258,60 +249,44 @@ def case(name: str, graph_nodes: dict, ticks: tuple[int, ...], copies: int, repe
     ]
 
 
-def row(name: str, value: Any, unit: str, yardstick: str, goal: str = "") -> dict[str, Any]:
-    """Return one row of a bench."""
-    return {"name": name, "value": value, "unit": unit, "yardstick": yardstick, "goal": goal}
-
-
-def building() -> list[dict[str, Any]]:
+def building(counts: Sequence[int]) -> list[dict[str, Any]]:
     """Measure how long timelines take to draw and to wire."""
     found = []
-    for episodes in (1_000, 10_000):
+    for episodes in counts:
         graph_nodes = nodes()
         draw(graph_nodes, DURATION_S, 10, 0)
         begin = time.perf_counter()
         drawn = draw(graph_nodes, DURATION_S, episodes, 0)
         middle = time.perf_counter()
-        from sim2real.runtime.wiring import wire
-
         wire(graph_nodes, "agent", drawn)
         end = time.perf_counter()
         goals = ("< 1", "< 2") if episodes == 1_000 else ("linear", "linear")
         for what, seconds, goal in (("draw", middle - begin, goals[0]), ("wire", end - middle, goals[1])):
-            found.append(
-                {
-                    "name": f"graph/build/{episodes}_episodes_{what}_s",
-                    "value": round(seconds, 3),
-                    "unit": "s",
-                    "goal": goal,
-                }
-            )
+            found.append(row(f"graph/build/{episodes}_episodes_{what}_s", round(seconds, 3), "s", goal=goal))
     return found
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
-    """Measure on the device that JAX finds."""
-    parser = argparse.ArgumentParser(prog="bench.py graph")
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
     parser.add_argument("--copies", type=int, nargs="+", help="default: 1024 on the CPU, 20000 and 100000 on a GPU")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of timelines")
+    parser.add_argument("--build", type=int, nargs="+", default=[1_000, 10_000], help="episodes to draw and to wire")
     parser.add_argument("--mjx", type=int, default=64, help="copies of the MJX arm; 0 leaves it out")
-    options = parser.parse_args(arguments)
-    device = options.name or jax.default_backend()
-    copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
-    rows: list[dict[str, Any]] = []
-    for count in copies:
-        rows += case(f"graph/{device}", nodes(), (1,), count, options.repeats, False)
-        rows += case(f"graph/{device}/hiccups", nodes(), (1,), count, options.repeats, True)
-        rows += case(
-            f"graph/{device}/30_over_100_hz", nodes(30.0, 100.0, 0.005), (3, 3, 4), count, options.repeats, False
-        )
-    if options.mjx:
-        from benches.arm import mjx_case  # MuJoCo is not needed without it
+    parser.add_argument("--links", type=int, default=6, help="links of the MJX arm")
 
-        rows += mjx_case(device, options.mjx, options.repeats)
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure on the device that JAX finds."""
+    device = f"graph/{options.name or jax.default_backend()}"
+    copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
+    rows = [r for count in copies for kind in options.cases for r in case(device, kind, count, options.repeats)]
+    if options.mjx:
+        from benches.graph_mjx import mjx_case  # MuJoCo is not needed without it
+
+        rows += mjx_case(device, options.mjx, options.repeats, options.links)
     graph_nodes = nodes()
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
-    rows.append({"name": "graph/bytes_per_copy", "value": bytes_per_copy(graph), "unit": "B", "goal": "< 2000"})
-    rows += building()
-    return {"rows": rows, "device": str(jax.devices()[0]), "jax": jax.__version__, "file": Path(__file__).name}
+    rows.append(row("graph/bytes_per_copy", bytes_per_copy(graph), "B", goal="< 2000"))
+    return {"rows": [*rows, *building(options.build)]}

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benches import recordings
+from benches import figures, recordings
 from benches.recordings import PAST, SPECS
 from sim2real.graph.episode import Episode
 from sim2real.identify import prediction
@@ -34,6 +34,11 @@ from sim2real.stages.pipeline import load_pipeline
 SETTLE_S = 0.3
 """How much of the past the initial state of the disk's free run is estimated from [s]."""
 PARTS = ("fit", "half", "others", "sysid", "delays", "speed")
+BUDGET = ("generations", "population", "refine", "long_s")
+QUICK = {
+    **{"fit": ":200", "test": "200:300", "parts": ["fit", "sysid", "speed"]},
+    **{"generations": 2, "population": 8, "refine": 1, "long_s": 0.0, "candidates": 4, "speed_s": 0.1},
+}
 OTHERS = {
     "kp=100": "kp=200,800",
     "kp=800": "kp=100,200",
@@ -62,17 +67,25 @@ class Case:
         return [c.position if c.index is None else f"{c.position}[{c.index}]" for c in self.model.channels]
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
-    """Fit, predict, compare; return the rows."""
-    parser = argparse.ArgumentParser(prog="bench.py identify")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--case", choices=["disk", "xl330", "so101"], required=True)
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings, or one of their files")
+    parser.add_argument("--case", choices=["disk", "xl330", "so101"], default="disk")
     parser.add_argument("--fit", help="what to fit on; see benches/recordings.py")
     parser.add_argument("--test", help="what to judge on")
     parser.add_argument("--seeds", type=int, nargs="+", help="seeds of the search (xl330: 0 1 2, else 0)")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="what to measure")
-    options = parser.parse_args(arguments)
-    case, parts = make_case(options.case), options.parts
+    parser.add_argument("--generations", type=int, help="of the search; default: the pipeline's")
+    parser.add_argument("--population", type=int, help="of the search; default: the pipeline's")
+    parser.add_argument("--refine", type=int, help="finalists that are refined; default: the pipeline's")
+    parser.add_argument("--long-s", type=float, help="segments of the last refinement [s]; default: the pipeline's")
+    parser.add_argument("--candidates", type=int, help="speed: at once; default: 2048 on the CPU, 65536 on a GPU")
+    parser.add_argument("--speed-s", type=float, default=20.0, help="speed: how long mujoco.sysid is measured [s]")
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Fit, predict, compare; return the rows."""
+    case, parts = make_case(options), options.parts
     fitted = recordings.load(case.name, options.data, options.fit or SPECS[case.name])
     test = recordings.load(case.name, options.data, options.test or SPECS[f"{case.name}_test"], PAST)
     rows: list[dict[str, Any]] = []
@@ -88,7 +101,7 @@ def main(arguments: list[str]) -> dict[str, Any]:
     if case.name == "disk" and "delays" in parts:
         rows += delays(case, options.data)
     if case.name == "disk" and "speed" in parts:
-        rows += speed(case, fitted)
+        rows += speed(case, fitted, options.candidates, options.speed_s)
     return {"rows": rows, "fit": list(fitted), "test": list(test), "values": [f.values for f in found]}
 
 
@@ -108,17 +121,18 @@ def fit_and_judge(
     return found, rows + judged(case, found[0], results, test, seeds)
 
 
-def make_case(name: str) -> Case:
+def make_case(options: argparse.Namespace) -> Case:
     """Return the pipeline's part of a case."""
-    pipeline = load_pipeline(name)
+    pipeline = load_pipeline(options.case)
     robot: Any = pipeline.load()
-    return Case(name, pipeline.identify, robot, robot.identifiable(pipeline.identify.max_delay_s))
+    budget = {n: getattr(options, n) for n in BUDGET if getattr(options, n) is not None}
+    config = replace(pipeline.identify, **budget)
+    return Case(options.case, config, robot, robot.identifiable(config.max_delay_s))
 
 
 def row(name: str, value: float, unit: str, yardstick: str = "", goal: str = "") -> dict[str, Any]:
-    """Return a row of the result."""
-    rounded = float(f"{value:.4g}")
-    return {"name": f"identify/{name}", "value": rounded, "unit": unit, "yardstick": yardstick, "goal": goal}
+    """Return a row of the result, rounded to four digits."""
+    return figures.row(f"identify/{name}", float(f"{value:.4g}"), unit, yardstick, goal)
 
 
 def identify(case: Case, fitted: Mapping[str, Episode]) -> Fit:
@@ -301,15 +315,22 @@ def yardstick(
     return [row(*r) for r in sysid_rows.rows(case.name, fitted, test, values)]
 
 
-def speed(case: Case, fitted: Mapping[str, Episode]) -> list[dict[str, Any]]:
-    """Return how many candidates a second are simulated over 6,000 samples, 30,000 steps of the physics, each."""
+def speed(case: Case, fitted: Mapping[str, Episode], count: int | None, seconds: float) -> list[dict[str, Any]]:
+    """Return how many candidates a second are simulated over 6,000 samples, 30,000 steps of the physics, each.
+
+    Args:
+        case: The disk.
+        fitted: Its recording; of a shorter one all is simulated.
+        count: Candidates at once.
+        seconds: How long mujoco.sysid is measured [s].
+    """
     from benches import sysid
 
     config = replace(case.config, initial_state="measured")
     episode = next(iter(fitted.values()))
-    problem = Problem(case.model, [episode], [Span(0, 0.3)], 150.0, config)
+    problem = Problem(case.model, [episode], [Span(0, 0.3)], min(150.0, episode.duration_s - 0.6), config)
     device = jax.devices()[0].platform
-    count = 65536 if device == "gpu" else 2048
+    count = count or (65536 if device == "gpu" else 2048)
     candidates = 0.3 * jax.random.normal(jax.random.key(0), (count, len(problem.table)))
     run = jax.jit(lambda c: problem.losses(c, c[0]))
     run(candidates).block_until_ready()
@@ -318,14 +339,14 @@ def speed(case: Case, fitted: Mapping[str, Episode]) -> list[dict[str, Any]]:
         begin = time.monotonic()
         run(candidates + 0.01 * i).block_until_ready()
         times.append(time.monotonic() - begin)
-    seconds = float(np.median(times))
-    rows = [row(f"disk/{device}/candidates_per_s", count / seconds, "1/s", "30,000 steps each")]
+    took = float(np.median(times))
+    rows = [row(f"disk/{device}/candidates_per_s", count / took, "1/s", "30,000 steps each")]
     if device == "gpu":
-        rows.append(row(f"disk/{device}/generation_of_65536_s", seconds, "s", "30,000 steps each"))
+        rows.append(row(f"disk/{device}/generation_of_{count}_s", took, "s", "30,000 steps each"))
         return rows
-    theirs = sysid.disk_speed(20.0)
+    theirs = sysid.disk_speed(seconds)
     return [
         *rows,
         row("disk/sysid_evaluations_per_s", theirs, "1/s", "mujoco.sysid, 30,000 steps each"),
-        row("disk/candidates_over_sysid", count / seconds / theirs, "1", "mujoco.sysid", ">= 200"),
+        row("disk/candidates_over_sysid", count / took / theirs, "1", "mujoco.sysid", ">= 200"),
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importer import import_file
 from sim2real.log.mapping import load_mapping
@@ -29,15 +30,25 @@ def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
 
     Args:
         case: ``disk``, ``xl330`` or ``so101``.
-        data: Folder with the case's files, or with its folder.
+        data: Folder with the case's files, or with its folder, or one of the files.
         spec: disk: ``[FILE@]A:B``, samples. xl330: ``kp=100,800 motion=sin_sin,up_and_down``, or ``all``. so101: names
             of motions, with ``*``, and with ``[a:b]`` for a part, in shares of its length.
         past: Further samples of the disk before ``A``.
+
+    Raises:
+        UsageError: When there are no files, or the text selects none of them.
     """
     folder = data / FOLDERS[case] if (data / FOLDERS[case]).is_dir() else data
-    found = {"disk": _disk, "xl330": _xl330, "so101": _so101}[case](folder, spec, past)
+    pattern = "*.json" if case == "xl330" else "*.npz"
+    files = [folder] if folder.is_file() and folder.match(pattern) else sorted(folder.glob(pattern))
+    if not files:
+        raise UsageError(
+            f"{data} is no file {pattern} and no folder with such files", hint=f"--data: {case}'s recordings"
+        )
+    found = {"disk": _disk, "xl330": _xl330, "so101": _so101}[case](files, spec, past)
     if not found:
-        raise SystemExit(f"{spec!r} selects nothing in {folder}")
+        names = ", ".join(f.name for f in files)
+        raise UsageError(f"{spec!r} selects nothing of {names}", hint="say with --fit and --test what to take of them")
     return found
 
 
@@ -45,20 +56,21 @@ def _mapping(case: str) -> Path:
     return Path(str(load_pipeline(case).load("__init__").__file__)).with_name("import.toml")
 
 
-def _disk(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+def _disk(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
     name, _, part = spec.rpartition("@")
-    files = sorted(folder.glob("*.npz"))
-    file = folder / name if name else files[0]
     first, last = (int(x) if x else None for x in part.split(":"))
     begin = max(0, (first or 0) - past)
-    return {spec: import_file(file, load_mapping(_mapping("disk")), slice(begin, last))}
+    chosen = [f for f in files if f.name == name] if name else files[:1]
+    if not chosen:
+        return {}
+    return {spec: import_file(chosen[0], load_mapping(_mapping("disk")), slice(begin, last))}
 
 
-def _xl330(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+def _xl330(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
     del past
     wanted = dict(part.split("=") for part in spec.split() if part != "all")
     found = {}
-    for file in sorted(folder.glob("*.json")):
+    for file in files:
         about = json.loads(file.read_text())
         own = {"kp": str(about["kp"]), "motion": about["trajectory"], "file": file.stem}
         if all(own[key] in values.split(",") for key, values in wanted.items()):
@@ -66,13 +78,13 @@ def _xl330(folder: Path, spec: str, past: int) -> dict[str, Episode]:
     return found
 
 
-def _so101(folder: Path, spec: str, past: int) -> dict[str, Episode]:
+def _so101(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
     del past
     found = {}
     for part in spec.split():
         pattern, _, share = part.partition("[")
         a, b = (float(x) for x in share.rstrip("]").split(":")) if share else (0.0, 1.0)
-        for file in sorted(folder.glob("*.npz")):
+        for file in files:
             if fnmatch(file.stem, pattern):
                 with np.load(file) as content:
                     count = len(content["t_meas_s"])

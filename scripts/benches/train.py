@@ -8,59 +8,73 @@ from typing import Any
 import jax
 import numpy as np
 
+from benches.figures import row
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
 from sim2real.train.env import GraphEnvironment
-from sim2real.train.ppo import train
+from sim2real.train.ppo import TrainResult, train
 
-TIMELINES, EPISODE_S = 32, 5.0
+SPREAD, DRAWS = 0.02, 1024
+"""Copies differ in each of the dynamics by this share, in so many draws."""
+QUICK = {"steps": 256, "envs": 8, "timelines": 2, "episode_s": 0.5, "evaluations": 2, "minibatches": 2}
 
 
-def environment() -> GraphEnvironment:
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--seeds", type=int, default=1, help="policies in parallel")
+    parser.add_argument("--envs", type=int, default=256, help="copies for each")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps for each")
+    parser.add_argument("--evaluations", type=int, default=20, help="evaluations, spread over the steps")
+    parser.add_argument("--minibatches", type=int, default=PPOConfig.minibatches, help="they must divide --envs")
+    parser.add_argument("--timelines", type=int, default=32, help="timelines that episodes are drawn from")
+    parser.add_argument("--episode-s", type=float, default=5.0, help="length of an episode [s]")
+    parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
+
+
+def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     """Return the pendulum as the embedded robot is, on timelines with the jitter of a quiet machine."""
     robot = load_pipeline("pendulum").load()
     truth = load_pipeline("pendulum").load("plant").PendulumPlant().truth()
     values = {**truth, "sensor_delay": 0.02, "actuator_delay": 0.025}
-    jitter = np.random.default_rng(0).gamma(4.0, 2e-4, 2000)
+    rng = np.random.default_rng(0)
+    draws = {name: value * (1 + SPREAD * rng.standard_normal(DRAWS)) for name, value in truth.items()}
+    jitter = rng.gamma(4.0, 2e-4, 2000)
     computation = {n: EmpiricalDist(jitter) for n in ("sensor", "agent", "actuator")}
-    nodes, task = robot.training(values, dict.fromkeys(truth, 0.02), computation, True)
-    graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, EPISODE_S, TIMELINES, 0))
+    nodes, task = robot.training(values, draws, computation, True)
+    graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, episode_s, timelines, 0))
     return GraphEnvironment(graph, task)
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> dict[str, Any]:
     """Train on the device that JAX finds."""
-    parser = argparse.ArgumentParser(prog="bench.py train")
-    parser.add_argument("--seeds", type=int, default=1, help="policies in parallel")
-    parser.add_argument("--envs", type=int, default=256, help="copies for each")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps for each")
-    parser.add_argument("--name", help="name of the device in the rows")
-    options = parser.parse_args(arguments)
-    env = environment()
+    env = environment(options.timelines, options.episode_s)
     config = PPOConfig(
         num_seeds=options.seeds,
         num_envs=options.envs,
         total_steps=options.steps,
-        evaluations=20,
+        minibatches=options.minibatches,
+        evaluations=options.evaluations,
         eval_steps=env.length + 1,
     )
     result = train(env, config, jax.random.key(0))
-    name = f"train/{options.name or jax.default_backend()}/pendulum/{options.seeds}_seeds"
+    return {"rows": rows(result, f"train/{options.name or jax.default_backend()}/pendulum/{options.seeds}_seeds")}
+
+
+def rows(result: TrainResult, name: str) -> list[dict[str, Any]]:
+    """Return speed, success at the end, and when the best and the worst seed succeeded."""
     success = np.asarray(result.history["success"])
-    rows = [
-        {"name": f"{name}/env_steps_per_s", "value": round(result.env_steps_per_s), "unit": "1/s"},
-        {"name": f"{name}/compile_s", "value": round(result.compile_s, 1), "unit": "s"},
-        {"name": f"{name}/train_s", "value": round(result.train_s, 1), "unit": "s"},
-        {"name": f"{name}/final_success", "value": np.round(success[-1], 3).tolist(), "unit": "share of 2nd half"},
+    found = [
+        row(f"{name}/env_steps_per_s", round(result.env_steps_per_s), "1/s"),
+        row(f"{name}/compile_s", round(result.compile_s, 1), "s"),
+        row(f"{name}/train_s", round(result.train_s, 1), "s"),
+        row(f"{name}/final_success", np.round(success[-1], 3).tolist(), "share of 2nd half"),
     ]
     for level in (0.85, 0.95):
         for who, reached in (("best", success.max(axis=1)), ("all", success.min(axis=1))):
             at = np.flatnonzero(reached >= level)
             seconds = round(float(result.elapsed_s[at[0]]), 1) if at.size else None
-            rows.append(
-                {"name": f"{name}/time_to_{level}_{who}_s", "value": seconds, "unit": "s", "goal": "compile incl."}
-            )
-    return {"rows": rows, "device": str(jax.devices()[0]), "jax": jax.__version__}
+            found.append(row(f"{name}/time_to_{level}_{who}_s", seconds, "s", goal="compile incl."))
+    return found

@@ -1,0 +1,56 @@
+"""The benches, and which paths of the repository each of them measures: figures are of a state of those."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+_GRAPH = ("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "pipelines/pendulum")
+_COMMON = ("scripts/benches/figures.py",)
+_STAGES = ("sim2real", "!sim2real/view", "scripts/benches/stages.py")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A bench.
+
+    Attributes:
+        module: Its module in this folder: ``add_flags``, ``run``, and ``QUICK``, what flags are with --quick.
+        summary: What it measures, in a line.
+        measures: Files and folders that its figures depend on; ``!`` leaves one out, ``{flag}`` is a flag's value.
+    """
+
+    module: str
+    summary: str
+    measures: tuple[str, ...]
+
+
+BENCHES = {
+    "arm": Bench("arm", "the arm's whole run, or its training alone", (*_STAGES, "pipelines/arm")),
+    "async": Bench("asynchronous", "the simulated clock's speed, and the wall clock's lateness", _GRAPH),
+    "compose": Bench("compose", "worlds from parts against dm_control and bare MJX", ("sim2real/composer",)),
+    "demo": Bench(
+        "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")
+    ),
+    "graph": Bench(
+        "graph", "the compiled graph against a robot written by hand", (*_GRAPH, "scripts/benches/graph_mjx.py")
+    ),
+    "identify": Bench(
+        "identify",
+        "recordings of real motors, fitted on one part and judged on another",
+        (
+            *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
+            *("sim2real/log", "pipelines/{case}"),
+            *("scripts/benches/recordings.py", "scripts/benches/sysid.py", "scripts/benches/sysid_rows.py"),
+        ),
+    ),
+    "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
+    "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
+}
+
+
+def measures(name: str, flags: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the paths that a bench with these flags measures, its own modules among them."""
+    bench = BENCHES[name]
+    return (*(path.format(**flags) for path in bench.measures), f"scripts/benches/{bench.module}.py", *_COMMON)

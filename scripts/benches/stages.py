@@ -1,0 +1,79 @@
+"""Whole runs of a robot, stage by stage, by the command line: what the benches of the demo and of the arm share."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from benches.figures import row
+from sim2real.stages.runs import STAGES, StageFolder, finished
+
+
+def sim2real(*arguments: str) -> None:
+    """Run a command in a process of its own, as a user does; what it says goes to stderr."""
+    print("sim2real", *arguments, file=sys.stderr)
+    subprocess.run([sys.executable, "-m", "sim2real.cli", *arguments], check=True, stdout=subprocess.DEVNULL)
+
+
+def done(run_dir: Path, stage: str) -> StageFolder:
+    """Return the finished stage of a run folder."""
+    folder = finished(run_dir, stage)
+    if folder is None:
+        raise SystemExit(f"{stage} did not finish in {run_dir}")
+    return folder
+
+
+def whole_run(pipeline: str, seed: int, runs: Path, flags: list[str]) -> tuple[Path, dict[str, Any]]:
+    """Run all stages; return the run folder, and what they took and found."""
+    begin = time.monotonic()
+    sim2real("run", pipeline, "--seed", str(seed), "--runs", str(runs), *flags)
+    result: dict[str, Any] = {"seed": seed, "total_s": time.monotonic() - begin}
+    run_dir = next((runs / pipeline).iterdir())
+    result |= {f"{stage}_s": done(run_dir, stage).manifest["duration_s"] for stage in STAGES}
+    return run_dir, result | estimates(done(run_dir, "identify"))
+
+
+def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
+    """Train on the nominal model without delays, and deploy, in a copy of a run folder; return the copy."""
+    copy = runs / "nominal"
+    shutil.copytree(run_dir, copy)
+    for flags in (["train", pipeline, "--model", "nominal"], ["deploy", pipeline]):
+        sim2real(*flags, "--seed", str(seed), "--run", str(copy), "--runs", str(runs))
+    return copy
+
+
+def estimates(identify: StageFolder) -> dict[str, Any]:
+    """Return how far the identified dynamics and the round trip are off the true ones."""
+    document = json.loads(identify.output("parameters").read_text())
+    by_name = {p["name"]: p for p in document["parameters"]}
+    trip = by_name["round_trip_delay"]
+    return {
+        "errors": {n: p["estimate"] / p["truth"] - 1 for n, p in by_name.items() if p["kind"] == "dynamics"},
+        "round_trip_ms": 1e3 * trip["estimate"],
+        "round_trip_error_ms": 1e3 * (trip["estimate"] - trip["truth"]),
+    }
+
+
+def deployed(run_dir: Path, quantity: str) -> list[float]:
+    """Return a quantity of the score of every deployment on the robot."""
+    result = json.loads(done(run_dir, "deploy").output("result").read_text())
+    return [episode["real"][quantity] for episode in result["episodes"]]
+
+
+def rows(name: str, seeds: list[dict[str, Any]], goals: dict[str, str]) -> list[dict[str, Any]]:
+    """Return seconds and errors of whole runs, one value a seed; goals by the end of a row's name."""
+    found = []
+    for stage in (*STAGES, "total"):
+        values = [round(s[f"{stage}_s"], 1) for s in seeds]
+        found.append(row(f"{name}/{stage}_s", values, "s", "", goals.get(f"{stage}_s", "")))
+    off = [round(s["round_trip_error_ms"], 2) for s in seeds]
+    found.append(row(f"{name}/round_trip_error_ms", off, "ms", "true latency", "+-3"))
+    for parameter in seeds[0]["errors"]:
+        values = [round(100 * s["errors"][parameter], 2) for s in seeds]
+        found.append(row(f"{name}/{parameter}_error", values, "%", "true parameter", goals.get("error", "")))
+    return found

@@ -1,0 +1,165 @@
+"""Every bench runs with --quick, and its report says what it is of; figures are not looked at."""
+
+import ast
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
+import bench  # noqa: E402
+from benches import compose, graph_mjx, provenance  # noqa: E402
+from benches.catalogue import BENCHES  # noqa: E402
+
+MODULES = sorted(SCRIPTS.rglob("*.py"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_to_compile():
+    """What runs for milliseconds need not be compiled for speed."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """Run a bench; return its report, what it printed, and what it said."""
+
+    def run(name, *flags):
+        path = tmp_path / "report.json"
+        assert bench.main([name, "--quick", "--json", str(path), *map(str, flags)]) == 0
+        told = capsys.readouterr()
+        report = json.loads(path.read_text())
+        assert (report["bench"], report["quick"]) == (name, True)
+        assert "measure nothing" in told.err
+        assert report["measured"]
+        for row in report["rows"]:
+            assert set(row) == {"name", "value", "unit", "yardstick", "goal"}
+            assert row["name"] in told.out
+        return report
+
+    return run
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """Programs on MJX are traced but not compiled, which would take three quarters of the time."""
+
+    def compare(programs, starts, repeats):
+        for program in programs.values():
+            jax.eval_shape(jax.vmap(program), starts)
+        return dict.fromkeys(programs, 1.0), dict.fromkeys(programs, 1.0)
+
+    for module in (compose, graph_mjx):
+        monkeypatch.setattr(module, "compare", compare)
+
+
+def names(report):
+    return {row["name"] for row in report["rows"]}
+
+
+def test_graph(run, traced):
+    found = names(run("graph", "--name", "h200"))
+    assert {"graph/h200/hiccups/2/over_hand", "graph/h200/mjx_arm/2/over_bare", "graph/bytes_per_copy"} <= found
+    assert "graph/build/10_episodes_wire_s" in found
+
+
+def test_train(run):
+    report = run("train", "--seeds", 2)
+    name = f"train/{jax.default_backend()}/pendulum/2_seeds"
+    rows = {row["name"].removeprefix(f"{name}/"): row["value"] for row in report["rows"]}
+    assert len(rows["final_success"]) == 2
+    assert rows["env_steps_per_s"] > 0
+    assert rows["time_to_0.95_all_s"] is None
+    assert report["machine"]["devices"]
+
+
+def test_async(run):
+    assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
+
+
+def test_compose(run, traced):
+    found = names(run("compose"))
+    assert {"compose/build_20_entities_ms", "compose/reset_ms", "compose/mjx_over_c_float64/contact_free"} <= found
+    assert "compose/cpu/mjx_env_over_bare" in found
+
+
+def test_log(run):
+    report = run("log")
+    rows = {row["name"]: row["value"] for row in report["rows"]}
+    assert rows["log/truncations/recovered"] == 3
+    assert {"log/loop_200hz/p99_ms", "log/range_read_ms"} <= set(rows)
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory):
+    """A recording in the form of the disk's, of a pendulum that is pushed about."""
+    voltage = np.repeat(np.random.default_rng(0).uniform(-2, 2, 50), 10)
+    state, angles = np.zeros(2), []
+    for u in voltage:
+        for _ in range(5):
+            state = state + 0.005 * np.array([state[1], 50.0 * u - 100.0 * np.sin(state[0]) - 5.0 * state[1]])
+        angles.append(state[0])
+    path = tmp_path_factory.mktemp("disk") / "disk.npz"
+    np.savez(path, u=voltage, th=np.array(angles))
+    return path
+
+
+def test_identify(run, disk):
+    pytest.importorskip("mujoco.sysid")
+    report = run("identify", "--data", disk)
+    assert {"identify/disk/fit_s", "identify/disk/free_run_over_sysid"} <= names(report)
+    assert report["flags"]["data"] == str(disk)
+    assert report["values"][0]["delay"] >= 0
+
+
+@pytest.mark.parametrize(
+    ("data", "flags", "words"),
+    [
+        ("nothing.npz", [], "nothing.npz is no file *.npz and no folder with such files"),
+        ("disk.npz", ["--fit", "other.npz@0:10"], "'other.npz@0:10' selects nothing of disk.npz"),
+        ("disk.npz", ["--case", "xl330"], "is no file *.json and no folder with such files"),
+        ("disk.npz", ["--case", "so101", "--fit", "step_response"], "'step_response' selects nothing of disk.npz"),
+    ],
+)
+def test_data_that_is_not_there_is_said_in_words(disk, capsys, data, flags, words):
+    assert bench.main(["identify", "--data", str(disk.with_name(data)), *flags]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert "\nhint: " in told
+
+
+@pytest.mark.parametrize(("name", "flag"), [("graph", "--copies"), ("identify", "--data"), ("train", "--minibatches")])
+def test_help_shows_the_flags_of_a_bench(name, flag, capsys):
+    with pytest.raises(SystemExit) as end:
+        bench.main([name, "--help"])
+    told = capsys.readouterr().out
+    assert end.value.code == 0
+    assert flag in told
+    assert "--quick" in told
+
+
+def test_help_lists_the_benches(capsys):
+    with pytest.raises(SystemExit):
+        bench.main(["--help"])
+    told = capsys.readouterr().out
+    assert all(f"  {name} " in told for name in BENCHES)
+
+
+def test_the_commit_of_a_copy_can_be_told(run, monkeypatch):
+    monkeypatch.setattr(provenance, "_git", lambda *_: None)
+    assert run("log", "--commit", "abc1234")["commit"] == "abc1234"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda m: m.name)
+def test_scripts_stay_short(module):
+    text = module.read_text()
+    assert len(text.splitlines()) <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 60, node.name
