@@ -17,6 +17,9 @@ for _number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Two workers share two cores: one program does not take both.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 # Programs compiled by an earlier run are read from disk, those of subprocesses too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
@@ -24,6 +27,25 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 # A machine with two busy cores misses hypothesis's deadlines without anything being wrong.
 settings.register_profile("sim2real", deadline=None)
 settings.load_profile("sim2real")
+
+
+# Rooms that take longest go to the workers first, so that neither is left with a long one at the end.
+LONGEST = ("real time", "identify", "composer", "integration", "train", "robots", "runtime", "pipelines")
+
+
+def pytest_collection_modifyitems(items):
+    """Give each room to one worker, which so compiles its programs once; all tests in real time to the same one.
+
+    Two of those at a time would keep each other from their deadlines.
+    """
+    groups = {}
+    for item in items:
+        room = item.path.relative_to(REPOSITORY / "tests").parts[0]
+        groups[item] = "real time" if item.get_closest_marker("realtime") else room
+        item.add_marker(pytest.mark.xdist_group(groups[item]))
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        rank = {room: i for i, room in enumerate(LONGEST)}
+        items.sort(key=lambda item: (rank.get(groups[item], len(rank)), groups[item]))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -20,6 +20,8 @@ from sim2real.hardware.protocol import Instruction, Parser, StatusError, build
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.hardware.wire import EmulatorConfig
 
+pytestmark = pytest.mark.realtime
+
 PLANTS = Path(__file__).parent / "plants.py"
 OK = 0
 

@@ -17,6 +17,8 @@ from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.rig import ServoRig
 from sim2real.hardware.truth import Kind
 
+pytestmark = pytest.mark.realtime
+
 IDS = (1, 2, 3)
 START_RAD = np.array([0.5, -0.8, 0.3])
 DRIVE = PositionDrive(p_gain=800, profile_velocity_rad_s=20.0)

@@ -16,6 +16,8 @@ from sim2real.hardware.rig import ServoRig
 from sim2real.hardware.truth import Kind
 from sim2real.hardware.wire import EmulatorConfig
 
+pytestmark = pytest.mark.realtime
+
 SUPPLY_V = 5.0
 TIMEOUT_S = 0.1
 

@@ -10,6 +10,8 @@ from sim2real.hardware.registers import RAD_PER_COUNT, OperatingMode
 from sim2real.hardware.twin import TwinPlant
 from sim2real.stages.pipeline import load_pipeline
 
+pytestmark = pytest.mark.realtime
+
 CENTRE_RAD = 2048 * RAD_PER_COUNT
 FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 1.5}
 

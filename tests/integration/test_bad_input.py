@@ -12,6 +12,8 @@ from sim2real.hardware.port import WaitingPort
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.stages.train import load_parameters
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def fails(capsys):

@@ -9,6 +9,8 @@ from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import read_log
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def record(tmp_path, capsys):

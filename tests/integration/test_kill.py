@@ -12,6 +12,8 @@ from live_robots import assert_torque_ends_off, manifest_of, motor, wait_until_r
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
+pytestmark = pytest.mark.realtime
+
 
 def check_death(log, killed_ns, truth):
     """The log holds all but the last 0.25 s before the death, and the motor stopped within 0.2 s of it."""

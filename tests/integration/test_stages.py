@@ -10,6 +10,8 @@ from sim2real import cli
 from sim2real.log.reader import read_log
 from sim2real.stages.runs import STAGES, finished, newest
 
+pytestmark = pytest.mark.realtime
+
 
 def strict_json(path):
     """Read JSON as other programs do, which know no NaN."""

@@ -19,6 +19,8 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord
 from sim2real.log import McapRecorder, TruncatedLogWarning, read_log, read_session, recover, summary
 
+pytestmark = pytest.mark.realtime
+
 
 def read_quietly(path):
     with warnings.catch_warnings():

@@ -11,6 +11,8 @@ import pytest
 from sim2real.hardware.plant import load_plant
 from sim2real.hardware.registers import OperatingMode
 
+pytestmark = pytest.mark.realtime
+
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "arm" / "plant.py"
 ArmPlant = functools.partial(load_plant, f"{FILE}:ArmPlant")  # as the emulator gets it
 SMOOTH = {"coulomb": (0.0, 0.0, 0.0)}

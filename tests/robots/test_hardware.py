@@ -18,6 +18,8 @@ from sim2real.robots.hardware import Excitation
 from sim2real.robots.messages import Goals
 from sim2real.stages.session import run_episode
 
+pytestmark = pytest.mark.realtime
+
 # A busy machine is not what is tested: the watchdog is patient.
 GATE = GateLimits(limit=1.5, slew_per_s=6.0, command_timeout_s=0.2, max_speed_rad_s=20.0, servo_watchdog_s=0.6)
 SIGNAL = np.concatenate([np.zeros((5, 3)), np.tile([0.3, 0.6, -0.4], (20, 1)), np.tile([0.2, 1.45, 0.1], (10, 1))])

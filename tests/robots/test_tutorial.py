@@ -12,6 +12,8 @@ from sim2real.log.reader import read_log
 from sim2real.stages import record
 from sim2real.stages.pipeline import load_pipeline
 
+pytestmark = pytest.mark.realtime
+
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 
 

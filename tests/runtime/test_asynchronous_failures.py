@@ -15,7 +15,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.failure import GraphTimeout, NodeFailed
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
 KEY = jax.random.key(0)
 
 

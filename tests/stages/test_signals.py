@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.realtime
+
 FINALISER = """
 import gc, sys, time
 from types import ModuleType
