@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,6 +20,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.data import NodeData
+from sim2real.runtime.failure import noted
 from sim2real.runtime.handover import Reply
 from sim2real.runtime.init import collect, init_graph_state
 from sim2real.runtime.simulated import SimulatedRun
@@ -34,7 +37,8 @@ class AsyncGraph:
     provides the output. ``with graph:`` stops it on the way out; so does the interpreter's exit.
 
     A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step, and the
-    call that waits, or else the next one, raises it with the node's name.
+    call that waits, or else the next one, raises it with the node's name. A step that hangs is a failure, too: its
+    node's ``stop`` is then called from outside, as is that of a node whose startup outlives the graph.
 
     Args:
         nodes: The nodes, by name or as a list.
@@ -46,6 +50,9 @@ class AsyncGraph:
         timeline: What happens when; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: How long a call waits for the next step, and the supervisor for its caller [s].
         spin_s: How long threads poll before a step instead of sleeping [s]. Wall clock only.
+        step_timeout_s: How long a step of any node may take before it counts as hanging, which stops the graph [s]; 0:
+            as long as it likes; default: ten periods of its node, at least 1 s. What the caller takes for a step does
+            not count. Wall clock only.
 
     Raises:
         UsageError: When the nodes form no graph or an option does not go with the clock.
@@ -62,17 +69,21 @@ class AsyncGraph:
         timeline: Timeline | None = None,
         timeout_s: float = 30.0,
         spin_s: float = 0.0,
+        step_timeout_s: float | None = None,
     ) -> None:
+        _check_supervisor(supervisor, nodes)
         self.nodes = collect(nodes, supervisor)
         self.supervisor = supervisor
         self.clock = Clock(clock)
         self.recorder = recorder
         self._factor, self._duration_s, self._timeline = real_time_factor, duration_s, timeline
-        self._timeout_s, self._spin_s = timeout_s, spin_s
+        self._timeout_s, self._spin_s, self._step_timeout_s = timeout_s, spin_s, step_timeout_s
         self._steppers = {name: Stepper(node) for name, node in self.nodes.items()}
         self._jit: dict[str, bool] = dict.fromkeys(self.nodes, True)
         self._run: WallClockRun | SimulatedRun | None = None
         self._run_data: dict[str, NodeData] = {}
+        self._lock = threading.Lock()
+        self._stops = 0
         self._check_options()
 
     def init(
@@ -112,7 +123,8 @@ class AsyncGraph:
 
         Raises:
             UsageError: When the graph is running.
-            Sim2RealError: When a startup failed; all nodes are stopped then.
+            Sim2RealError: When a startup failed, or another thread stopped the graph meanwhile; all nodes are stopped
+                then.
         """
         if self.running:
             raise UsageError("the graph is running", hint="call stop() first")
@@ -121,12 +133,17 @@ class AsyncGraph:
     def stop(self, timeout_s: float = 10.0) -> None:
         """Stop the graph, from any state and any thread; does nothing when it is stopped.
 
+        A graph that is being started ends as well: when this returns, no startup runs or will run.
+
         Raises:
             Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
         """
         atexit.unregister(self.stop)
-        if self._run is not None:
-            self._run.stop(timeout_s)
+        with self._lock:
+            self._stops += 1
+            run = self._run
+        if run is not None:
+            run.stop(timeout_s)
 
     def run_for(self, duration_s: float) -> GraphState:
         """Let the running graph run on, the supervisor making its own steps, and return its state.
@@ -203,20 +220,23 @@ class AsyncGraph:
     def __enter__(self) -> AsyncGraph:
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        self.stop()
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        with contextlib.nullcontext() if error is None else noted(error):
+            self.stop()
 
     def _check_options(self) -> None:
         simulated = self.clock is Clock.SIMULATED
         if simulated:
             if (self._duration_s is None) == (self._timeline is None):
                 raise UsageError("the simulated clock needs a duration_s or a timeline, one of them")
-            if self._spin_s:
-                raise UsageError("spin_s is for the wall clock")
+            if self._spin_s or self._step_timeout_s is not None:
+                raise UsageError("spin_s and step_timeout_s are for the wall clock")
         elif self._factor or self._duration_s is not None or self._timeline is not None:
             raise UsageError("real_time_factor, duration_s and timeline are for the simulated clock")
-        if not (self._factor >= 0 and self._spin_s >= 0 and self._timeout_s > 0):
-            raise UsageError("real_time_factor and spin_s must be at least 0, timeout_s must be positive")
+        if not (self._factor >= 0 and self._spin_s >= 0 and (self._step_timeout_s or 0.0) >= 0 and self._timeout_s > 0):
+            raise UsageError(
+                "real_time_factor, spin_s and step_timeout_s must be at least 0, timeout_s must be positive"
+            )
         for node in self.nodes.values():
             averaged = [c for c in node.inputs.values() if c.averaged]
             if averaged and not simulated:
@@ -250,19 +270,24 @@ class AsyncGraph:
                     f"{', '.join(self._run.alive)} did not end when the graph was stopped, and may still act",
                     hint="start a new process",
                 )
+        stops = self._stops
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, own)
         if self.clock is Clock.SIMULATED:
             timeline, episode = self._timeline_of(graph_state)
             run = SimulatedRun(*common, timeline, episode, self._factor)
         else:
-            run = WallClockRun(*common, self._spin_s, self._timeout_s)
-        self._run, self._run_data = run, data
+            run = WallClockRun(*common, self._spin_s, self._timeout_s, self._step_timeout_s)
+        with self._lock:
+            if self._stops != stops:
+                raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
+            self._run, self._run_data = run, data
         atexit.register(self.stop)
         try:
             run.begin(timeout_s)
-        except BaseException:
-            self.stop(timeout_s)
+        except BaseException as error:
+            with noted(error):  # Ctrl-C must stay Ctrl-C, whatever a startup that hangs makes of the stop
+                self.stop(timeout_s)
             raise
         return run
 
@@ -298,3 +323,19 @@ class AsyncGraph:
         if output is None:
             return Reply(step_state)
         return Reply(step_state, self._run_data[self.supervisor.name].form.pack(output))
+
+
+def _check_supervisor(supervisor: Any, nodes: Any) -> None:
+    if isinstance(supervisor, BaseNode):
+        return
+    given = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
+    if isinstance(supervisor, str):
+        what, hint = f"the name {supervisor!r}", "pass the node itself"
+    elif isinstance(supervisor, Mapping | list | tuple | set):
+        what, hint = f"{len(supervisor)} nodes", "one node's steps are what reset() and step() stop at: pass that one"
+    else:
+        what, hint = f"a {type(supervisor).__name__}", "pass one of the nodes"
+    raise UsageError(
+        f"the supervisor must be a node, not {what}. Nodes: {', '.join(str(getattr(n, 'name', n)) for n in given)}",
+        hint=hint,
+    )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from sim2real.errors import Sim2RealError
 
 
@@ -41,3 +44,13 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
     failed = NodeFailed(f"node {node!r} failed in its {during}: {type(error).__name__}: {error}", node)
     failed.__cause__ = error
     return failed
+
+
+@contextmanager
+def noted(error: BaseException) -> Iterator[None]:
+    """Make what fails in the block a note of the error that is on its way out, so that it keeps its place."""
+    try:
+        yield
+    except Exception as other:
+        if other is not error:
+            error.add_note(f"then: {type(other).__name__}: {other}")

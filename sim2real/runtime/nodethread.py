@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 
@@ -15,7 +16,7 @@ from sim2real.runtime.channel import Channel, Table
 from sim2real.runtime.clock import MonotonicClock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import Stopped, named
-from sim2real.runtime.handover import Handover
+from sim2real.runtime.handover import Handover, Reply
 from sim2real.runtime.statistics import StepLog
 from sim2real.runtime.stepper import Result, Stepper, overwritten
 
@@ -72,6 +73,9 @@ class Shared:
 class NodeThread(threading.Thread):
     """Startup, steps and stop of a node all run here, so that ``stop`` never overtakes the last step.
 
+    Unless one of them hangs: then ``stop`` is called from outside, and here once more should the node ever come back,
+    as what it did meanwhile may have undone the first.
+
     Args:
         stepper: The node's prepared stepper.
         data: Its data.
@@ -79,6 +83,13 @@ class NodeThread(threading.Thread):
         outputs: The channels of its readers.
         shared: What all threads share.
         handover: Where the supervisor meets its caller; None for the other nodes.
+
+    Attributes:
+        ready: Set once the startup is over, one way or another.
+        over: Set when there is nothing more to wait for: the thread has ended, or was given up.
+        given_up: Whether the node hung and was made safe from outside.
+        during: What the thread does: ``startup``, ``step 12`` or ``stop``.
+        since_s: Since when startup or a step runs, on the machine's monotonic clock [s]; None while neither does.
     """
 
     def __init__(
@@ -93,17 +104,36 @@ class NodeThread(threading.Thread):
         super().__init__(name=f"sim2real:{stepper.node.name}", daemon=True)
         self.node, self.stepper, self.data = stepper.node, stepper, data
         self.inputs, self.outputs, self.shared, self.handover = inputs, outputs, shared, handover
-        self.ready = threading.Event()
-        self.log = StepLog()
+        self.ready, self.over = threading.Event(), threading.Event()
+        self.given_up = False
+        self.log = StepLog(inputs)
         self.during = "startup"
+        self.since_s: float | None = None
         self._safe_lock = threading.Lock()
-        self._safe = False
 
     def run(self) -> None:
-        """Run until the graph stops; whatever happens, the node's ``stop`` is called."""
+        """Run until the graph stops; whatever happens, the ``stop`` of a node that was started up is called."""
         try:
+            if not self.shared.stopping.is_set():  # else nothing has been switched on, and nothing shall be
+                self._live()
+        finally:
+            self.ready.set()
+            self.over.set()
+
+    def give_up(self, timeout_s: float) -> None:
+        """Call the node's ``stop`` although its thread hangs, and wait for that for a while."""
+        self.given_up = True
+        helper = threading.Thread(target=self._make_safe, args=(True,), daemon=True)
+        helper.start()
+        helper.join(timeout_s)
+        self.over.set()
+
+    def _live(self) -> None:
+        try:
+            self.since_s = time.monotonic()
             if not self.node.startup(self.shared.graph_state, self.shared.timeout_s):
                 raise Sim2RealError(f"the startup of node {self.node.name!r} did not succeed")
+            self.since_s = None
             self.ready.set()
             self.shared.go.wait()
             self._loop()
@@ -112,26 +142,18 @@ class NodeThread(threading.Thread):
         except BaseException as error:
             self.shared.fail(named(error, self.node.name, self.during))
         finally:
-            self.during = "stop"
-            self._make_safe()
-            self.ready.set()
+            self.during, self.since_s = "stop", None
+            self._make_safe(False)
 
-    def make_safe_from_outside(self, timeout_s: float) -> None:
-        """Call the node's ``stop`` although its thread hangs, and wait for it for a while."""
-        helper = threading.Thread(target=self._make_safe, daemon=True)
-        helper.start()
-        helper.join(timeout_s)
-
-    def _make_safe(self) -> None:
+    def _make_safe(self, from_outside: bool) -> None:
         with self._safe_lock:
-            if self._safe:
-                return
-            self._safe = True
-        try:
-            if not self.node.stop(self.shared.timeout_s):
-                raise Sim2RealError(f"the stop of node {self.node.name!r} did not succeed")
-        except BaseException as error:
-            self.shared.fail(named(error, self.node.name, "stop"))
+            if from_outside and self.during == "stop":
+                return  # it came back
+            try:
+                if not self.node.stop(self.shared.timeout_s):
+                    raise Sim2RealError(f"the stop of node {self.node.name!r} did not succeed")
+            except BaseException as error:
+                self.shared.fail(named(error, self.node.name, "stop"))
 
     def _loop(self) -> None:
         node, shared, clock = self.node, self.shared, self.shared.clock
@@ -144,28 +166,31 @@ class NodeThread(threading.Thread):
             blocked = max((channel.wait_group(k) for channel in self.inputs.values()), default=0)
             begin = int(start(scheduled, drift, end, blocked, waits))
             later = int(next_drift(node.scheduling, scheduled, drift, end))
+            overrun = begin == end > scheduled + drift
             if not clock.sleep_past(begin, shared.stopping, shared.spin):
                 return
             woken = clock.now()
             for name, channel in self.inputs.items():
-                self.data.windows[name].push(channel.take(k, begin))
+                taken = channel.take(k, begin)
+                self.data.windows[name].push(taken)
+                self.log.read(name, begin, taken[-1].sent if taken else None)
             result = self._step(k, begin)
             end = clock.now()
             moved = overwritten(result.ts, begin, end, node.name)
             for channel in self.outputs:
                 channel.put(k, end, result.leaves)
             self.data.keep(result.changed)
-            self.log.add(begin, woken, end, slots[k + 1] + later)
+            self.log.add(begin, woken, overrun)
             self._record(StepRecord(node.name, k, scheduled, begin, woken, moved, end, drift), result)
+            self.since_s = None
             if self.handover is not None:
                 self.handover.finished()
             drift = later
 
     def _step(self, k: int, begin: int) -> Result:
         given = self.data.step_state(k, begin)
-        if self.handover is None:
-            return self.stepper.run(self.data, given, {})
-        reply = self.handover.meet(given, self.shared.answer_timeout_s)
+        reply = self.handover.meet(given, self.shared.answer_timeout_s) if self.handover else Reply()
+        self.since_s = time.monotonic()  # not before: the caller may take its time
         return self.stepper.answer(self.data, given, {}, reply)
 
     def _record(self, record: StepRecord, result: Result) -> None:

@@ -59,7 +59,8 @@ class _Player:
         self.outputs: list[_Link] = []
         self.k = 0
         self.drift = 0
-        self.log = StepLog()
+        # Of a trainable delay the step itself picks the message: the timeline does not know which.
+        self.log = StepLog(n for n, c in node.inputs.items() if not c.trainable)
 
     def ready(self, players: Mapping[str, _Player]) -> bool:
         """Return whether everything that the next step consumes has been sent."""
@@ -236,6 +237,8 @@ class SimulatedRun:
         for name, link in player.links.items():
             messages = [self._message(link, m) for m in link.consumed(player.k)]
             player.data.windows[name].push(messages)
+            if not player.data.node.inputs[name].trainable:
+                player.log.read(name, begin, messages[-1].sent if messages else None)
         given = player.data.step_state(player.k, begin)
         if player.data.node.name == self._supervisor and not self._own:
             self._pending = given
@@ -257,8 +260,9 @@ class SimulatedRun:
         for link in player.outputs:
             link.put(k, result.leaves)
         player.data.keep(result.changed)
-        later = int(next_drift(node.scheduling, player.slots[k], player.drift, player.ends[k - 1] if k else 0))
-        player.log.add(begin, begin, end, player.slots[k + 1] + later)
+        before = player.ends[k - 1] if k else 0
+        later = int(next_drift(node.scheduling, player.slots[k], player.drift, before))
+        player.log.add(begin, begin, begin == before > player.slots[k] + player.drift)
         self._record(player, k, moved, result)
         player.drift = later
 

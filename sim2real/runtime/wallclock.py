@@ -20,9 +20,9 @@ from sim2real.runtime.handover import Handover, Reply
 from sim2real.runtime.nodethread import NodeThread, Shared
 from sim2real.runtime.statistics import NodeStatistics
 from sim2real.runtime.stepper import Stepper
+from sim2real.runtime.watchdog import LAST_RESORT_S, Watchdog, step_limits
 
 _LEAD_S = 0.005
-_LAST_RESORT_S = 1.0
 
 
 class WallClockRun:
@@ -38,6 +38,7 @@ class WallClockRun:
         own: Whether the supervisor makes its steps itself.
         spin_s: How long threads poll before a step instead of sleeping [s].
         timeout_s: How long the supervisor waits for its caller [s].
+        step_timeout_s: How long a step may take, see ``step_limits``.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class WallClockRun:
         own: bool,
         spin_s: float,
         timeout_s: float,
+        step_timeout_s: float | None,
     ) -> None:
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
         self._graph_state, self._recorder, self._gym = graph_state, recorder, not own
@@ -64,6 +66,7 @@ class WallClockRun:
             outputs = [self._channels[c.input_node.name, c.name] for c in node.outputs if c.input_node.name in nodes]
             handover = self._handover if name == supervisor else None
             self._threads[name] = NodeThread(steppers[name], data[name], inputs, outputs, self._shared, handover)
+        self._watchdog = Watchdog(self._threads.values(), step_limits(nodes, step_timeout_s), self._shared)
         self._process = ExitStack()
         self._stop_lock = threading.Lock()
         self._stopped = False
@@ -86,9 +89,11 @@ class WallClockRun:
             # Before the startups, which may switch torque on: collecting garbage holds every thread up, for half a
             # second in a large process, and a servo's watchdog would trip.
             self._process.enter_context(realtime())
-        deadline = time.monotonic() + timeout_s
-        for thread in self._threads.values():
-            thread.start()
+            deadline = time.monotonic() + timeout_s
+            # Under the lock: a stop from another thread waits until all that will ever start has started, and ends it.
+            self._watchdog.start()
+            for thread in self._threads.values():
+                thread.start()
         for name, thread in self._threads.items():
             if not thread.ready.wait(max(0.0, deadline - time.monotonic())):
                 self._shared.fail(
@@ -109,7 +114,7 @@ class WallClockRun:
         self._shared.go.set()
 
     def _refuse_if_stopped(self) -> None:
-        if self._stopped:
+        if self.ended:
             raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
 
     def check(self) -> None:
@@ -164,7 +169,7 @@ class WallClockRun:
         with self._stop_lock:
             if not self._stopped:
                 self._stopped = True
-                self._end(deadline, timeout_s)
+                self._end(deadline)
             failure = self._shared.deliver()
         if failure is not None:
             raise failure
@@ -183,17 +188,23 @@ class WallClockRun:
         for channel in self._channels.values():
             channel.stop()
 
-    def _end(self, deadline: float, timeout_s: float) -> None:
+    def _end(self, deadline: float) -> None:
+        begin = time.monotonic()
         for thread in self._threads.values():
             if thread.ident is not None:
-                thread.join(max(0.0, deadline - time.monotonic()))
+                thread.over.wait(max(0.0, deadline - time.monotonic()))
+                if not thread.given_up:
+                    thread.join(max(0.0, deadline - time.monotonic()))
+        self._watchdog.finish()
         self._process.close()
         for name, thread in self._threads.items():
             if thread.is_alive():
-                thread.make_safe_from_outside(_LAST_RESORT_S)
+                if not thread.given_up:
+                    thread.give_up(LAST_RESORT_S)
+                waited_s = time.monotonic() - begin
                 self._shared.fail(
                     GraphTimeout(
-                        f"node {name!r} is still in its {thread.during} {timeout_s:g} s after the stop; "
+                        f"node {name!r} is still in its {thread.during} {waited_s:.1f} s after the stop; "
                         "its stop() was called from outside",
                         hint="give what it waits for a timeout of its own",
                     )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_le
 from sim2real.graph.node import BaseNode
 from sim2real.log.writer import McapRecorder
 from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
 from sim2real.stages.manifest import git_state, plain, versions
 from sim2real.stages.pipeline import Pipeline
@@ -106,11 +106,11 @@ def run_episode(
         session.rig.stop_quietly()
         status = f"{type(error).__name__}: {error}"
         # What else goes wrong on the way out must not take the place of the reason.
-        with _noted(error):
+        with noted(error):
             graph.stop()
-        with _noted(error):
+        with noted(error):
             recorder.write_event("stop", status)
-        with _noted(error):
+        with noted(error):
             recorder.close(status, _exit_code(error), _summary(graph, session, watch))
         raise
     summary = _summary(graph, session, watch)
@@ -210,16 +210,6 @@ def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any
 def _numbers(values: Iterable[float]) -> list[float | None]:
     """Return the values for JSON, which knows no NaN: a node that never stepped has no times."""
     return [v if math.isfinite(v) else None for v in values]
-
-
-@contextmanager
-def _noted(error: BaseException) -> Iterator[None]:
-    """Make what fails in the block a note of the error that is on its way out."""
-    try:
-        yield
-    except Exception as other:
-        if other is not error:
-            error.add_note(f"then: {type(other).__name__}: {other}")
 
 
 def _exit_code(error: BaseException) -> int:

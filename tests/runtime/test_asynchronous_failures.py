@@ -2,6 +2,8 @@
 
 import contextlib
 import gc
+import os
+import signal
 import threading
 import time
 
@@ -13,10 +15,25 @@ from asynchronous_nodes import Plain, Value, pair
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.failure import GraphTimeout, NodeFailed
+from sim2real.runtime.failure import GraphTimeout, NodeFailed, noted
+from sim2real.runtime.nodethread import NodeThread
+from sim2real.runtime.watchdog import step_limits
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
 KEY = jax.random.key(0)
+WHOLE = (["startup", "stop"], [])
+"""What a node may have seen of an episode that was stopped while it started: all of it, or nothing."""
+
+
+def graph_threads():
+    return [t.name for t in threading.enumerate() if t.name.startswith("sim2real:")]
+
+
+def wait_for(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def run(sensor, agent, seconds):
@@ -112,16 +129,22 @@ def test_a_failed_startup_stops_everything():
     class Slow(Plain):
         def startup(self, graph_state, timeout=None):
             super().startup(graph_state, timeout)
-            time.sleep(0.5)
+            release.wait(20)
             return True
 
+    release = threading.Event()
+
     for cls, seconds, match in ((Unplugged, 5.0, "startup of node 'sensor'"), (Slow, 0.1, "'sensor' has not finished")):
+        release.clear()
         sensor, agent = pair(cls)
         graph = AsyncGraph([sensor, agent], agent)
         with pytest.raises(Sim2RealError, match=match):
             graph.start(graph.init(KEY), timeout_s=seconds)
-        time.sleep(0.6)
-        assert sensor.calls == agent.calls == ["startup", "stop"]
+        release.set()
+        wait_for(lambda: not graph_threads())
+        # The slow one is made safe at once, and again when its startup comes back, which may have switched things on.
+        assert sensor.calls == ["startup", "stop", "stop"] if cls is Slow else ["startup", "stop"]
+        assert agent.calls in WHOLE  # nothing starts up once the graph has failed
         assert sensor.seqs == agent.seqs == []
 
 
@@ -152,10 +175,11 @@ def test_calls_honour_their_timeouts():
     with pytest.raises(Sim2RealError, match="sensor did not end"):
         graph.start(gs)
     sensor.release.set()
-    time.sleep(0.1)
+    wait_for(lambda: not graph_threads())
+    assert sensor.calls == ["startup", "stop", "stop"]  # once more: the step that hung may have acted since
     graph.start(gs)
     graph.stop()
-    assert sensor.calls == ["startup", "stop"] * 2
+    assert sensor.calls[3:] == ["startup", "stop"]
 
 
 def test_a_supervisor_without_a_caller_stops_the_graph():
@@ -193,7 +217,10 @@ def test_stop_from_another_thread_or_a_node(mode):
                 later.start()  # only now: on a busy machine the start may take longer than the timer
             getattr(graph, mode)(10.0)
         graph.stop()
-        assert sensor.calls == agent.calls == ["startup", "stop"]
+        assert sensor.calls in WHOLE
+        assert agent.calls in WHOLE
+        if mode != "step" or cls is Stops:  # else the stop may come before the first startup
+            assert sensor.calls == agent.calls == ["startup", "stop"]
 
 
 @pytest.mark.parametrize(("clock", "sequences"), [(Clock.SIMULATED, 940), (Clock.WALL_CLOCK, 60)])
@@ -222,7 +249,7 @@ def test_any_order_of_calls(clock, sequences):
                 made += 1
     graph.stop()
     assert made > sequences
-    assert not [t for t in threading.enumerate() if t.name.startswith("sim2real:")]
+    assert not graph_threads()
     if clock is Clock.WALL_CLOCK:
         assert sensor.calls == ["startup", "stop"] * (len(sensor.calls) // 2)
         assert len(sensor.calls) > 20
@@ -242,3 +269,190 @@ def test_garbage_is_collected_before_a_startup_may_switch_torque_on():
     assert was
     assert not sensor.collecting
     assert gc.isenabled()
+
+
+class Motor(Plain):
+    """A startup that switches torque on."""
+
+    torque = False
+
+    def startup(self, graph_state, timeout=None):
+        self.torque = True
+        return super().startup(graph_state, timeout)
+
+    def stop(self, timeout=None):
+        time.sleep(0.1)
+        self.torque = False
+        return super().stop(timeout)
+
+
+@pytest.mark.parametrize("moment", ["compiling", "between threads", "startup"])
+def test_stop_ends_a_start(moment, monkeypatch):
+    """When stop() returns, torque is off and stays off, however far the start in another thread is."""
+    reached, let_go = threading.Event(), threading.Event()
+
+    def pause():
+        reached.set()
+        let_go.wait(20)
+
+    class Other(Plain):
+        def startup(self, graph_state, timeout=None):
+            if moment == "startup":
+                reached.set()
+                wait_for(lambda: not graph.running)
+            return super().startup(graph_state, timeout)
+
+    def prepare(self, graph_state):
+        if moment == "compiling":
+            pause()
+        return prepared(self, graph_state)
+
+    def start_thread(self):
+        if moment == "between threads" and self.node.name == "motor":
+            pause()
+        started(self)
+
+    prepared, started = AsyncGraph._prepare, NodeThread.start
+    monkeypatch.setattr(AsyncGraph, "_prepare", prepare)
+    monkeypatch.setattr(NodeThread, "start", start_thread)
+    other, motor = Other("other", 50), Motor("motor", 50)
+    graph = AsyncGraph([other, motor], motor)
+    gs, caught = graph.init(KEY), []
+
+    def start():
+        with pytest.raises(Sim2RealError, match="stopped while it started") as raised:
+            graph.start(gs)
+        caught.append(raised)
+
+    starting = threading.Thread(target=start)
+    starting.start()
+    assert reached.wait(20)
+    if moment == "startup":
+        wait_for(lambda: motor.torque)
+    threading.Timer(0.1, let_go.set).start()
+    graph.stop()
+    after = list(motor.calls)
+    assert not motor.torque
+    starting.join(20)
+    assert caught
+    assert motor.calls == after
+    assert motor.calls == (["startup", "stop"] if moment == "startup" else [])
+    assert not graph.running
+    assert not graph_threads()
+
+
+def test_a_step_that_hangs_stops_the_graph_and_is_made_safe():
+    class Stuck(Motor):
+        release = threading.Event()
+
+        def step(self, step_state):
+            if step_state.seq == 5:
+                self.release.wait(20)
+            return super().step(step_state)
+
+    sensor, motor = Plain("sensor", 50), Stuck("motor", 50)
+    motor.connect(sensor)
+    graph = AsyncGraph([sensor, motor], sensor, step_timeout_s=0.5)
+    begin = time.monotonic()
+    graph.start(graph.init(KEY))
+    wait_for(lambda: not motor.torque)  # although nobody waits for the graph
+    with pytest.raises(GraphTimeout, match=r"node 'motor' hangs: its step 5 has taken 0\.5 s") as caught:
+        graph.run_for(30.0)
+    assert time.monotonic() - begin < 10.0
+    assert "'motor' is still in its step 5" in "".join(caught.value.__notes__)
+    assert sensor.calls == motor.calls == ["startup", "stop"]
+    motor.release.set()
+    wait_for(lambda: not graph_threads())
+    assert motor.calls == ["startup", "stop", "stop"]
+
+
+def test_how_long_a_step_may_take():
+    nodes = {n.name: n for n in (Plain("fast", 50), Plain("slow", 2))}
+    assert step_limits(nodes, None) == {"fast": 1.0, "slow": 5.0}
+    assert step_limits(nodes, 0.3) == {"fast": 0.3, "slow": 0.3}
+    assert step_limits(nodes, 0.0) == {"fast": float("inf"), "slow": float("inf")}
+    with pytest.raises(UsageError, match="step_timeout_s must be at least 0"):
+        AsyncGraph(nodes, nodes["slow"], step_timeout_s=-1.0)
+    with pytest.raises(UsageError, match="step_timeout_s are for the wall clock"):
+        AsyncGraph(nodes, nodes["slow"], Clock.SIMULATED, duration_s=1.0, step_timeout_s=1.0)
+
+
+def test_the_watchdog_does_not_count_what_the_caller_takes():
+    sensor, agent = pair()
+    with AsyncGraph([sensor, agent], agent, step_timeout_s=0.3) as graph:
+        gs, ss = graph.reset(graph.init(KEY))
+        time.sleep(0.7)
+        graph.step(gs, ss, Value(x=0))
+
+
+def test_ctrl_c_ends_a_startup_that_hangs():
+    class Hanging(Plain):
+        release = threading.Event()
+
+        def startup(self, graph_state, timeout=None):
+            self.release.wait(20)
+            return super().startup(graph_state, timeout)
+
+    hanging, motor = Hanging("hanging", 50), Motor("motor", 50)
+    graph = AsyncGraph([motor, hanging], motor)
+    gs = graph.init(KEY)
+    graph.warmup(gs)
+
+    def interrupt():
+        wait_for(lambda: motor.torque)
+        begun.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    begun = []
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt) as caught:
+        graph.start(gs, timeout_s=50.0)
+    assert time.monotonic() - begun[0] < 5.0
+    assert not motor.torque
+    assert "'hanging' is still in its startup" in "".join(caught.value.__notes__)
+    assert hanging.calls == ["stop"]
+    hanging.release.set()
+    wait_for(lambda: not graph_threads())
+    assert hanging.calls == ["stop", "startup", "stop"]
+
+
+def test_leaving_the_graph_does_not_hide_why():
+    class BadStop(Plain):
+        def stop(self, timeout=None):
+            raise OSError("port")
+
+    node = BadStop("a", 50)
+
+    def interrupted():
+        with AsyncGraph([node], node) as graph:
+            graph.start(graph.init(KEY))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        interrupted()
+    assert "OSError: port" in "".join(caught.value.__notes__)
+
+
+def test_what_fails_on_the_way_out_becomes_a_note():
+    reason = SafetyStop("too fast")
+    with noted(reason):
+        raise OSError("disk full")
+    with noted(reason):
+        raise reason
+    assert reason.__notes__ == ["then: OSError: disk full"]
+    with pytest.raises(KeyboardInterrupt), noted(reason):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("supervisor", "match"),
+    [
+        ("agent", "must be a node, not the name 'agent'. Nodes: sensor, agent"),
+        (["sensor", "agent"], "must be a node, not 2 nodes. Nodes: sensor, agent"),
+        (None, "must be a node, not a NoneType"),
+    ],
+)
+def test_the_supervisor_is_one_node(supervisor, match):
+    with pytest.raises(UsageError, match=match) as caught:
+        AsyncGraph(list(pair()), supervisor)
+    assert caught.value.hint

@@ -52,14 +52,3 @@ def test_timing_tables_have_gaps_where_a_node_never_stepped():
     assert len(headers) == len(rows[0])
     assert session._numbers([1.0, float("nan")]) == [1.0, None]
     json.dumps(rows, allow_nan=False)
-
-
-def test_what_fails_on_the_way_out_becomes_a_note():
-    reason = SafetyStop("too fast")
-    with session._noted(reason):
-        raise OSError("disk full")
-    with session._noted(reason):
-        raise reason
-    assert reason.__notes__ == ["then: OSError: disk full"]
-    with pytest.raises(KeyboardInterrupt), session._noted(reason):
-        raise KeyboardInterrupt
