@@ -24,6 +24,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.robust import tamed
 from sim2real.identify.segments import Segments, Span, cut
+from sim2real.runtime.bursts import make_room
 from sim2real.runtime.compiled import CompiledGraph
 
 
@@ -71,7 +72,9 @@ class Problem:
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s = cuts.spans, length_s
-        self.graph = CompiledGraph(nodes, model.sensor, draw(nodes, length_s, recorded=cuts.timeline), cuts.given)
+        timeline = draw(nodes, length_s, recorded=cuts.timeline)
+        make_room(nodes, timeline)  # after a hiccup commands leave in a burst
+        self.graph = CompiledGraph(nodes, model.sensor, timeline, cuts.given)
         self.segments = self.graph.episodes
         self.begins_s = np.array([s.begin_s for s in self.spans])
         self.recording = np.array([s.recording for s in self.spans])

@@ -12,7 +12,7 @@ from flax import struct
 
 from sim2real.graph.base import Base, GraphState
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identify.parameters import Parameter
 
 BURST = 3
@@ -67,9 +67,17 @@ def delay_bounds(
 
 
 def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
-    """Connect the loop that runs on hardware and in simulation alike."""
+    """Connect the loop that runs on hardware and in simulation alike.
+
+    Whoever waits for another catches up after a hiccup: agent and actuator make up for the steps that they missed, back
+    to back, and return to their grid (``Scheduling.PHASE``). With ``FREQUENCY`` one step of 100 ms would move their
+    schedules for good, and every later action would be made of data that is 80 ms old while newer messages wait. The
+    sensor sets the pace and keeps its frequency: nobody waits in front of it, so what it sends is never old, and no
+    two samples lie closer together than its period. As long as no step overruns, both rules are one and the same.
+    """
     agent.connect(sensor, blocking=True)
     actuator.connect(agent, blocking=True)
+    agent.scheduling = actuator.scheduling = Scheduling.PHASE
     return {n.name: n for n in (sensor, agent, actuator)}
 
 

@@ -5,13 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.graph import BaseNode
+from sim2real.graph import BaseNode, EmpiricalDist, Scheduling, TrainableDist
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseWorld
+from sim2real.graph.schedule import derive, draw
+from sim2real.graph.windows import bursty_episodes, newest_message
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.loop import (
+    BURST,
     DELAYS,
     DelayParams,
+    control_nodes,
     delay_bounds,
     delay_of,
     delay_parameters,
@@ -19,6 +23,7 @@ from sim2real.robots.loop import (
     recorded_loop,
     simulated_loop,
 )
+from sim2real.runtime.bursts import make_room
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
 VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}
@@ -138,3 +143,67 @@ def test_a_recorded_loop_bears_every_delay_that_may_be_identified(nodes):
     assert (world.inputs["actuator"].delay_dist.min, world.inputs["actuator"].delay_dist.max) == (0.0, 0.06 + LEAD_S)
     assert (sensor.inputs["world"].delay_dist.min, sensor.inputs["world"].delay_dist.max) == (0.0, 0.06)
     assert actuator.inputs == {}, "what it sent was recorded"
+
+
+def ages(nodes, timeline, reader):
+    """Return how old the newest message of each step of a reader is [ticks], ``(N,)``."""
+    (name,) = nodes[reader].inputs
+    edge, vertex = timeline.edges[reader, name], timeline.vertices[reader]
+    age = vertex.start - np.take_along_axis(timeline.vertices[name].end, newest_message(edge, vertex), axis=1)
+    return age[0, : vertex.count[0]]
+
+
+def played(nodes, busy, steps=100):
+    """Return the timeline of a loop whose steps take ``busy`` [ticks], by node ``(steps,)``."""
+    delays = {name: np.asarray(busy[name])[None] for name in nodes}
+    transfers = {(n, i): np.zeros((1, steps), np.int64) for n, node in nodes.items() for i in node.inputs}
+    return derive(nodes, delays, transfers, 20_000 * steps)
+
+
+@pytest.mark.parametrize("slow", ["sensor", "agent", "actuator"])
+def test_after_a_hiccup_nobody_goes_on_with_old_data(nodes, slow):
+    loop = control_nodes(*nodes[:3])
+    busy = {name: np.full(100, 1000) for name in loop}
+    busy[slow][30] = 100_000
+    timeline = played(loop, busy)
+    for reader in ("agent", "actuator"):
+        before, after = ages(loop, timeline, reader)[:30], ages(loop, timeline, reader)[38:]
+        assert after.max() <= before.max() == 0
+    sampled = np.diff(timeline.vertices["sensor"].start[0])
+    assert sampled.min() == 20_000, "no burst of samples"
+
+
+def test_without_overruns_the_timelines_are_those_of_a_kept_frequency(nodes):
+    rng = np.random.default_rng(0)
+    loop = control_nodes(*nodes[:3])
+    assert [n.scheduling for n in nodes[:3]] == [Scheduling.FREQUENCY, Scheduling.PHASE, Scheduling.PHASE]
+    busy = {name: rng.integers(500, 6_000, 100) for name in loop}  # three in a row: less than a period
+    found = played(loop, busy)
+    for node in loop.values():
+        node.scheduling = Scheduling.FREQUENCY
+    kept = played(loop, busy)
+    for name in loop:
+        np.testing.assert_array_equal(found.vertices[name].start, kept.vertices[name].start)
+    for key, edge in found.edges.items():
+        np.testing.assert_array_equal(edge.seq_in, kept.edges[key].seq_in)
+
+
+def test_a_recording_with_a_hiccup_fits_the_window_of_its_commands(nodes):
+    """Commands that leave at once after a hiccup may be more than the loop expects: the window grows, nothing else."""
+    sensor, _, actuator, world = nodes
+    actuator.scheduling = Scheduling.PHASE
+    found = recorded_loop(sensor, actuator, world, 0.06)
+    calm = draw(found, 2.0)
+    assert make_room(found, calm) == {}
+    assert world.inputs["actuator"].delay_dist.burst == BURST
+    busy = np.full(100, 0.001)
+    busy[30] = 0.2
+    actuator.delay_dist = EmpiricalDist(busy, block=100)
+    hiccup = draw(found, 2.0)
+    assert bursty_episodes(found, hiccup).all()
+    grown = make_room(found, hiccup)
+    assert set(grown) == {("world", "actuator")}
+    assert not bursty_episodes(found, hiccup).any()
+    dist = world.inputs["actuator"].delay_dist
+    assert isinstance(dist, TrainableDist)
+    assert dist.burst == BURST + grown["world", "actuator"] <= 10  # a hiccup of ten periods
