@@ -137,13 +137,16 @@ def check_deadlines(summary: Mapping[str, Any]) -> None:
 
 
 def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
-    """Return the timing table of a summary: rows and headers, times in ms."""
-    headers = ["node", "steps", "period p50", "p99", "max [ms]", "late p50", "p99", "max [ms]", "overruns"]
+    """Return the timing table of a summary: rows and headers, times in ms; the age is that of the oldest input."""
+    quantiles = ["p50", "p99", "max [ms]"]
+    headers = ["node", "steps", "period p50", *quantiles[1:], "late p50", *quantiles[1:], "age p50", *quantiles[1:]]
     rows = []
     for name, node in summary["timing"].items():
-        times = [q if q is None else round(1e3 * q, 2) for kind in ("period_s", "lateness_s") for q in node[kind]]
+        ages = [max(q) for q in zip(*node["age_s"].values(), strict=True)] or [None] * 3
+        kinds = (node["period_s"], node["lateness_s"], ages)
+        times = [q if q is None else round(1e3 * q, 2) for kind in kinds for q in kind]
         rows.append([name, node["steps"], *times, node["overruns"]])
-    return rows, headers
+    return rows, [*headers, "overruns"]
 
 
 def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str) -> None:
@@ -164,6 +167,8 @@ def _recorder(
         name: {
             "rate_hz": node.rate,
             "delay_s": node.delay,
+            "scheduling": node.scheduling.value,
+            **{k: v for k, v in (("color", node.color), ("order", node.order)) if v is not None},
             "inputs": {
                 i: {"from": c.output_node.name, "blocking": c.blocking, "window": c.window, "skip": c.skip}
                 for i, c in node.inputs.items()
@@ -193,8 +198,9 @@ def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any
             "period_s": _numbers(s.period_s),
             "lateness_s": _numbers(s.lateness_s),
             "overruns": s.overruns,
+            "age_s": {name: _numbers(ages) for name, ages in s.age_s.items()},
         }
-        for n, s in graph.statistics().items()
+        for n, s in sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
     }
     return {
         "monotonic_ns": watch.monotonic_ns,
@@ -205,6 +211,11 @@ def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any
         "command_timeouts": rig.timeouts,
         "gate": asdict(rig.gate.counts),
     }
+
+
+def _place(node: BaseNode) -> float:
+    """Return where a node stands in tables: those with an ``order`` first, the others as they are."""
+    return math.inf if node.order is None else node.order
 
 
 def _numbers(values: Iterable[float]) -> list[float | None]:

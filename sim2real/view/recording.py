@@ -14,9 +14,10 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
+from sim2real.log.ages import input_ages
 from sim2real.view.content import IDLE, Curve, Tab, states_of, tabs_of
 from sim2real.view.run import finished, pipeline_of
-from sim2real.view.timing import in_order, slowest_period_s
+from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
 """The one timeline: with several the viewer picks one by itself."""
@@ -99,7 +100,7 @@ def _send_curve(recording: Any, curve: Curve) -> None:
 
 
 def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
-    """Send each node's states as lanes, and how late it woke."""
+    """Send each node's states as lanes, how late it woke and how old its inputs were."""
     rr = _rerun()
     for node in in_order(episode):
         steps = episode.steps[node]
@@ -107,19 +108,31 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
             continue
         lane = f"{folder}/schedule/{node}"
         # Null would be no state at all, and the viewer takes it so, but its own `rrd verify` calls it malformed.
+        own = _own_color(episode, node)
+        looks = {**_STATES, **({"computing": own} if own else {})}
         named = rr.StateConfiguration(
             values=[*_STATES, IDLE],
             labels=[*_STATES, IDLE],
-            colors=[*_STATES.values(), (0, 0, 0)],
+            colors=[*looks.values(), (0, 0, 0)],
             visible=[*(True for _ in _STATES), False],
         )
         recording.log(lane, named, static=True)
         times, states = states_of(steps)
         recording.send_columns(lane, [_time(times)], rr.StateChange.columns(state=states))
-        entity = f"{folder}/lateness/{node}"
-        recording.log(entity, rr.SeriesLines(names=node, widths=1.2), static=True)
-        late_ms = (steps.woken - steps.start) / 1e3
-        recording.send_columns(entity, [_time(steps.woken / 1e6)], rr.Scalars.columns(scalars=late_ms))
+        lines = {f"lateness/{node}": (node, (steps.woken - steps.start) / 1e3)}
+        for name, age_s in input_ages(episode, node).items():
+            lines[f"age/{node}/{name}"] = f"{name} in {node}", 1e3 * age_s
+        for entity, (label, values) in lines.items():
+            looks = rr.SeriesLines(names=label, widths=1.2, colors=own)
+            recording.log(f"{folder}/{entity}", looks, static=True)
+            times = _time(steps.woken / 1e6)
+            recording.send_columns(f"{folder}/{entity}", [times], rr.Scalars.columns(scalars=values))
+
+
+def _own_color(episode: Episode, node: str) -> tuple[int, int, int] | None:
+    """Return the colour that a node was given, if any."""
+    own = color_of(episode, node, "")
+    return (int(own[1:3], 16), int(own[3:5], 16), int(own[5:7], 16)) if own else None
 
 
 def _blueprint(tabs: Sequence[Tab], with_scene: bool) -> Any:
@@ -136,7 +149,7 @@ def _blueprint(tabs: Sequence[Tab], with_scene: bool) -> Any:
 
 
 def _page(tab: Tab, with_scene: bool) -> Any:
-    """Return a tab's arrangement: plots on the left; scene, schedule and lateness on the right."""
+    """Return a tab's arrangement: plots on the left; scene, schedule, lateness and age of inputs on the right."""
     import rerun.blueprint as rrb
 
     legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop)
@@ -167,11 +180,14 @@ def _page(tab: Tab, with_scene: bool) -> Any:
             rrb.TimeSeriesView(
                 name="Lateness [ms]", origin=f"/{tab.entity}/lateness", plot_legend=legend, axis_x=whole
             ),
+            rrb.TimeSeriesView(
+                name="Age of inputs [ms]", origin=f"/{tab.entity}/age", plot_legend=legend, axis_x=whole
+            ),
         ]
     left = rrb.Vertical(*plots, name=tab.title)
     if not side:
         return left
-    shares = [3, *([2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
+    shares = [3, *([2, 2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
     return rrb.Horizontal(left, rrb.Vertical(*side, row_shares=shares), column_shares=[3, 2], name=tab.title)
 
 

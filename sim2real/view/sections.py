@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from sim2real.graph.episode import Episode
+from sim2real.log.ages import oldest_input
 from sim2real.view import figures, timing
 from sim2real.view.about import about
 from sim2real.view.artifacts import read_deployment, read_training
 from sim2real.view.blocks import (
+    MISSING,
     Block,
     FigureBlock,
     NoteBlock,
@@ -116,6 +118,11 @@ def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
     p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
     worst = max(p99, key=lambda n: p99[n])
     yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
+    old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
+    oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
+    if oldest:
+        reader = max(oldest, key=lambda n: oldest[n])
+        yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
     ends: list[Mapping[str, Any]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
     overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
     if overruns:
@@ -136,8 +143,10 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
         for values in (taken.period, taken.lateness, taken.computation):
             p50, p99 = np.quantile(values, [0.5, 0.99])
             row += [fixed(float(v), 2) for v in (p50, p99, values.max())]
+        ages = 1e3 * oldest_input(episode, node)
+        row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
         rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
-    heads = [f"{q} {k}" for q in ("period", "late", "comp.") for k in ("p50", "p99", "max")]
+    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "age") for k in ("p50", "p99", "max")]
     table = TableBlock(
         f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}",
         ("node", "steps", *heads, "overruns"),
@@ -153,7 +162,8 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
         ),
         FigureBlock(
             timing.histograms(episode, f"{name}-timing"),
-            f"How well the nodes kept their times, in ms.{which} Dashed: the 99 % quantile. Counts are logarithmic.",
+            f"How well the nodes kept their times, in ms.{which} Age: how long before a step's start the newest "
+            "message that it used was sent, of its oldest input. Dashed: the 99 % quantile. Counts are logarithmic.",
         ),
         table,
     ]

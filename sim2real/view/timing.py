@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import is_color_like, to_hex
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from sim2real.graph.episode import Episode, Steps
+from sim2real.log.ages import oldest_input
 from sim2real.view import style
 from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
@@ -39,7 +41,7 @@ def times(steps: Steps) -> Times:
 
 
 def in_order(episode: Episode) -> list[str]:
-    """Return the nodes, senders before their readers where the graph has no loop."""
+    """Return the nodes: those with an ``order`` of their own first, then senders before their readers, loops aside."""
     senders: Mapping[str, set[str]] = {
         n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
     }
@@ -49,7 +51,14 @@ def in_order(episode: Episode) -> list[str]:
         ready = [n for n in left if not (senders.get(n, set()) & set(left) - {n})] or left
         order.append(ready[0])
         left.remove(ready[0])
-    return order
+    own = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
+    return sorted(order, key=lambda n: float("inf") if own.get(n) is None else own[n])  # of equals, as they were
+
+
+def color_of(episode: Episode, node: str, default: str) -> str:
+    """Return a node's own colour as ``#rrggbb``; ``default`` where it has none that matplotlib knows."""
+    own = episode.metadata.get("graph", {}).get(node, {}).get("color")
+    return to_hex(own) if is_color_like(own) else default
 
 
 def slowest_period_s(episode: Episode) -> float:
@@ -59,11 +68,13 @@ def slowest_period_s(episode: Episode) -> float:
 
 
 def histograms(episode: Episode, name: str) -> str:
-    """Draw how period, lateness and computation are distributed, a row for each node."""
+    """Draw how period, lateness, computation and the age of inputs are distributed, a row for each node."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n]) > 1]
+    ages = {n: 1e3 * oldest_input(episode, n) for n in nodes}
+    oldest = max((float(a.max()) for a in ages.values() if a.size), default=0.0)
     with styled():
         figure = new_figure(0.6 + 1.35 * len(nodes))
-        grid = figure.subplots(len(nodes), 3, squeeze=False, sharex="col", sharey="row")
+        grid = figure.subplots(len(nodes), 4, squeeze=False, sharex="col", sharey="row")
         limits = []
         for column, quantity in enumerate(("period", "lateness", "computation")):
             values = np.concatenate([getattr(times(episode.steps[n]), quantity) for n in nodes])
@@ -71,15 +82,22 @@ def histograms(episode: Episode, name: str) -> str:
         for node, row in zip(nodes, grid, strict=True):
             measured = times(episode.steps[node])
             row[0].set_ylabel(f"{node}\nsteps")
-            for axes, values, span in zip(
-                row, (measured.period, measured.lateness, measured.computation), limits, strict=True
-            ):
-                _histogram(axes, values, span)
-        for axes, title in zip(grid[0], ("Period", "Lateness of awakening", "Computation"), strict=True):
+            columns = (measured.period, measured.lateness, measured.computation)
+            color = color_of(episode, node, BLUE)
+            for axes, values, span in zip(row, columns, limits, strict=False):
+                _histogram(axes, values, span, color)
+            if ages[node].size:
+                _histogram(row[3], ages[node], (0.0, max(oldest, 1e-3)), color)
+            else:
+                row[3].annotate("no inputs", (0.03, 0.8), xycoords="axes fraction", color=MUTED)
+        for axes, title in zip(
+            grid[0], ("Period", "Lateness of awakening", "Computation", "Age of inputs"), strict=True
+        ):
             axes.annotate(title, (0, 1.22), xycoords="axes fraction", fontweight="bold", fontsize=9, color=INK)
         for axes in grid[-1]:
             axes.set_xlabel("[ms]")
-        return to_svg(figure, name, f"Histograms of period, lateness and computation of {', '.join(nodes)}")
+        what = "period, lateness, computation and age of inputs"
+        return to_svg(figure, name, f"Histograms of {what} of {', '.join(nodes)}")
 
 
 def schedule(episode: Episode, name: str) -> str:
@@ -96,15 +114,17 @@ def schedule(episode: Episode, name: str) -> str:
         grid = figure.subplots(1, 2, sharey=True)
         for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
             for row, node in enumerate(nodes):
-                _bars(axes, episode.steps[node], row, begin, begin + length)
+                look = color_of(episode, node, BLUE)
+                _bars(axes, episode.steps[node], row, begin, begin + length, look)
             _arrows(axes, episode, nodes, begin, begin + length)
             axes.set(title=title, xlabel=f"time since {begin / 1e6:.3f} s [ms]", xlim=(0, length / 1e3))
             axes.set_yticks(range(len(nodes)), nodes)
             axes.grid(False, axis="y")
             axes.tick_params(axis="y", length=0)
         grid[0].set_ylim(len(nodes) - 0.5, -0.6)
+        own_colors = any(color_of(episode, n, BLUE) != BLUE for n in nodes)
         entries = [
-            Patch(facecolor=BLUE, label="computing"),
+            Patch(facecolor=BLUE, label="computing, or in the node's own colour" if own_colors else "computing"),
             Patch(facecolor=ORANGE, label="late awakening"),
             Patch(facecolor="none", edgecolor=MUTED, hatch="////", label="waiting for its inputs"),
         ]
@@ -112,9 +132,9 @@ def schedule(episode: Episode, name: str) -> str:
         return to_svg(figure, name, "Excerpts of the schedule: when each node waited and computed, and its messages")
 
 
-def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float]) -> None:
-    axes.hist(values, bins=60, range=span, histtype="stepfilled", facecolor=BLUE, alpha=0.35)
-    axes.hist(values, bins=60, range=span, histtype="step", color=BLUE, lw=1.0)
+def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float], color: str) -> None:
+    axes.hist(values, bins=60, range=span, histtype="stepfilled", facecolor=color, alpha=0.35)
+    axes.hist(values, bins=60, range=span, histtype="step", color=color, lw=1.0)
     axes.set_yscale("log")
     axes.set_ylim(0.6, 2 * len(values))
     style.plain_log(axes.yaxis)
@@ -124,8 +144,8 @@ def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float]) -> Non
     axes.set_title(f"p50 {p50:.2f} · p99 {p99:.2f} · max {values.max():.2f}", fontweight="normal", fontsize=8)
 
 
-def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
-    """Draw the steps of one node that overlap an interval [us]."""
+def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:
+    """Draw the steps of one node that overlap an interval [us], computing in ``color``."""
     # A step is due before the last one has ended when that one overran: it waits from there on.
     free = np.concatenate([[0], steps.end[:-1]])
     due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
@@ -134,7 +154,7 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float) -> None:
     kinds: tuple[tuple[np.ndarray, np.ndarray, dict[str, Any]], ...] = (
         (due, start, {"facecolor": "none", "edgecolor": MUTED, "hatch": "////", "lw": 0.6}),
         (start, woken, {"facecolor": ORANGE}),
-        (woken, done, {"facecolor": BLUE, "edgecolor": BLUE, "lw": 0.8}),  # the edge: a short step stays visible
+        (woken, done, {"facecolor": color, "edgecolor": color, "lw": 0.8}),  # the edge: a short step stays visible
     )
     for first, last, look in kinds:
         wide = last > first

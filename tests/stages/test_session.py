@@ -34,8 +34,9 @@ def test_infinity_and_other_types_are_none_of_its_business():
     watch.step(step(0), {"range_m": np.inf, "flag": True, "n": np.int64(3), "image": np.zeros((2, 2), np.uint8)})
 
 
-def node(overruns, steps=200):
-    return {"steps": steps, "overruns": overruns, "period_s": [0.02, 0.021, None], "lateness_s": [None] * 3}
+def node(overruns, steps=200, **ages):
+    times = {"period_s": [0.02, 0.021, None], "lateness_s": [None] * 3, "age_s": ages}
+    return {"steps": steps, "overruns": overruns, **times}
 
 
 def test_deadlines():
@@ -47,8 +48,9 @@ def test_deadlines():
 
 
 def test_timing_tables_have_gaps_where_a_node_never_stepped():
-    rows, headers = session.timing_rows({"timing": {"a": node(1)}})
-    assert rows == [["a", 200, 20.0, 21.0, None, None, None, None, 1]]
+    rows, headers = session.timing_rows({"timing": {"a": node(1), "b": node(0, x=[0.1, 0.2, 0.3], y=[0.0, 0.25, 0.3])}})
+    assert rows[0] == ["a", 200, 20.0, 21.0, *[None] * 7, 1]
+    assert rows[1][8:] == [100.0, 250.0, 300.0, 0], "the oldest input of each step"
     assert len(headers) == len(rows[0])
     assert session._numbers([1.0, float("nan")]) == [1.0, None]
     json.dumps(rows, allow_nan=False)

@@ -18,6 +18,8 @@ PERIOD_US = 20_000
 STEPS = 200
 MONOTONIC_NS = 5_000_000_000
 NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
+COLOR = "#663399"
+"""The actuator's own, which also has an order: it stands first."""
 UNITS = {"th": "rad", "thdot": "rad/s", "action": "V"}
 
 
@@ -27,6 +29,8 @@ def write_log(path: Path, steps: int = STEPS, end: bool = True) -> None:
         n: {"rate_hz": 50.0, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
         for n, s in NODES.items()
     }
+    graph["actuator"] |= {"color": COLOR, "order": 0}
+    graph["agent"] |= {"color": "no such colour"}
     outputs: dict[str, Any] = {
         "sensor": {"th": np.float32(0), "thdot": np.float32(0)},
         "agent": {"action": np.zeros(1, np.float32)},

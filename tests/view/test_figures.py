@@ -114,6 +114,22 @@ def test_the_latest_awakening_is_named(drawn):
     assert "Around the latest awakening: agent, 4.0 ms" in texts(drawn["schedule"])
 
 
+def test_nodes_have_their_own_order_and_colour(drawn, log):
+    assert timing.in_order(log.episode) == ["actuator", "sensor", "agent"]
+    colors = [timing.color_of(log.episode, n, "mine") for n in ("actuator", "agent", "sensor")]
+    assert colors == [synthetic_run.COLOR, "mine", "mine"], "a name that nobody knows is no colour"
+    for name in ("schedule", "histograms"):
+        assert synthetic_run.COLOR in drawn[name]
+    assert "computing, or in the node's own colour" in texts(drawn["schedule"])
+
+
+def test_the_age_of_inputs_has_a_column(drawn):
+    shown = texts(drawn["histograms"])
+    assert "Age of inputs" in shown
+    assert shown.count("no inputs") == 1
+    assert shown.count("p50 0.01 · p99 0.01 · max 0.01") == 2
+
+
 def test_correlations_stand_in_the_cells(drawn):
     assert texts(drawn["correlation"]).count("0.50") == 6
 
