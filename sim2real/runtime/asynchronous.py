@@ -28,6 +28,9 @@ from sim2real.runtime.statistics import NodeStatistics
 from sim2real.runtime.stepper import Stepper
 from sim2real.runtime.wallclock import WallClockRun
 
+_INTERRUPTED_S = 1.0
+"""How long nodes have for their stop when a start is interrupted [s]."""
+
 
 class AsyncGraph:
     """Runs a graph: on hardware in real time, or in simulation in the order of events.
@@ -286,8 +289,9 @@ class AsyncGraph:
         try:
             run.begin(timeout_s)
         except BaseException as error:
-            with noted(error):  # Ctrl-C must stay Ctrl-C, whatever a startup that hangs makes of the stop
-                self.stop(timeout_s)
+            # Ctrl-C must stay Ctrl-C, and soon, whatever a startup that hangs makes of the stop.
+            with noted(error):
+                self.stop(timeout_s if isinstance(error, Exception) else min(timeout_s, _INTERRUPTED_S))
             raise
         return run
 

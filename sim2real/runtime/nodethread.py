@@ -86,8 +86,9 @@ class NodeThread(threading.Thread):
 
     Attributes:
         ready: Set once the startup is over, one way or another.
-        over: Set when there is nothing more to wait for: the thread has ended, or was given up.
-        given_up: Whether the node hung and was made safe from outside.
+        over: Set when there is nothing more to wait for: the thread has ended, or its step hangs.
+        made_safe: Whether the node's ``stop`` was called from outside.
+        failed: Whether the graph stopped because a step of this node hangs.
         during: What the thread does: ``startup``, ``step 12`` or ``stop``.
         since_s: Since when startup or a step runs, on the machine's monotonic clock [s]; None while neither does.
     """
@@ -105,7 +106,7 @@ class NodeThread(threading.Thread):
         self.node, self.stepper, self.data = stepper.node, stepper, data
         self.inputs, self.outputs, self.shared, self.handover = inputs, outputs, shared, handover
         self.ready, self.over = threading.Event(), threading.Event()
-        self.given_up = False
+        self.made_safe = self.failed = False
         self.log = StepLog(inputs)
         self.during = "startup"
         self.since_s: float | None = None
@@ -120,13 +121,12 @@ class NodeThread(threading.Thread):
             self.ready.set()
             self.over.set()
 
-    def give_up(self, timeout_s: float) -> None:
-        """Call the node's ``stop`` although its thread hangs, and wait for that for a while."""
-        self.given_up = True
+    def make_safe_from_outside(self, timeout_s: float) -> None:
+        """Call the node's ``stop`` although its thread is busy, and wait for that for a while."""
+        self.made_safe = True
         helper = threading.Thread(target=self._make_safe, args=(True,), daemon=True)
         helper.start()
         helper.join(timeout_s)
-        self.over.set()
 
     def _live(self) -> None:
         try:
@@ -166,7 +166,7 @@ class NodeThread(threading.Thread):
             blocked = max((channel.wait_group(k) for channel in self.inputs.values()), default=0)
             begin = int(start(scheduled, drift, end, blocked, waits))
             later = int(next_drift(node.scheduling, scheduled, drift, end))
-            overrun = begin == end > scheduled + drift
+            overrun = end > max(scheduled + drift, blocked)
             if not clock.sleep_past(begin, shared.stopping, shared.spin):
                 return
             woken = clock.now()

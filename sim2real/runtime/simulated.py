@@ -62,6 +62,11 @@ class _Player:
         # Of a trainable delay the step itself picks the message: the timeline does not know which.
         self.log = StepLog(n for n, c in node.inputs.items() if not c.trainable)
 
+    def blocked(self, k: int) -> int:
+        """Return the last arrival among the messages that step ``k`` waited for, 0 if there are none [ticks]."""
+        awaited = [link for name, link in self.links.items() if self.stepper.node.inputs[name].blocking]
+        return max((link.received[m] for link in awaited for m in link.consumed(k)[-1:]), default=0)
+
     def ready(self, players: Mapping[str, _Player]) -> bool:
         """Return whether everything that the next step consumes has been sent."""
         for link in self.links.values():
@@ -262,7 +267,7 @@ class SimulatedRun:
         player.data.keep(result.changed)
         before = player.ends[k - 1] if k else 0
         later = int(next_drift(node.scheduling, player.slots[k], player.drift, before))
-        player.log.add(begin, begin, begin == before > player.slots[k] + player.drift)
+        player.log.add(begin, begin, before > max(player.slots[k] + player.drift, player.blocked(k)))
         self._record(player, k, moved, result)
         player.drift = later
 

@@ -193,14 +193,14 @@ class WallClockRun:
         for thread in self._threads.values():
             if thread.ident is not None:
                 thread.over.wait(max(0.0, deadline - time.monotonic()))
-                if not thread.given_up:
+                if not thread.made_safe:
                     thread.join(max(0.0, deadline - time.monotonic()))
         self._watchdog.finish()
         self._process.close()
         for name, thread in self._threads.items():
-            if thread.is_alive():
-                if not thread.given_up:
-                    thread.give_up(LAST_RESORT_S)
+            if thread.is_alive() and not thread.failed:
+                if not thread.made_safe:
+                    thread.make_safe_from_outside(LAST_RESORT_S)
                 waited_s = time.monotonic() - begin
                 self._shared.fail(
                     GraphTimeout(

@@ -47,19 +47,19 @@ class Watchdog(threading.Thread):
             now = time.monotonic()
             if shared.stopping.is_set():
                 stopped_s = stopped_s or now
-            rests = [self._look(t, now, stopped_s) for t in self._threads if not t.given_up]
+            rests = [self._look(t, now, stopped_s) for t in self._threads if not t.made_safe]
             rest = max(0.0, min([*rests, *self._limits.values()]))
             waiting = self._quit if stopped_s else shared.stopping
             waiting.wait(min(rest, threading.TIMEOUT_MAX))
 
     def finish(self) -> None:
-        """End; the graph has stopped, and its threads have ended or have had their time."""
+        """End: the graph has stopped, and its threads have ended or have had their time."""
         self._quit.set()
         if self.ident is not None:
             self.join()
 
     def _look(self, thread: NodeThread, now: float, stopped_s: float) -> float:
-        """Give a thread up that has run too long; else return how long it may run yet [s]."""
+        """Deal with a thread that has run too long; return how long it, or what it does next, may run [s]."""
         limit = self._limits[thread.node.name]
         since, during = thread.since_s, thread.during
         if since is None:
@@ -70,11 +70,14 @@ class Watchdog(threading.Thread):
         if rest > 0 or thread.since_s != since:
             return rest
         if not stopped_s:
+            thread.failed = True
             self._shared.fail(
                 GraphTimeout(
                     f"node {thread.node.name!r} hangs: its {during} has taken {limit:g} s, so the graph stopped",
                     hint="give what it waits for a timeout of its own, or AsyncGraph a longer step_timeout_s",
                 )
             )
-        thread.give_up(LAST_RESORT_S)
+        thread.make_safe_from_outside(LAST_RESORT_S)
+        if during != "startup":  # which may well come back, and then stops by itself
+            thread.over.set()
         return limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,9 +15,13 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.schedule import draw
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.windows import newest_message
 from sim2real.hardware.truth import read_truth
+from sim2real.log.ages import input_ages
 from sim2real.log.reader import read_log
 from sim2real.policy.bundle import load_bundle, read_weights
+from sim2real.runtime.bursts import make_room
 from sim2real.runtime.clock import realtime
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import DeployConfig
@@ -53,11 +57,13 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
                 stage.output("truth", TRUTH)
             timing = [_deploy(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
         print(table(*timing_rows(timing[-1])))
+        episodes = [read_log(log) for log in logs]
         real = [
-            _true_states(stage.folder / TRUTH, s, read_log(log), robot) for log, s in zip(logs, timing, strict=True)
+            _true_states(stage.folder / TRUTH, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)
         ]
-        simulated = _simulate(robot, policy, values, read_log(logs[0]), config.duration_s, len(logs))
+        simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs))
         result = _compare(robot, real, simulated)
+        result["gap"] += _age_rows(robot, episodes, timeline)
         stage.output("result", "result.json").write_text(
             json.dumps({**result, "timing": timing, "units": dict(robot.UNITS)}, indent=1)
         )
@@ -166,12 +172,22 @@ def _simulate(
     episode: Episode,
     duration_s: float,
     episodes: int,
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
-    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's."""
+) -> tuple[list[tuple[np.ndarray, dict[str, np.ndarray]]] | None, Timeline | None]:
+    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
+
+    Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
+    once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
+    """
     if values is None:
-        return None
-    nodes, _ = robot.training(values, {}, computation_delays(episode)[0], True)
-    graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, duration_s, _SIMULATIONS, 0))
+        return None, None
+    computation, hiccups = computation_delays(episode, 1.0 / robot.RATE_HZ)
+    if hiccups:
+        left = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
+        note(f"the simulation leaves out steps that took longer than a period of the policy: {left}")
+    nodes, _ = robot.training(values, {}, computation, True)
+    timeline = draw(nodes, duration_s, _SIMULATIONS, 0)
+    make_room(nodes, timeline)
+    graph = CompiledGraph(nodes, robot.SUPERVISOR, timeline)
     # Each deployment's own trial in turn: its simulation has the same to do.
     trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
@@ -181,7 +197,33 @@ def _simulate(
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
     records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
-    return [_run(graph, nodes["world"].rate, records, robot, e) for e in range(_SIMULATIONS)]
+    return [_run(graph, nodes["world"].rate, records, robot, e) for e in range(_SIMULATIONS)], timeline
+
+
+def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[dict[str, Any]]:
+    """Return rows of the gap table: how old the data were that policy and actuator acted on, on the robot and here."""
+    rows = []
+    for reader in (robot.SUPERVISOR, robot.COMMAND[0]):
+        measured = [input_ages(e, reader) for e in episodes]
+        for name in measured[0]:
+            ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]
+            simulated = None if timeline is None else _drawn_ages(timeline, reader, name)
+            for label, of in (("p50", 0.5), ("max", 1.0)):
+                r = _mean([float(np.quantile(a, of)) for a in ages if a.size])
+                s = None if simulated is None else float(np.mean(np.quantile(simulated, of, axis=1)))
+                gap = None if r is None or s is None else r - s
+                quantity = f"age_of_{name}_in_{reader}_{label}_s"
+                rows.append({"quantity": quantity, "real": r, "simulation": s, "gap": gap})
+    return rows
+
+
+def _drawn_ages(timeline: Timeline, reader: str, name: str) -> np.ndarray:
+    """Return how old the newest message of each step is in drawn timelines [s]; the same steps of all, ``(E, N)``."""
+    edge, vertex = timeline.edges[reader, name], timeline.vertices[reader]
+    newest = newest_message(edge, vertex)[:, : int(vertex.count.min())]
+    first = int((newest < 0).sum(axis=1).max())
+    sent = np.take_along_axis(timeline.vertices[edge.sender].end, newest.clip(0), axis=1)
+    return (vertex.start[:, : newest.shape[1]] - sent)[:, first:] / TICKS_PER_S
 
 
 def _run(

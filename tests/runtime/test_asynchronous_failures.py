@@ -359,7 +359,7 @@ def test_a_step_that_hangs_stops_the_graph_and_is_made_safe():
     with pytest.raises(GraphTimeout, match=r"node 'motor' hangs: its step 5 has taken 0\.5 s") as caught:
         graph.run_for(30.0)
     assert time.monotonic() - begin < 10.0
-    assert "'motor' is still in its step 5" in "".join(caught.value.__notes__)
+    assert not getattr(caught.value, "__notes__", []), "said once"
     assert sensor.calls == motor.calls == ["startup", "stop"]
     motor.release.set()
     wait_for(lambda: not graph_threads())

@@ -9,11 +9,12 @@ import pytest
 from asynchronous_nodes import Jitted, Plain, jittery, random_graph
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph import BaseNode, BaseWorld, Timeline, TrainableDist
+from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Scheduling, Timeline, TrainableDist
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import HashInJax, HashInPython, Reference, Value
 from sim2real.graph.testing.nodes import mix
+from sim2real.log.ages import input_ages
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS
@@ -237,3 +238,42 @@ def test_options_that_do_not_fit_are_refused():
     world.connect(command, delay_dist=TrainableDist.create(0.01, 0.0, 0.05, "zoh_mean"))
     with pytest.raises(UsageError, match="zoh_mean"):
         AsyncGraph([world, command], command)
+
+
+def test_statistics_tell_how_old_the_data_were_that_steps_used():
+    """One step of 100 ms: who keeps the frequency reads 80 ms late for good, who keeps the phase does not."""
+    sensor = Plain("sensor", 50.0, delay_dist=0.001)
+    busy = EmpiricalDist([*[0.001] * 30, 0.1, *[0.001] * 69], block=100)
+    readers = [Plain(s.value, 50.0, delay=0.001, delay_dist=busy, scheduling=s) for s in Scheduling]
+    for reader in readers:
+        reader.connect(sensor, blocking=True)
+    readers[0].connect(sensor, name="fresh")
+    episode, _ = record({n.name: n for n in (sensor, *readers)}, "sensor", duration_s=2.0)
+    graph = AsyncGraph([sensor, *readers], sensor, Clock.SIMULATED, duration_s=2.0)
+    with graph:
+        graph.start(graph.init(jax.random.key(0)))
+        graph.wait()
+    found = graph.statistics()
+    assert found["sensor"].age_s == {}
+    frequency, phase = (found[s.value] for s in (Scheduling.FREQUENCY, Scheduling.PHASE))
+    assert [frequency.age_s["sensor"].p50, frequency.age_s["sensor"].max] == pytest.approx([0.08, 0.08])
+    assert [phase.age_s["sensor"].p50, phase.age_s["sensor"].max] == pytest.approx([0.0, 0.08])
+    assert frequency.age_s["fresh"].p50 == pytest.approx(0.0)
+    assert (frequency.overruns, phase.overruns) == (1, 5), "of those that keep the phase, each that starts late counts"
+    for node in found:
+        for name, ages in input_ages(episode, node).items():  # the log says the same
+            assert np.quantile(ages, [0.5, 0.99, 1.0]) == pytest.approx(found[node].age_s[name])
+
+
+def test_a_node_that_waits_for_a_late_sender_does_not_overrun():
+    sensor = Plain(
+        "sensor", 50.0, delay=0.001, delay_dist=EmpiricalDist([*[0.001] * 10, 0.09, *[0.001] * 89], block=100)
+    )
+    agent = Plain("agent", 50.0, delay_dist=0.001, scheduling=Scheduling.PHASE)
+    agent.connect(sensor, blocking=True)
+    with AsyncGraph([sensor, agent], agent, Clock.SIMULATED, duration_s=1.0) as graph:
+        graph.start(graph.init(jax.random.key(0)))
+        graph.wait()
+        found = graph.statistics()
+    assert (found["sensor"].overruns, found["agent"].overruns) == (1, 0)
+    assert found["agent"].age_s["sensor"].max == pytest.approx(0.0)

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
+from sim2real.graph.node import BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.robots.loop import control_nodes
 from sim2real.stages import deploy
 from sim2real.stages.pipeline import load_pipeline
 
@@ -65,3 +68,23 @@ def test_numbers_keep_their_names():
         "th": [0, 1, 2],
         **{f"pose[{i}]": [i, 4 + i, 8 + i] for i in range(4)},
     }
+
+
+def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
+    """One message of the recording is used 80 ms late; simulated timelines have 2 ms everywhere."""
+    robot = SimpleNamespace(SUPERVISOR="agent", COMMAND=("actuator", "action"))
+    recorder = MemoryRecorder()
+    for k in range(50):
+        begin = 20_000 * k + (80_000 if k == 30 else 0)
+        recorder.step(StepRecord("agent", k, begin, begin, begin, -1, begin + 1000, 0), {"action": 0.0})
+        recorder.step(StepRecord("actuator", k, begin, begin + 1000, begin, -1, begin + 2000, 0), {"action": 0.0})
+        recorder.message(MessageRecord("agent", "sensor", k, k, 20_000 * k, 20_000 * k))
+        recorder.message(MessageRecord("actuator", "agent", k, k, begin + 1000, begin + 1000))
+    nodes = control_nodes(*(BaseNode(name, 50.0, delay=0.002) for name in ("sensor", "agent", "actuator")))
+    rows = {row["quantity"]: row for row in deploy._age_rows(robot, [recorder.episode()], draw(nodes, 1.0, 3))}
+    worst = rows["age_of_sensor_in_agent_max_s"]
+    assert [worst[k] for k in ("real", "simulation", "gap")] == pytest.approx([0.08, 0.002, 0.078])
+    assert rows["age_of_sensor_in_agent_p50_s"]["real"] == pytest.approx(0.0)
+    assert len(rows) == 4
+    alone = deploy._age_rows(robot, [recorder.episode()], None)
+    assert [row["simulation"] for row in alone] == [None] * 4
