@@ -36,7 +36,7 @@ class Watchdog(threading.Thread):
     """
 
     def __init__(self, threads: Iterable[NodeThread], limits: Mapping[str, float], shared: Shared) -> None:
-        super().__init__(name="sim2real:watchdog", daemon=True)
+        super().__init__(name="sim2real:watchdog of the graph", daemon=True)
         self._threads, self._limits, self._shared = list(threads), limits, shared
         self._quit = threading.Event()
 

@@ -1,0 +1,31 @@
+"""A recording with a hiccup: the commands that waited leave at once, and it identifies all the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+from sim2real.log.reader import read_log
+from sim2real.robots.loop import BURST
+from sim2real.stages.pipeline import load_pipeline
+
+LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
+
+
+def burst_of(episode):
+    """Return how many messages more than usual the window of a problem's commands holds."""
+    model = load_pipeline("pendulum").load().identifiable(0.06)
+    return Problem(model, [episode], [Span(0, 1.0)], 3.0).graph.nodes["world"].inputs["actuator"].delay_dist.burst
+
+
+@pytest.mark.parametrize("waited", [0, 12])
+def test_commands_that_leave_at_once_find_room(waited):
+    episode = read_log(LOG)
+    actuator = episode.steps["actuator"]
+    end = actuator.end.copy()
+    end[100 : 100 + waited] = end[100 + waited] - 1000 * np.arange(waited, 0, -1)
+    held = replace(episode, steps={**episode.steps, "actuator": replace(actuator, end=end)})
+    assert burst_of(held) == (BURST if waited == 0 else 11)
