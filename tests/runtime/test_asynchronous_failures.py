@@ -387,9 +387,10 @@ def test_the_watchdog_does_not_count_what_the_caller_takes():
 
 def test_ctrl_c_ends_a_startup_that_hangs():
     class Hanging(Plain):
-        release = threading.Event()
+        reached, release = threading.Event(), threading.Event()
 
         def startup(self, graph_state, timeout=None):
+            self.reached.set()
             self.release.wait(20)
             return super().startup(graph_state, timeout)
 
@@ -399,7 +400,7 @@ def test_ctrl_c_ends_a_startup_that_hangs():
     graph.warmup(gs)
 
     def interrupt():
-        wait_for(lambda: motor.torque)
+        wait_for(lambda: motor.torque and hanging.reached.is_set())
         begun.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
