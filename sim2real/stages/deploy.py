@@ -177,10 +177,15 @@ def _simulate(
 
     Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
     once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
+    None and None where there is nothing to simulate with.
     """
     if values is None:
         return None, None
-    computation, hiccups = computation_delays(episode, 1.0 / robot.RATE_HZ)
+    try:
+        computation, hiccups = computation_delays(episode, 1.0 / robot.RATE_HZ)
+    except Sim2RealError as error:  # the robot has run: what it did must not be lost
+        note(f"warning: nothing to compare with: {error.args[0]}")
+        return None, None
     if hiccups:
         left = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
         note(f"the simulation leaves out steps that took longer than a period of the policy: {left}")
@@ -207,7 +212,9 @@ def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | No
         measured = [input_ages(e, reader) for e in episodes]
         for name in measured[0]:
             ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]
-            simulated = None if timeline is None else _drawn_ages(timeline, reader, name)
+            simulated = None
+            if timeline is not None and (reader, name) in timeline.edges:
+                simulated = _drawn_ages(timeline, reader, name)
             for label, of in (("p50", 0.5), ("max", 1.0)):
                 r = _mean([float(np.quantile(a, of)) for a in ages if a.size])
                 s = None if simulated is None else float(np.mean(np.quantile(simulated, of, axis=1)))

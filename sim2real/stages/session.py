@@ -137,7 +137,7 @@ def check_deadlines(summary: Mapping[str, Any]) -> None:
 
 
 def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
-    """Return the timing table of a summary: rows and headers, times in ms; the age is that of the oldest input."""
+    """Return the timing table of a summary: rows and headers, times in ms; ages are those of its oldest input."""
     quantiles = ["p50", "p99", "max [ms]"]
     headers = ["node", "steps", "period p50", *quantiles[1:], "late p50", *quantiles[1:], "age p50", *quantiles[1:]]
     rows = []

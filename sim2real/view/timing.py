@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -52,13 +53,14 @@ def in_order(episode: Episode) -> list[str]:
         order.append(ready[0])
         left.remove(ready[0])
     own = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
-    return sorted(order, key=lambda n: float("inf") if own.get(n) is None else own[n])  # of equals, as they were
+    place = {n: own[n] if isinstance(own.get(n), int) else math.inf for n in order}
+    return sorted(order, key=lambda n: place[n])  # of equals, as they were
 
 
 def color_of(episode: Episode, node: str, default: str) -> str:
     """Return a node's own colour as ``#rrggbb``; ``default`` where it has none that matplotlib knows."""
     own = episode.metadata.get("graph", {}).get(node, {}).get("color")
-    return to_hex(own) if is_color_like(own) else default
+    return to_hex(own) if isinstance(own, str) and is_color_like(own) else default
 
 
 def slowest_period_s(episode: Episode) -> float:

@@ -88,3 +88,13 @@ def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
     assert len(rows) == 4
     alone = deploy._age_rows(robot, [recorder.episode()], None)
     assert [row["simulation"] for row in alone] == [None] * 4
+
+
+def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simulation(capsys):
+    slow = steps(50)
+    busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
+    episode = Episode(steps={"agent": busy}, messages={}, outputs={})
+    assert deploy._simulate(ARM, None, {"gain": 1.0}, episode, 1.0, 1) == (None, None)
+    assert (
+        "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
+    )

@@ -50,7 +50,7 @@ def test_deadlines():
 def test_timing_tables_have_gaps_where_a_node_never_stepped():
     rows, headers = session.timing_rows({"timing": {"a": node(1), "b": node(0, x=[0.1, 0.2, 0.3], y=[0.0, 0.25, 0.3])}})
     assert rows[0] == ["a", 200, 20.0, 21.0, *[None] * 7, 1]
-    assert rows[1][8:] == [100.0, 250.0, 300.0, 0], "the oldest input of each step"
+    assert rows[1][8:] == [100.0, 250.0, 300.0, 0], "of the inputs, the older one"
     assert len(headers) == len(rows[0])
     assert session._numbers([1.0, float("nan")]) == [1.0, None]
     json.dumps(rows, allow_nan=False)
