@@ -1,5 +1,7 @@
 """What goes wrong while the robot moves: the exit code says it, the log is readable, the motor is off."""
 
+import time
+
 import numpy as np
 import pytest
 from live_robots import assert_torque_ends_off, manifest_of, motor
@@ -157,6 +159,29 @@ def test_a_policy_that_hangs_gets_zero_volts(make_pipeline, record):
     stopped = goals[(t_ns > begin_ns + 150e6) & (t_ns < resumed_ns)]
     assert stopped.size
     assert np.all(stopped == 0.0)
+
+
+def test_a_step_that_hangs_ends_the_recording(make_pipeline, record):
+    name = make_pipeline(
+        "stuck_agent",
+        """
+        class Stuck(hardware.Excitation):
+            def step(self, step_state):
+                if step_state.seq == 40:
+                    time.sleep(6)
+                return super().step(step_state)
+
+        def recording_nodes(session, signal):
+            return nodes(session, signal, agent=Stuck)
+        """,
+    )
+    begin = time.monotonic()
+    code, said, folder = record(name, duration_s=50)
+    assert code == errors.ERROR
+    assert "node 'agent' hangs: its step 40 has taken 1 s" in said
+    assert time.monotonic() - begin < 30.0
+    assert len(read_log(folder / "session.mcap").steps["agent"]) == 40
+    assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
 def test_a_slow_start_does_not_trip_the_servos_watchdog(make_pipeline, record):
