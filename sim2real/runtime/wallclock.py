@@ -23,6 +23,7 @@ from sim2real.runtime.stepper import Stepper
 from sim2real.runtime.watchdog import LAST_RESORT_S, Watchdog, step_limits
 
 _LEAD_S = 0.005
+_POLL_S = 0.05
 
 
 class WallClockRun:
@@ -95,13 +96,14 @@ class WallClockRun:
             for thread in self._threads.values():
                 thread.start()
         for name, thread in self._threads.items():
-            if not thread.ready.wait(max(0.0, deadline - time.monotonic())):
-                self._shared.fail(
-                    GraphTimeout(
-                        f"node {name!r} has not finished its startup after {timeout_s:g} s",
-                        hint="see what it waits for, or start with a longer timeout_s",
+            while not (thread.ready.wait(_POLL_S) or self.ended):
+                if time.monotonic() > deadline:
+                    self._shared.fail(
+                        GraphTimeout(
+                            f"node {name!r} has not finished its startup after {timeout_s:g} s",
+                            hint="see what it waits for, or start with a longer timeout_s",
+                        )
                     )
-                )
         self.check()
         with self._stop_lock:
             self._refuse_if_stopped()
