@@ -20,7 +20,8 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.runtime.fit import check_fit, nodes_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.program import Rollout, RowProgram, select
+from sim2real.runtime.program import Rollout, RowProgram
+from sim2real.runtime.walk import Walk
 from sim2real.runtime.wiring import Wiring, wire
 
 
@@ -58,15 +59,8 @@ class CompiledGraph:
         self.given = tuple(given or ())
         check_fit(self.nodes, timeline, self.given)
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
-        self.program = RowProgram(self.nodes, self.wiring, given or {})
-        self._turns = [i for i, n in enumerate(self.wiring.slots) if n == self.supervisor]
-        # Place of each of the supervisor's steps, (E, K): row * turns + turn; behind the last row where there is none.
-        self._places = np.full((self.episodes, 0), 0)
-        if self._turns:
-            seq = np.stack([self.wiring.tables[i].seq for i in self._turns], axis=-1).reshape(self.episodes, -1)
-            self._places = np.full((self.episodes, int(seq.max()) + 1), seq.shape[1])
-            e, at = np.nonzero(seq >= 0)
-            self._places[e, seq[e, at]] = at
+        self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes)
+        self._walk = Walk(self.program, self.supervisor)
 
     @property
     def rows(self) -> int:
@@ -81,7 +75,7 @@ class CompiledGraph:
     @property
     def steps(self) -> int:
         """Steps of the supervisor in the shortest episode: ``reset`` shows the first, ``step`` the others."""
-        return int((self._places < self.rows * len(self._turns)).sum(axis=1).min())
+        return int(self._walk.counts.min())
 
     def init(
         self,
@@ -108,7 +102,8 @@ class CompiledGraph:
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
         buffer |= {name: outputs[name] for name in self.given}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
-        return _replace(gs, eps=jnp.asarray(eps, jnp.int32), step=jnp.int32(0), seq={}, buffer=buffer, aux=aux)
+        # The row is numpy's: what follows in the same program sees that it is the first.
+        return _replace(gs, eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
         """Run to the supervisor's first step.
@@ -120,9 +115,7 @@ class CompiledGraph:
             The graph's state, in which ``seq`` says which step of the supervisor awaits, and what the supervisor sees.
         """
         self._check_row_start(gs, "reset")
-        gs = self.program.run_slots(gs, 0, self._first_turn(), {})
-        found = self.program.seq(gs, self._turns[0]) >= 0
-        return self._stand(*self._search(gs, 0, found, int(self._places[:, 0].max())))
+        return self._walk.to_first(gs)
 
     def step(
         self, gs: GraphState, step_state: StepState | None = None, output: Any = None
@@ -137,20 +130,20 @@ class CompiledGraph:
         Raises:
             UsageError: Before ``reset``, or when the episode has no further step.
         """
+        self._walk.first_turn()
         k = self._awaited(gs, "step")
         if not (_traced(k) or _traced(gs.eps)):
-            last = int((self._places[int(gs.eps)] < self.rows * len(self._turns)).sum()) - 1
+            last = int(self._walk.counts[int(gs.eps)]) - 1
             if not 0 <= int(k) < last:
                 raise UsageError(
                     f"the timeline ends after step {last} of the supervisor {self.supervisor!r}",
                     hint="start again with init() and reset(), or draw longer timelines",
                 )
-        turn = jnp.asarray(self._places)[gs.eps, jnp.maximum(k, 0)] % len(self._turns)
-        before = self._seen(gs, turn) if step_state is None else step_state
+        turn = self._walk.turn_of(gs, k)
+        before = self._walk.seen(gs, turn) if step_state is None else step_state
         after, made = self.program.call(self.supervisor, before) if output is None else (before, output)
-        gs = self.program.commit(gs, self._turns[0], after, made, k >= 0)
-        hops = int(np.diff(self._places, axis=1).max(initial=1))
-        return self._stand(*self._search(gs, turn, jnp.bool_(False), hops))
+        gs = self.program.commit(gs, self.supervisor, after, made, k >= 0)
+        return self._walk.to_next(gs, turn, k < 0)
 
     def run(self, gs: GraphState) -> GraphState:
         """Run to the supervisor's next step, make it as the supervisor does, and run to the one after it.
@@ -162,9 +155,7 @@ class CompiledGraph:
     def run_row(self, gs: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
         """Run one row: every slot of the boundary, then the world's ticks."""
         self._check_row_start(gs, "run_row")
-        outputs: dict[str, list[Rollout]] = {}
-        gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs)
-        return self.program.run_world(gs, outputs), outputs
+        return self._run_row(gs, inside=not _traced(gs.step))
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
@@ -192,8 +183,10 @@ class CompiledGraph:
                 running = [n for n in self.nodes if n not in self.given]
                 raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
 
+        inside = not _traced(gs.step)
+
         def body(state: GraphState, _: None) -> tuple[GraphState, Any]:
-            state, outputs = self.run_row(state)
+            state, outputs = self._run_row(state, inside)
             kept = {n: outputs.get(n, []) for n in record}
             return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
 
@@ -214,16 +207,18 @@ class CompiledGraph:
             UsageError: When the supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
-        turn = self._only_turn()
-        gs = self.program.run_slots(gs, 0, turn, {})
+        turn = self._walk.only_turn()
+        gs = self.program.run_slots(gs, 0, turn, {}, inside=not _traced(gs.step))
         step_state = self.program.step_state(gs, turn)
         return _replace(gs, seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
     def advance(self, gs: GraphState, step_state: StepState, output: Any) -> GraphState:
         """Put in the supervisor's step and run the rest of the row; the counterpart of ``observe``."""
-        turn, k = self._only_turn(), self._awaited(gs, "advance")
-        gs = self.program.commit(_replace(gs, seq={}), turn, step_state, output, k >= 0)
-        return self._rest_of_row(gs, turn)
+        turn, k = self._walk.only_turn(), self._awaited(gs, "advance")
+        gs = self.program.commit(_replace(gs, seq={}), self.supervisor, step_state, output, k >= 0)
+        inside = not _traced(gs.step)
+        gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
+        return self.program.run_world(gs, {}, inside)
 
     def report(self) -> dict[str, Any]:
         """Return what the compiler made of the timelines.
@@ -237,79 +232,25 @@ class CompiledGraph:
         """
         w = self.wiring
         shapes = jax.eval_shape(self.init, jax.random.key(0))
-        rows = self._places // max(1, len(self._turns))
         windows = {(n, i): self.nodes[n].inputs[i].total_window for n, i in w.bursts}
         return {
             "episodes": self.episodes,
             "rows": w.rows,
             "ticks_per_row": w.ticks,
             "slots": list(w.slots),
-            "supervisor_slots": len(self._turns),
-            "supervisor_steps": self.steps if self._turns else 0,
-            "longest_gap": int(np.diff(rows, axis=1).max(initial=1)),
+            "supervisor_slots": len(self._walk.turns),
+            "supervisor_steps": self.steps if self._walk.turns else 0,
+            "longest_gap": self._walk.longest_gap,
             "discarded": w.discarded,
             "rings": dict(w.rings),
             "bursts": {f"{n}/{i}": {"burst": b, "window": windows[n, i]} for (n, i), b in w.bursts.items()},
             "bytes_per_copy": sum(x.size * x.dtype.itemsize for x in jax.tree_util.tree_leaves(shapes)),
         }
 
-    def _rest_of_row(self, gs: GraphState, turn: int) -> GraphState:
-        return self.program.run_world(self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}), {})
-
-    def _hop(self, gs: GraphState, i: int) -> GraphState:
-        """Run from the supervisor's turn ``i`` of a row to its next turn, in this row or the next one."""
-        if i + 1 < len(self._turns):
-            return self.program.run_slots(gs, self._turns[i] + 1, self._turns[i + 1], {})
-        return self.program.run_slots(self._rest_of_row(gs, self._turns[i]), 0, self._turns[0], {})
-
-    def _search(self, gs: GraphState, turn: Any, found: Any, hops: int) -> tuple[GraphState, Any]:
-        """Hop on, up to ``hops`` times, until the supervisor makes a step; return the state and its turn.
-
-        What is computed behind the step that was found is selected away. With one turn in a row and a step in every
-        row there is nothing to select.
-        """
-        turns = len(self._turns)
-        if turns == 1:
-            for i in range(hops):
-                new = self._hop(gs, 0)
-                gs = new if i == 0 and hops == 1 else select(found, gs, new)
-                found = found | (self.program.seq(gs, self._turns[0]) >= 0)
-            return gs, turn
-        for _ in range(-(-hops // turns) + (hops > 0)):  # one sweep more, as it starts at any turn
-            for i in range(turns):
-                active = ~found & (turn == i)
-                gs = select(active, self._hop(gs, i), gs)
-                arrived = (i + 1) % turns
-                turn = jnp.where(active, arrived, turn)
-                found = found | (active & (self.program.seq(gs, self._turns[arrived]) >= 0))
-        return gs, turn
-
-    def _stand(self, gs: GraphState, turn: Any) -> tuple[GraphState, StepState]:
-        """Return the state that awaits a step of the supervisor, and what it sees."""
-        step_state = self._seen(gs, turn)
-        return _replace(gs, seq={self.supervisor: step_state.seq}), step_state
-
-    def _seen(self, gs: GraphState, turn: Any) -> StepState:
-        step_state = self.program.step_state(gs, self._turns[0])
-        seq = self.program.seq(gs, self._turns[0])
-        for i, slot in enumerate(self._turns[1:], start=1):
-            step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
-            seq = jnp.where(turn == i, self.program.seq(gs, slot), seq)
-        return step_state.replace(seq=seq)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _first_turn(self) -> int:
-        if not self._turns:
-            raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
-        return self._turns[0]
-
-    def _only_turn(self) -> int:
-        first = self._first_turn()
-        if len(self._turns) > 1:
-            raise UsageError(
-                f"the supervisor {self.supervisor!r} makes up to {len(self._turns)} steps in a row of these timelines",
-                hint="draw timelines without bursts, leave the episodes with a hiccup out, or use reset() and step()",
-            )
-        return first
+    def _run_row(self, gs: GraphState, inside: bool) -> tuple[GraphState, dict[str, list[Rollout]]]:
+        outputs: dict[str, list[Rollout]] = {}
+        gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside)
+        return self.program.run_world(gs, outputs, inside), outputs
 
     def _awaited(self, gs: GraphState, call: str) -> Any:
         """Return which step of the supervisor awaits."""

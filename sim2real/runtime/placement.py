@@ -1,8 +1,8 @@
-"""In which row, and at which turn of it, each step of a timeline is computed.
+"""In which row, and in which slot of it, each step of a timeline is computed.
 
 A world ticks on a fixed grid and always runs. Between the last tick that a step sees and the first tick that its output
 touches there is slack, so the step can be computed at any tick in between. A **row** is one boundary, where steps of
-the other nodes run in **turns**, followed by n world ticks. Pure numpy, ahead of time.
+the other nodes run in **slots**, followed by n world ticks. Pure numpy, ahead of time.
 """
 
 from __future__ import annotations
@@ -17,13 +17,9 @@ from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.graph.schedule import topological
 from sim2real.graph.timeline import Edge, Timeline, search_rows
 from sim2real.graph.windows import newest_message
+from sim2real.runtime.slots import Heard, Steps, arrange
 
-TURNS = 256
-"""Turns at one boundary, at most."""
 _UNREAD = np.int64(2**40)
-
-Steps = dict[str, np.ndarray]
-"""Node -> a number for each of its steps, shape ``(E, N)``, int64."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +30,15 @@ class Placement:
         ticks: World ticks in a row; 1 without a world.
         rows: Rows in an episode.
         row: Each step's row; steps whose row lies behind the last one are not computed.
-        turn: Each step's turn at the boundary of its row.
-        slots: (turn, place among the nodes, node) of every slot of a boundary, in the order in which they run.
+        slot: Each step's slot at the boundary of its row.
+        slots: The node of every slot of a boundary, in the order in which they run.
     """
 
     ticks: int
     rows: int
     row: Steps
-    turn: Steps
-    slots: list[tuple[int, int, str]]
+    slot: Steps
+    slots: tuple[str, ...]
 
 
 class Placer:
@@ -105,32 +101,30 @@ class Placer:
             yield key[0], self.edges[key], self.newest[key]
 
     def _cheapest(self, world_ticks: int) -> Placement:
-        """Return, of the placements that fit every slack, the one with the fewest slots a tick.
+        """Return the placement with the fewest slots of the supervisor; of these, that with the fewest slots a tick.
 
-        The largest row that fits is not always the best: three steps in ten ticks fit rows of four ticks with two slots
-        each, and rows of three with one.
+        A supervisor that makes one step in a row can be trained row by row. The largest row that fits is not always the
+        best: three steps in ten ticks fit rows of four ticks with two slots each, and rows of three with one.
         """
         rate = self.nodes[self.world or ""].rate
         most = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
         lowest = self._earliest()
         highest = self._latest(lowest, 2 * most)
-        best = None
+        found = []
         for n in range(most, 0, -1):
             if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self.valid(o)].all() for o in self.others):
                 continue
-            found = self._fill(n, world_ticks // n, self._rows(lowest, highest, n))
-            if best is None or len(found.slots) / n < len(best.slots) / best.ticks:
-                best = found
-        if best is None:
+            found.append(self._fill(n, world_ticks // n, self._rows(lowest, highest, n)))
+        if not found:
             raise UsageError("these timelines have no tick of the world", hint="draw longer timelines")
-        return best
+        return min(found, key=lambda p: (p.slots.count(self.supervisor), len(p.slots) / p.ticks))
 
     def _fill(self, ticks: int, rows: int, row: Steps) -> Placement:
         """Return the placement of steps in given rows; steps behind the last row need no slot."""
-        counts = {n: self.valid(n) & (row[n] < rows) for n in self.others}
-        turn = self._turns(row, counts)
-        slots = sorted((int(t), i, n) for i, n in enumerate(self.others) for t in np.unique(turn[n][counts[n]]))
-        return Placement(ticks, rows, row, turn, slots)
+        counted = {n: self.valid(n) & (row[n] < rows) for n in self.others}
+        heard = [Heard(n, e.sender, at) for n, e, at in self.live() if self.world not in (n, e.sender)]
+        slots, slot = arrange(self.supervisor, rows, {n: row[n] for n in self.others}, counted, heard)
+        return Placement(ticks, rows, row, slot, slots)
 
     def _earliest(self) -> Steps:
         """Return for each step how many world ticks it has seen the output of, directly or not."""
@@ -205,43 +199,6 @@ class Placer:
                 changed |= bool((new != rows[reader]).any())
                 rows[reader] = new
         return {n: rows[n] for n in self.others}
-
-    def _turns(self, row: Steps, counts: Mapping[str, np.ndarray]) -> Steps:
-        """Return each step's turn at the boundary: after what it hears and after the node's step before.
-
-        Only the steps in ``counts``, shape ``(E, N)``, bool, take turns.
-        """
-        order = {n: i for i, n in enumerate(self.nodes)}
-        turns = {n: np.zeros_like(r) for n, r in row.items()}
-        changed = True
-        while changed:
-            changed = False
-            for name, r in row.items():
-                new = turns[name].copy()
-                again = r[:, 1:] == r[:, :-1]
-                new[:, 1:] = np.where(again, np.maximum(new[:, 1:], new[:, :-1] + 1), new[:, 1:])
-                for reader, edge, at in self.live():
-                    if reader != name or edge.sender == self.world:
-                        continue
-                    here = (at >= 0) & (np.take_along_axis(row[edge.sender], at.clip(0), 1) == r)
-                    later = int(order[edge.sender] >= order[name])
-                    after = np.take_along_axis(turns[edge.sender], at.clip(0), 1) + later
-                    new = np.where(here, np.maximum(new, after), new)
-                new = np.where(counts[name], new, 0)
-                changed |= bool((new != turns[name]).any())
-                turns[name] = new
-            self._check_turns(turns)
-        return turns
-
-    def _check_turns(self, turns: Steps) -> None:
-        crowded = [n for n, t in turns.items() if int(t.max(initial=0)) >= TURNS]
-        if crowded:
-            between = "ticks of the world" if self.world else f"steps of the supervisor {self.supervisor!r}"
-            raise UsageError(
-                f"node {crowded[0]!r} makes more than {TURNS} steps between two {between}, or steps of "
-                f"{', '.join(crowded)} wait for each other's messages of the same instant",
-                hint="bring the rates closer together; give the nodes of a loop a computation delay",
-            )
 
 
 def _heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:

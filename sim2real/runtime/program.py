@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sim2real.errors import Sim2RealError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.runtime.match import matched
 from sim2real.runtime.wiring import SlotTable, Wiring
 
 
@@ -33,10 +33,11 @@ class RowProgram:
         nodes: The nodes by name.
         wiring: The tables.
         given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
+        episodes: E.
     """
 
-    def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any]) -> None:
-        self.nodes, self.wiring = nodes, wiring
+    def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any], episodes: int) -> None:
+        self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
         # (R, E, ...): what the episodes look up in one row lies side by side.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
@@ -44,33 +45,42 @@ class RowProgram:
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
 
-    def run_slots(self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]]) -> GraphState:
-        """Run the slots ``begin`` to ``end`` of the row, adding to ``outputs``."""
+    def run_slots(
+        self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]], inside: bool = False
+    ) -> GraphState:
+        """Run the slots ``begin`` to ``end`` of the row, adding to ``outputs``; behind the last row nothing changes.
+
+        ``inside`` promises that the row is none of those, which saves selecting.
+        """
         for i in range(begin, end):
             name = self.wiring.slots[i]
-            step_state = self.step_state(gs, i)
+            step_state = self.step_state(gs, i, inside)
             new, output = self.call(name, step_state)
-            gs = self.commit(gs, i, new, output, step_state.seq >= 0)
+            ran = None if inside and self._always[i] else step_state.seq >= 0
+            gs = self.commit(gs, name, new, output, ran)
             outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
         return gs
 
-    def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]]) -> GraphState:
-        """Run the world's ticks, adding to ``outputs``, and go to the next row."""
-        name = self.wiring.world
+    def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]], inside: bool = False) -> GraphState:
+        """Run the world's ticks, adding to ``outputs``, and go to the next row; see ``run_slots``."""
+        name, before, here = self.wiring.world, gs, None if inside else gs.step < self.wiring.rows
         if name is not None:
 
             def tick(gs: GraphState, now: Any) -> tuple[GraphState, Rollout]:
                 step_state = self._step_state(gs, name, now)
                 new, output = self.call(name, step_state)
-                return self.commit(gs, None, new, output, True), Rollout(step_state.seq, output)
+                return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
 
             # A loop keeps a GPU waiting. On a CPU it costs the pendulum nothing, and MuJoCo compiles in half the time.
             unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
             gs, made = jax.lax.scan(tick, gs, _at(self._world, gs), unroll=unroll)
+            if here is not None:
+                made = made._replace(seq=jnp.where(here, made.seq, -1))
             outputs.setdefault(name, []).extend(
                 jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], made) for i in range(self.wiring.ticks)
             )
-        return gs.replace(step=gs.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        gs = gs.replace(step=gs.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        return gs if here is None else select(here, gs, before)
 
     def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
         """Trace a node's step; an error in it names the node."""
@@ -80,40 +90,38 @@ class RowProgram:
             error.add_note(f"in the step of node {name!r}")
             raise
 
-    def step_state(self, gs: GraphState, slot: int) -> StepState:
-        """Return what the step of a slot gets; its ``seq`` is -1 where no step is made."""
-        return self._step_state(gs, self.wiring.slots[slot], _at(self._tables[slot], gs))
+    def step_state(self, gs: GraphState, slot: int, inside: bool = False) -> StepState:
+        """Return what the step of a slot gets; its ``seq`` is -1 where no step is made, and behind the last row."""
+        table = _at(self._tables[slot], gs)
+        if not inside:
+            table["seq"] = self.seq(gs, slot)
+        return self._step_state(gs, self.wiring.slots[slot], table)
 
     def seq(self, gs: GraphState, slot: int) -> Any:
         """Return which step a slot makes; -1 for none, and behind the last row."""
         inside = gs.step < self.wiring.rows
         return jnp.where(inside, self._tables[slot]["seq"][gs.step, gs.eps], -1)
 
-    def commit(self, gs: GraphState, slot: int | None, new: StepState, output: Any, ran: Any) -> GraphState:
-        """Take over a step's results: everywhere if the slot always runs, else where it ran."""
-        name = self.wiring.world if slot is None else self.wiring.slots[slot]
-        if name is None:
-            raise Sim2RealError("a graph without a world has no tick to commit")
-        always = slot is None or self._always[slot]
+    def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Any) -> GraphState:
+        """Take over the results of a node's step where it ``ran``; None: everywhere."""
 
-        def merge(fresh: Any, old: Any) -> Any:
+        def merge(field: str, fresh: Any, old: Any) -> Any:
             if fresh is old:
                 return old
-            cast = lambda a, b: jnp.asarray(a) if _is_key(b) else jnp.asarray(a, b.dtype)  # noqa: E731
-            fresh = jax.tree_util.tree_map(cast, fresh, old)
-            return fresh if always else select(ran, fresh, old)
+            fresh = matched(name, f"the {field} that step returns", fresh, "the one it got", old)
+            return fresh if ran is None else select(ran, fresh, old)
 
         changed: dict[str, Any] = {
-            "state": {**gs.state, name: merge(new.state, gs.state[name])},
-            "rng": {**gs.rng, name: merge(new.rng, gs.rng[name])},
+            field: {**getattr(gs, field), name: merge(field, getattr(new, field), getattr(gs, field)[name])}
+            for field in ("state", "rng")
         }
         if new.params is not gs.params[name]:
-            changed["params"] = {**gs.params, name: merge(new.params, gs.params[name])}
+            changed["params"] = {**gs.params, name: merge("params", new.params, gs.params[name])}
         if name in gs.buffer:
             kept = gs.buffer[name]
-            fresh = jax.tree_util.tree_map(lambda x, old: jnp.asarray(x, old.dtype), output, kept[-1])
+            fresh = matched(name, "the output of step", output, "that of init_output", kept[-1])
             pushed = (*kept[1:], fresh)
-            changed["buffer"] = {**gs.buffer, name: pushed if always else select(ran, pushed, kept)}
+            changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, kept)}
         return gs.replace(**changed)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any]) -> StepState:
@@ -172,10 +180,6 @@ def select(mask: Any, new: Any, old: Any) -> Any:
 
 def _is_mjx_data(leaf: Any) -> bool:
     return type(leaf).__module__.startswith("mujoco.mjx") and hasattr(leaf, "where")
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _pytree(table: SlotTable | None) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.handover import Reply
+from sim2real.runtime.match import matched
 
 _CARRIED = ("rng", "params", "state")
 
@@ -49,14 +50,18 @@ class Stepper:
         """
         jit = jit and self.node.jittable
         arguments = (data.step_state(0, 0), data.ages(0))
-        leaves, tree = jax.tree_util.tree_flatten(arguments)
+        leaves, tree = jax.tree_util.tree_flatten((arguments, data.form.default))
         signature = (jit, tree, [(np.shape(x), jnp.result_type(x)) for x in leaves] if jit else None)
         if signature == self._signature:
             return
         self._compiled = None
         if jit:
-            traced = jax.jit(self._call).trace(*arguments)
-            self._check(data, arguments[0], traced.out_info)
+            default = data.form.unpack(data.form.default)
+
+            def call(step_state: StepState, ages: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+                return self._matched(step_state, *self._call(step_state, ages), default)
+
+            traced = jax.jit(call).trace(*arguments)
             self._compiled = traced.lower().compile()
             if not traced.jaxpr.effects:  # pure: a first call fills caches, its result is dropped
                 jax.block_until_ready(self._compiled(*arguments))
@@ -91,26 +96,14 @@ class Stepper:
             )
         return _changed(step_state, result[0]), result[1]
 
-    def _check(self, data: NodeData, given: StepState, out: Any) -> None:
-        changed, output = out
+    def _matched(self, given: StepState, changed: dict[str, Any], output: Any, default: Any) -> tuple[dict, Any]:
+        """Return a step's results in the types that the node's state and default output have."""
+        name = self.node.name
         for field in _CARRIED:
             if field in changed:
-                self._compare(f"the {field} that step returns", changed[field], "the one it got", getattr(given, field))
-        self._compare("the output of step", output, "that of init_output", data.form.unpack(data.form.default))
-
-    def _compare(self, what: str, got: Any, reference: str, expected: Any) -> None:
-        where = f"node {self.node.name!r}: {what} differs from {reference}"
-        if jax.tree_util.tree_structure(got) != jax.tree_util.tree_structure(expected):
-            trees = [jax.tree_util.tree_structure(t) for t in (got, expected)]
-            raise UsageError(f"{where}: {trees[0]} instead of {trees[1]}")
-        flat, _ = jax.tree_util.tree_flatten_with_path(expected)
-        for (path, old), new in zip(flat, jax.tree_util.tree_leaves(got), strict=True):
-            if np.shape(old) != new.shape or jnp.result_type(old) != new.dtype:
-                raise UsageError(
-                    f"{where}: {jax.tree_util.keystr(path) or 'the value'} is {new.dtype}{list(new.shape)} "
-                    f"instead of {jnp.result_type(old)}{list(np.shape(old))}",
-                    hint="keep shapes and dtypes fixed, e.g. jnp.float32(0.0) in init, x.astype(...) in step",
-                )
+                what = f"the {field} that step returns"
+                changed[field] = matched(name, what, changed[field], "the one it got", getattr(given, field))
+        return changed, matched(name, "the output of step", output, "that of init_output", default)
 
 
 def overwritten(ts: Any, begin: int, now: int, node: str) -> int:

@@ -15,7 +15,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.timeline import NEVER, Timeline, Vertex, search_rows
 from sim2real.graph.windows import check_bursts, longest_burst
-from sim2real.runtime.placement import TURNS, Placement, Placer
+from sim2real.runtime.placement import Placement, Placer
 
 EMPTY_AGE_S = 1e6
 """Age of an empty slot in a window [s]: older than any message."""
@@ -105,16 +105,16 @@ class _Tables:
         self.placer, self.placement = placer, placement
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
-        # When each step is done: by row, turn and place among the nodes, as the program runs.
+        # When each step is done: by row and slot, as the program runs.
         self.done = {
-            n: np.where(placer.valid(n), self._moment(placement.row[n], placement.turn[n], i), NEVER)
-            for i, n in enumerate(placer.others)
+            n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
+            for n in placer.others
         }
 
     def wiring(self) -> Wiring:
         """Return all tables."""
-        names = tuple(n for _, _, n in self.placement.slots)
-        tables = tuple(self._slot_table(n, turn, i) for turn, i, n in self.placement.slots)
+        names = self.placement.slots
+        tables = tuple(self._slot_table(n, i) for i, n in enumerate(names))
         world_table = self._world_table() if self.world else None
         ran = [t.seq >= 0 for t in tables]
         return Wiring(
@@ -129,23 +129,23 @@ class _Tables:
             bursts={k: longest_burst(e, self.timeline.vertices[k[0]]) for k, e in self.placer.edges.items()},
         )
 
-    def _moment(self, row: np.ndarray, turn: np.ndarray | int, place: int) -> np.ndarray:
-        return (row * TURNS + turn) * (len(self.nodes) + 1) + place
+    def _moment(self, row: np.ndarray, slot: np.ndarray | int) -> np.ndarray:
+        return row * (len(self.placement.slots) + 1) + slot
 
-    def _slot_table(self, name: str, turn: int, place: int) -> SlotTable:
-        rows, turns = self.placement.row[name], self.placement.turn[name]
+    def _slot_table(self, name: str, slot: int) -> SlotTable:
+        rows, slots = self.placement.row[name], self.placement.slot[name]
         seq = np.full((self.timeline.episodes, self.rows), -1, np.int64)
-        e, k = np.nonzero((turns == turn) & (rows < self.rows) & self.placer.valid(name))
+        e, k = np.nonzero((slots == slot) & (rows < self.rows) & self.placer.valid(name))
         seq[e, rows[e, k]] = k
         row = np.arange(self.rows, dtype=np.int64)
-        return self._table(name, seq, self._moment(row, turn, place), row * self.ticks)
+        return self._table(name, seq, self._moment(row, slot), row * self.ticks)
 
     def _world_table(self) -> SlotTable:
         world = self.world or ""
         episodes = self.timeline.episodes
         tick = np.arange(self.rows * self.ticks, dtype=np.int64)
         seq = np.broadcast_to(tick, (episodes, tick.size))
-        after = self._moment(tick // self.ticks, TURNS - 1, len(self.nodes))  # the whole boundary is done
+        after = self._moment(tick // self.ticks, len(self.placement.slots))  # the whole boundary is done
         flat = self._table(world, seq, after, tick)
         split = lambda a: a.reshape(episodes, self.rows, self.ticks, *a.shape[2:])  # noqa: E731
         inputs = {

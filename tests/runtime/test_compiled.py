@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import topologies
+from jax.extend.core import jaxprs_in_params
 from test_wiring import simulate
 
 from sim2real.errors import UsageError
@@ -129,6 +130,41 @@ def test_observe_and_advance_are_the_same_row_by_row(compiled):
     assert 0 < int(acts.sum()) < graph.rows  # in some rows the policy makes no step
 
 
+def test_a_step_is_as_large_a_program_as_a_row():
+    """A policy far slower than its world: the rows between two of its steps are a loop."""
+    nodes, supervisor = topologies.inner_loop(jax_hash_node)
+    graph = CompiledGraph(nodes, supervisor, draw(nodes, 0.5))
+    assert graph.report()["longest_gap"] >= 10
+    gs = graph.init(KEY)
+    row = equations(lambda s: graph.run_row(s)[0], gs)
+    assert equations(graph.step, jax.eval_shape(graph.reset, gs)[0]) < 1.5 * row
+
+
+def equations(function, *arguments):
+    """Return how many equations a program has, those in loops and calls counted once."""
+
+    def count(jaxpr):
+        return sum(1 + sum(count(j) for j in jaxprs_in_params(e.params)) for e in jaxpr.eqns)
+
+    return count(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def test_nothing_changes_behind_the_last_row(compiled):
+    """Under ``jit`` where a state stands is not known before: an error cannot be raised, so it stays as it is."""
+    graph = compiled(topologies.robot)
+    roll = jax.jit(lambda s: graph.rollout(s, ("world", "policy")))
+    end, _ = roll(graph.init(KEY, eps=1))
+    after, records = roll(end)
+    assert equal(after, end)
+    assert all((np.asarray(r.seq) == -1).all() for r in records.values())
+    row = jax.jit(lambda s: graph.advance(*graph.observe(s)[:2], Value(x=jnp.uint32(3))))
+    assert equal(row(end), end)
+
+
+def equal(a, b):
+    return jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), a, b))
+
+
 def test_a_rollout_in_parts_is_a_rollout(compiled):
     graph = compiled(topologies.robot)
     gs, first = graph.rollout(graph.init(KEY), ("world",), rows=5)
@@ -155,8 +191,11 @@ def test_errors_instead_of_silence(compiled):
         awaiting, ss = jax.jit(graph.step)(awaiting, ss, Value(x=jnp.uint32(1)))
     with pytest.raises(UsageError, match=f"timeline ends after step {graph.steps - 1} of the supervisor 'policy'"):
         graph.step(awaiting, ss, Value(x=jnp.uint32(1)))
-    _, ss = jax.jit(graph.step)(awaiting, ss, Value(x=jnp.uint32(1)))  # traced: it cannot be seen, but is marked
+    step = jax.jit(graph.step)
+    ended, ss = step(awaiting, ss, Value(x=jnp.uint32(1)))  # traced: it cannot be seen, but is marked
     assert int(ss.seq) == -1
+    assert int(ended.step) == graph.rows
+    assert equal(step(ended, ss, Value(x=jnp.uint32(2)))[0], ended)
     for rows in (0, graph.rows + 1):
         with pytest.raises(UsageError, match="rows are left"):
             graph.rollout(gs, rows=rows)

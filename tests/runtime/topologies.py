@@ -119,6 +119,22 @@ def slow_supervisor(make):
     return by_name(fast, slow), "slow"
 
 
+def inner_loop(make, policy_hz=10):
+    """A controller at the world's rate under a slow policy."""
+    world, sensor, inner, policy = (
+        make("world", 200, True),
+        make("sensor", 200, False, delay_dist=0.0005),
+        make("inner", 200, False, delay_dist=0.001),
+        make("policy", policy_hz, False, delay_dist=0.0015),
+    )
+    sensor.connect(world)
+    inner.connect(sensor)
+    policy.connect(sensor)
+    inner.connect(policy, skip=True)
+    world.connect(inner, skip=True)
+    return by_name(world, sensor, inner, policy), "policy"
+
+
 def random_one(make):
     """A random graph with two worlds."""
     return random_graph(13, size=3, worlds=2, make=make), "n0"
