@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from sim2real.graph import StepState as StepState
     from sim2real.graph import Timeline as Timeline
     from sim2real.graph import TrainableDist as TrainableDist
+    from sim2real.graph.episode import MemoryRecorder as MemoryRecorder
+    from sim2real.graph.schedule import draw as draw
     from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
+    from sim2real.runtime.clock import Clock as Clock
     from sim2real.runtime.compiled import CompiledGraph as CompiledGraph
     from sim2real.stages.pipeline import Pipeline as Pipeline
     from sim2real.train.networks import Policy as Policy
@@ -42,6 +45,7 @@ __all__ = [
     "Base",
     "BaseNode",
     "BaseWorld",
+    "Clock",
     "CompiledGraph",
     "Connection",
     "DeadlineExceeded",
@@ -52,6 +56,7 @@ __all__ = [
     "HardwareLost",
     "InputState",
     "Jitter",
+    "MemoryRecorder",
     "Pipeline",
     "Policy",
     "Recorder",
@@ -63,6 +68,7 @@ __all__ = [
     "Timeline",
     "TrainableDist",
     "UsageError",
+    "draw",
 ]
 
 _HOMES = {
@@ -85,7 +91,10 @@ _HOMES = {
         "Timeline",
         "TrainableDist",
     ),
+    "sim2real.graph.episode": ("MemoryRecorder",),
+    "sim2real.graph.schedule": ("draw",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
+    "sim2real.runtime.clock": ("Clock",),
     "sim2real.runtime.compiled": ("CompiledGraph",),
     "sim2real.stages.pipeline": ("Pipeline",),
     "sim2real.train.networks": ("Policy",),
@@ -108,4 +117,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__, "__version__"])
+    return sorted({*globals(), *__all__, "__version__"})

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from numbers import Real
 from statistics import NormalDist
 from typing import Any
 
@@ -46,7 +47,7 @@ class StaticDist(DelayDistribution):
     def __init__(self, dist: Any) -> None:
         self.dist = dist
         self._constant: float | None = None
-        if isinstance(dist, int | float):
+        if isinstance(dist, Real):
             self._constant = float(dist)
         elif type(dist).__name__ == "Deterministic" or (type(dist).__name__ == "Normal" and float(dist.scale) == 0.0):
             self._constant = float(dist.loc)
@@ -55,6 +56,10 @@ class StaticDist(DelayDistribution):
                 f"a delay distribution was expected, got {dist!r}",
                 hint="pass seconds, a distrax distribution or a DelayDistribution",
             )
+        elif type(dist).__name__ == "Normal" and not (
+            math.isfinite(float(dist.loc)) and math.isfinite(float(dist.scale))
+        ):
+            raise UsageError(f"a delay must be finite, got a Normal({float(dist.loc)}, {float(dist.scale)})")
         if self._constant is not None and (not math.isfinite(self._constant) or self._constant < 0):
             raise UsageError(f"a delay must be finite and at least 0 s, got {self._constant}")
 
@@ -209,6 +214,8 @@ class TrainableDist(Base, DelayDistribution):
         arrived yet is the upper end of that line. There, the default output in an empty slot arrived at time 0; with
         ``linear_real_only`` infinitely long ago, so that the first message holds until it arrives.
 
+        Messages are received this delay after they were sent, whatever ``ts_recv`` says of the timeline's least delay.
+
         Args:
             inputs: The widened window, leaves ``(W, ...)``.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
@@ -221,6 +228,8 @@ class TrainableDist(Base, DelayDistribution):
             The window of ``window`` messages.
         """
         late = age_s - self.delay  # time since arrival at this delay; negative: not there yet
+        received = jnp.where(inputs.seq >= 0, inputs.ts_sent + self.delay, inputs.ts_recv)
+        inputs = inputs.replace(ts_recv=received)  # pyright: ignore[reportAttributeAccessIssue]
         if self.interp == "zoh_mean":
             return _mean_over_period(inputs, late, window, period_s)
         width = inputs.seq.shape[0]

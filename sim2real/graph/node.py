@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from enum import Enum
+from numbers import Real
 from typing import Any
 
 from sim2real.errors import UsageError
@@ -51,15 +53,13 @@ class Connection:
         self.input_node = input_node
         self.output_node = output_node
         self.blocking = bool(blocking)
-        self.window = window
         self.skip = bool(skip)
         self.jitter = Jitter(jitter)
         self.name = name
         where = f"connection {output_node.name!r} -> {input_node.name!r} (input {name!r})"
         self.delay_dist = _as_distribution(delay_dist, where)
         self.delay = _expected_delay(delay, self.delay_dist, where)
-        if window < 1:
-            raise UsageError(f"{where}: window must be at least 1, got {window}")
+        self.window = _whole(window, where)
         if self.trainable and (self.blocking or self.jitter is Jitter.BUFFER):
             raise UsageError(
                 f"{where}: a trainable delay cannot move when a blocking or buffered message is used, as the step "
@@ -68,8 +68,8 @@ class Connection:
             )
         if self.averaged and not isinstance(input_node, BaseWorld):
             raise UsageError(f"{where}: interp='zoh_mean' is for inputs of a world", hint="use 'zoh' or 'linear'")
-        if self.averaged and window > 1:
-            raise UsageError(f"{where}: interp='zoh_mean' makes one message of all, it has no window of {window}")
+        if self.averaged and self.window > 1:
+            raise UsageError(f"{where}: interp='zoh_mean' makes one message of all, it has no window of {self.window}")
 
     @property
     def trainable(self) -> bool:
@@ -137,10 +137,8 @@ class BaseNode:
         order: int | None = None,
     ) -> None:
         where = f"node {name!r}"
-        if not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
-            raise UsageError(f"{where}: rate must be a positive number of hertz, got {rate!r}")
         self.name = name
-        self.rate = float(rate)
+        self.rate = _rate(rate, where)
         self.delay_dist = _as_distribution(delay_dist, where)
         if isinstance(self.delay_dist, TrainableDist):
             raise UsageError(
@@ -183,6 +181,11 @@ class BaseNode:
         Raises:
             UsageError: When the input's name is taken or an option makes no sense.
         """
+        if not isinstance(output_node, BaseNode):
+            raise UsageError(
+                f"node {self.name!r}: connect takes the node that sends, got {output_node!r}",
+                hint="pass the node itself, not its name",
+            )
         name = name or output_node.name
         if name in self.inputs:
             raise UsageError(
@@ -270,10 +273,8 @@ class BaseWorld(BaseNode):
     """
 
     def __init__(self, name: str, rate: float, color: str | None = None, order: int | None = None) -> None:
-        if not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
-            raise UsageError(f"node {name!r}: rate must be a positive number of hertz, got {rate!r}")
         # A hair less than the period: the end of a tick is never taken for the start of the next but one.
-        busy = 0.999 / rate
+        busy = 0.999 / _rate(rate, f"node {name!r}")
         super().__init__(name, rate, delay=busy, delay_dist=StaticDist(busy), color=color, order=order)
 
 
@@ -315,7 +316,24 @@ def _as_distribution(dist: Any, where: str) -> DelayDistribution:
 
 
 def _expected_delay(delay: float | None, dist: DelayDistribution, where: str) -> float:
-    value = dist.quantile(0.99) if delay is None else float(delay)
-    if not (math.isfinite(value) and value >= 0):
-        raise UsageError(f"{where}: the expected delay must be finite and at least 0 s, got {value}")
+    value = dist.quantile(0.99) if delay is None else delay
+    if not (isinstance(value, Real) and math.isfinite(value) and value >= 0):
+        raise UsageError(f"{where}: the expected delay must be finite and at least 0 s, got {value!r}")
+    return float(value)
+
+
+def _rate(rate: Any, where: str) -> float:
+    value = float(rate) if isinstance(rate, Real) else math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise UsageError(f"{where}: rate must be a positive number of hertz, got {rate!r}")
     return value
+
+
+def _whole(window: Any, where: str) -> int:
+    try:
+        count = operator.index(window)
+    except TypeError:
+        count = 0
+    if count < 1:
+        raise UsageError(f"{where}: window must be a whole number of messages, at least 1, got {window!r}")
+    return count

@@ -7,11 +7,14 @@ measured times; here they act on all episodes at once. ``docs/timing.md`` draws 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.collection import by_name, check_senders
+from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, Jitter, Scheduling, phase_ticks, to_ticks
 from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
@@ -86,7 +89,7 @@ def quota(connection: Connection, k: np.ndarray | int) -> np.ndarray:
 
 
 def draw(
-    nodes: Mapping[str, BaseNode],
+    nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
     duration_s: float,
     episodes: int = 1,
     rng: np.random.Generator | int = 0,
@@ -95,15 +98,22 @@ def draw(
     """Draw timelines: sample every delay, then apply the rules.
 
     Args:
-        nodes: The nodes by name.
+        nodes: The nodes, by name or as a list.
         duration_s: Steps that start before this time belong to the timeline [s].
         episodes: How many timelines; ignored with ``recorded``.
         rng: Generator or seed of the delays.
         recorded: Vertices and edges that are kept as they are; only what is missing is drawn (say, a simulated world).
 
     Raises:
-        UsageError: On an algebraic loop, a duration that holds no step, or ``advance`` without a blocking input.
+        UsageError: On an algebraic loop, a duration that holds no step, ``advance`` without a blocking input, a sender
+            that is not in the graph, or a distribution that draws what is no delay.
     """
+    nodes = by_name(nodes)
+    check_senders(nodes)
+    if not (math.isfinite(duration_s) and episodes >= 1):
+        raise UsageError(
+            f"{episodes} timelines of {duration_s} s cannot be drawn", hint="draw one or more, of a few seconds"
+        )
     rng = np.random.default_rng(rng)
     kept = recorded or Timeline({}, {})
     episodes = kept.episodes if recorded else episodes
@@ -113,15 +123,10 @@ def draw(
     transfers = {}
     for node in nodes.values():
         for c in node.inputs.values():
-            if c.output_node.name not in nodes:
-                raise UsageError(
-                    f"node {node.name!r} listens to {c.output_node.name!r}, which is not in the graph. "
-                    f"Nodes: {', '.join(nodes)}"
-                )
             if (node.name, c.name) not in kept.edges:
                 sender = kept.vertices.get(c.output_node.name)
                 count = sender.start.shape[1] if sender else delays[c.output_node.name].shape[1]
-                transfers[node.name, c.name] = _to_ticks(c.delay_dist.sample(rng, (episodes, count)))
+                transfers[node.name, c.name] = _sampled(c.delay_dist, rng, (episodes, count), repr(c))
     return derive(nodes, delays, transfers, to_ticks(duration_s), kept)
 
 
@@ -207,10 +212,17 @@ def _delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Gen
             f"node {node.name!r} makes no step within {duration_s} s: its first is due after {node.phase} s",
             hint="draw longer timelines",
         )
-    return _to_ticks(node.delay_dist.sample(rng, (episodes, count)))
+    return _sampled(node.delay_dist, rng, (episodes, count), f"node {node.name!r}")
 
 
-def _to_ticks(seconds: np.ndarray) -> np.ndarray:
+def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """Return delays in ticks; a distribution may be a user's own."""
+    seconds = np.asarray(dist.sample(rng, shape))
+    if seconds.shape != shape or not np.isfinite(seconds).all() or (seconds < 0).any():
+        raise UsageError(
+            f"{where}: {dist!r} draws what are no delays: {seconds.ravel()[:3]} of shape {seconds.shape}",
+            hint=f"sample() returns finite seconds of at least 0, of the shape that is asked for, here {shape}",
+        )
     return np.floor(seconds * TICKS_PER_S + 0.5).astype(np.int64)
 
 

@@ -18,7 +18,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
-from sim2real.runtime.fit import check_fit, nodes_of
+from sim2real.runtime.fit import check_fit, nodes_of, supervisor_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.program import Rollout, RowProgram
 from sim2real.runtime.walk import Walk
@@ -34,7 +34,8 @@ class CompiledGraph:
     for programs that look at every row anyway; in some of them the supervisor makes no step.
 
     Running past the end, or stepping before a reset, is an error; so is mixing the ways. Where ``jit`` or ``vmap`` hide
-    where a state stands, running past the end cannot be seen: what the supervisor gets has ``seq`` -1 then.
+    where a state stands, running past the end cannot be seen: then the state stays as it is at the end, and what the
+    supervisor gets has ``seq`` -1.
 
     Args:
         nodes: The nodes, by name or as a list. Those that the timeline does not hold are left out.
@@ -54,10 +55,10 @@ class CompiledGraph:
         given: Mapping[str, Any] | None = None,
     ) -> None:
         self.nodes = nodes_of(nodes, timeline)
-        self.supervisor = supervisor if isinstance(supervisor, str) else supervisor.name
+        self.supervisor = supervisor_of(supervisor, self.nodes)
         self.timeline = timeline
         self.given = tuple(given or ())
-        check_fit(self.nodes, timeline, self.given)
+        check_fit(self.nodes, timeline, given or {})
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes)
         self._walk = Walk(self.program, self.supervisor)
@@ -100,6 +101,7 @@ class CompiledGraph:
         gs = init_graph_state(self.nodes, self.supervisor, rng, params, order)
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
+        self.program.check_given(outputs)
         buffer |= {name: outputs[name] for name in self.given}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
         # The row is numpy's: what follows in the same program sees that it is the first.

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import jax
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import NEVER, Timeline
 
@@ -17,24 +20,33 @@ def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timel
     Raises:
         UsageError: When two have the same name, or one of the timeline's is missing.
     """
-    found: dict[str, BaseNode] = {}
-    for node in nodes.values() if isinstance(nodes, Mapping) else nodes:
-        if node.name in found:
-            raise UsageError(f"two nodes are called {node.name!r}", hint="names are unique in a graph")
-        found[node.name] = node
+    found = by_name(nodes)
     lost = [n for n in timeline.vertices if n not in found]
     if lost:
         raise UsageError(f"the timeline holds node {lost[0]!r}, which was not given. Nodes: {', '.join(found)}")
     return {n: node for n, node in found.items() if n in timeline.vertices}
 
 
-def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Sequence[str]) -> None:
+def supervisor_of(supervisor: Any, nodes: Mapping[str, BaseNode]) -> str:
+    """Return the supervisor's name, given that or the node itself.
+
+    Raises:
+        UsageError: When it is neither, or another object than the node of its name.
+    """
+    if not isinstance(supervisor, str | BaseNode):
+        raise UsageError(f"the supervisor is one node, or its name, got {supervisor!r}")
+    if isinstance(supervisor, BaseNode) and nodes.get(supervisor.name, supervisor) is not supervisor:
+        raise UsageError(f"the supervisor {supervisor!r} is another object than the node of its name in the graph")
+    return supervisor if isinstance(supervisor, str) else supervisor.name
+
+
+def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[str, Any]) -> None:
     """Check that nodes, connections and timeline fit each other, and that the nodes can be compiled.
 
     Args:
         nodes: The nodes of the timeline, by name.
         timeline: What ran when.
-        given: Names of nodes whose outputs are known, so that they do not run.
+        given: Nodes that do not run, as their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
     Raises:
         UsageError: When they do not.
@@ -45,11 +57,14 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Sequence
                 f"node {name!r} steps in plain Python (jittable = False) and cannot be compiled",
                 hint="give its recorded outputs, or put a simulated node in its place",
             )
+    check_senders(nodes, among=nodes)
     unknown = [n for n in given if n not in nodes]
     if unknown:
         raise UsageError(
             f"the outputs of {unknown[0]!r} are given, which is not in the graph. Nodes: {', '.join(nodes)}"
         )
+    for name, recorded in given.items():
+        _check_given(name, recorded, timeline)
     wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
     for name, input_name in sorted(wanted - set(timeline.edges)):
         raise UsageError(
@@ -70,4 +85,17 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Sequence
                 f"the messages for input {input_name!r} of node {name!r} are not one for each step of {edge.sender!r}, "
                 "consumed in order",
                 hint="make timelines with draw() or Timeline.from_episode()",
+            )
+
+
+def _check_given(name: str, recorded: Any, timeline: Timeline) -> None:
+    """Check that there is a recorded output for every step of every episode."""
+    steps = int(timeline.vertices[name].count.max(initial=0))
+    for path, leaf in jax.tree_util.tree_flatten_with_path(recorded)[0]:
+        shape = np.shape(leaf)
+        if len(shape) < 2 or shape[0] != timeline.episodes or shape[1] < steps:
+            raise UsageError(
+                f"the given outputs of node {name!r}{jax.tree_util.keystr(path)} have shape {shape}: its timeline has "
+                f"{timeline.episodes} episodes of up to {steps} steps",
+                hint=f"give leaves of shape ({timeline.episodes}, {steps}, ...), an output for each step",
             )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
+from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, phase_ticks
 from sim2real.graph.schedule import waits_for_schedule
@@ -25,26 +26,10 @@ def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: Base
     Raises:
         UsageError: When names clash, a sender is missing, connections form a loop, or ``advance`` cannot work.
     """
-    given = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
-    if not any(node is supervisor for node in given):
-        given.append(supervisor)
-    found: dict[str, BaseNode] = {}
-    for node in given:
-        if node.name in found:
-            raise UsageError(f"two nodes are called {node.name!r}", hint="names are unique in a graph")
-        found[node.name] = node
-    if isinstance(nodes, Mapping):
-        for key, node in nodes.items():
-            if key != node.name:
-                raise UsageError(f"the key {key!r} stands for a node that is called {node.name!r}")
+    found = by_name(nodes)
+    found = found if found.get(supervisor.name) is supervisor else by_name([*found.values(), supervisor])
+    check_senders(found)
     for node in found.values():
-        for c in node.inputs.values():
-            if found.get(c.output_node.name) is not c.output_node:
-                raise UsageError(
-                    f"node {node.name!r} listens to {c.output_node.name!r}, which is not in the graph. "
-                    f"Nodes: {', '.join(found)}",
-                    hint="pass every node that another one listens to",
-                )
         phase_ticks(node)
         waits_for_schedule(node)
     return found

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.runtime.match import matched
+from sim2real.runtime.match import check_match, matched
 from sim2real.runtime.wiring import SlotTable, Wiring
 
 
@@ -44,6 +44,12 @@ class RowProgram:
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
+
+    def check_given(self, outputs: Mapping[str, Any]) -> None:
+        """Check that recorded outputs look like the default ``outputs`` of their nodes."""
+        for name, recorded in self._given.items():
+            one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
+            check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
 
     def run_slots(
         self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]], inside: bool = False
@@ -149,7 +155,7 @@ class RowProgram:
 
         def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
             filled = seq.reshape(-1, *[1] * default.ndim) >= 0
-            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default.astype(recorded.dtype))
+            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default)
 
         return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
 

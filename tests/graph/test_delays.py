@@ -19,7 +19,7 @@ def generator():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("dist", [0.01, 0, distrax.Deterministic(0.01), distrax.Normal(0.01, 0.0)])
+@pytest.mark.parametrize("dist", [0.01, np.float32(0.01), 0, distrax.Deterministic(0.01), distrax.Normal(0.01, 0.0)])
 def test_constants(dist):
     d = StaticDist(dist)
     expected = 0 if dist == 0 else 0.01
@@ -58,7 +58,12 @@ def test_other_distributions_answer_from_samples():
     assert d.quantile(0.9) == pytest.approx(stats.gamma.ppf(0.9, 2.0, scale=0.01), rel=0.03)
 
 
-@pytest.mark.parametrize("bad", [-0.1, float("nan"), "0.1", distrax.Deterministic(-1.0)])
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    "bad", [-0.1, NAN, np.float32("inf"), "0.1", distrax.Deterministic(-1.0), distrax.Normal(NAN, 0.1)]
+)
 def test_what_is_no_delay_is_refused(bad):
     with pytest.raises(UsageError):
         StaticDist(bad)
@@ -163,6 +168,20 @@ def test_zoh_against_the_letter(sent, ts_ms, delay_ms, window, skip):
     to_us = lambda t: [round(x * 1e6) for x in t]  # noqa: E731 - ties are decided on ticks
     expected = slow_zoh(round(ts * 1e6), to_us(sent), values, round(delay * 1e6), window, skip)
     np.testing.assert_array_equal(got, [-7.0 if v is None else v for v in expected])
+
+
+@pytest.mark.parametrize("interp", ["zoh", "linear", "zoh_mean"])
+def test_a_message_is_received_its_delay_after_it_was_sent(interp):
+    """Not the least delay, with which the timeline was built: a policy may look at the age of what it uses."""
+    ts, sent = 0.2, [0.13, 0.152, 0.171]
+    dist = TrainableDist.create(0.033, LOW, HIGH, interp)
+    wide, age = window_of(ts, sent, [1.0, 2.0, 3.0], 5, 0.5, ts - LOW)
+    got = dist.apply(wide, age, 1, PERIOD, ts)
+    assert float(got.ts_recv[-1] - got.ts_sent[-1]) == pytest.approx(0.033, abs=1e-6)
+    assert float(got.ts_recv[-1]) <= ts + 1e-6
+    empty, age = window_of(ts, [], [], 5, 0.5, ts)
+    empty = empty.replace(ts_recv=jnp.zeros(5))
+    assert float(dist.apply(empty, age, 1, PERIOD, ts).ts_recv[-1]) == 0.0
 
 
 @settings(max_examples=150)

@@ -17,8 +17,21 @@ def test_a_rate_is_a_positive_number(rate):
             cls("n", rate)
 
 
-@pytest.mark.parametrize("options", [{"delay": -0.1}, {"delay": float("nan")}, {"delay_dist": -1}, {"delay_dist": "x"}])
-def test_delays_are_checked_and_named(options):
+def test_numbers_may_be_numpy_s():
+    node = BaseNode("n", np.int64(50), delay=np.float64(0.002), delay_dist=np.float32(0.001))
+    assert (type(node.rate), node.rate, node.delay) == (float, 50.0, 0.002)
+    assert BaseWorld("w", np.float32(50)).rate == 50.0
+    connection = node.connect(BaseNode("a", 10), window=np.int32(3), delay_dist=np.float32(0.25))
+    assert (type(connection.window), connection.total_window, connection.delay) == (int, 3, 0.25)
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize("value", [-0.1, NAN, "x"])
+@pytest.mark.parametrize("option", ["delay", "delay_dist"])
+def test_delays_are_checked_and_named(option, value):
+    options = {option: value}
     with pytest.raises(UsageError, match="node 'n'"):
         BaseNode("n", 10, **options)
     a, b = BaseNode("a", 10), BaseNode("b", 10)
@@ -28,9 +41,15 @@ def test_delays_are_checked_and_named(options):
     assert not a.outputs
 
 
-def test_a_window_holds_at_least_one():
-    with pytest.raises(UsageError, match="window must be at least 1, got 0"):
-        BaseNode("b", 1).connect(BaseNode("a", 1), window=0)
+@pytest.mark.parametrize("window", [0, 1.5, "2", None])
+def test_a_window_is_a_whole_number_of_at_least_one(window):
+    with pytest.raises(UsageError, match=f"'a' -> 'b'.* window must be a whole number.* at least 1, got {window!r}"):
+        BaseNode("b", 1).connect(BaseNode("a", 1), window=window)
+
+
+def test_only_nodes_can_be_connected():
+    with pytest.raises(UsageError, match="node 'b': connect takes the node that sends, got 'p'"):
+        BaseNode("b", 1).connect("p")
 
 
 def test_a_taken_name_is_refused_with_a_way_out():

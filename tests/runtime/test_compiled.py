@@ -219,6 +219,26 @@ def test_what_does_not_fit_is_refused():
         CompiledGraph([*nodes.values(), nodes["world"]], supervisor, timeline)
     with pytest.raises(UsageError, match="'nobody' are given"):
         CompiledGraph(nodes, supervisor, timeline, given={"nobody": None})
+    for given, words in (
+        (np.zeros((1, 3), np.uint32), r"'actuator'.x have shape \(1, 3\): its timeline has 1 episodes of up to 2"),
+        (np.zeros((2, 30), np.uint32), r"'actuator'.x have shape \(2, 30\)"),
+        (np.uint32(3), r"'actuator'.x have shape \(\)"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            CompiledGraph(nodes, supervisor, timeline, given={"actuator": Value(x=given)})
+    for given in (Value(x=np.zeros((1, 30))), Value(x=np.zeros((1, 30, 2), np.uint32)), np.zeros((1, 30), np.uint32)):
+        other = CompiledGraph(nodes, supervisor, timeline, given={"actuator": given})
+        with pytest.raises(UsageError, match="'actuator': an output that is given for it differs"):
+            other.init(KEY)
+    for wrong in (["policy"], None):
+        with pytest.raises(UsageError, match="the supervisor is one node, or its name"):
+            CompiledGraph(nodes, wrong, timeline)
+    with pytest.raises(UsageError, match=r"supervisor .*rate=7.* is another object than the node of its name"):
+        CompiledGraph(nodes, jax_hash_node("policy", 7, False), timeline)
+    world = CompiledGraph(nodes, "world", timeline)
+    for call in (world.reset, world.observe, world.step):
+        with pytest.raises(UsageError, match="supervisor 'world' is the world: it ticks in every row"):
+            call(world.init(KEY))
     nodes["policy"].connect(nodes["world"], name="more")
     with pytest.raises(UsageError, match="no messages for input 'more' of node 'policy'"):
         CompiledGraph(nodes, nodes[supervisor], timeline)
@@ -299,7 +319,8 @@ class Follower(Ramp):
 
     def step(self, step_state):
         window = step_state.inputs["world"]
-        return step_state, Value(x=jnp.sum(window.data.x * jnp.arange(1.0, window.seq.shape[0] + 1.0)))
+        age = jnp.sum(step_state.ts - window.ts_recv)  # shows in the output, as a policy might look at it
+        return step_state, Value(x=jnp.sum(window.data.x * jnp.arange(1.0, window.seq.shape[0] + 1.0)) + 0.1 * age)
 
 
 def delayed(to_world, to_sensor, window=1):

@@ -1,0 +1,106 @@
+"""What a step returns must look like what it got; only what JAX itself takes for the same may differ."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.graph import BaseNode
+from sim2real.graph.schedule import draw
+from sim2real.graph.testing import Value
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.match import matched
+
+FLOAT, INT = jnp.float32(1.0), jnp.int32(1)
+
+
+@pytest.mark.parametrize(
+    ("got", "like"),
+    [(0.5, FLOAT), (0, FLOAT), (np.float64(0.5), FLOAT), (2, INT), (True, jnp.bool_(False)), (jnp.asarray(0.5), FLOAT),
+     (3, jnp.uint8(0)), (np.zeros(2), jnp.zeros(2))],
+)  # fmt: skip
+def test_the_same_in_other_words_passes(got, like):
+    found = matched("n", "it", got, "that", like)
+    assert (found.dtype, found.shape) == (like.dtype, like.shape)
+    np.testing.assert_array_equal(found, got)
+
+
+@pytest.mark.parametrize(
+    ("got", "like", "words"),
+    [
+        (0.5, INT, r"float32\[\] instead of int32\[\]"),
+        (FLOAT, INT, r"float32\[\] instead of int32\[\]"),
+        (INT, FLOAT, r"int32\[\] instead of float32\[\]"),
+        (jnp.zeros(3), FLOAT, r"float32\[3\] instead of float32\[\]"),
+        ("x", FLOAT, r"str instead of float32\[\]"),
+    ],
+)
+def test_another_type_is_refused_by_name(got, like, words):
+    with pytest.raises(UsageError, match=rf"node 'n': it differs from that: \.x is {words}"):
+        matched("n", "it", Value(x=got), "that", Value(x=like))
+    with pytest.raises(UsageError, match="node 'n': it differs from that: "):
+        matched("n", "it", {"y": got}, "that", {"x": like})
+
+
+class Sensor(BaseNode):
+    """The usual slip: 0 where 0.0 was meant."""
+
+    def init_state(self, rng=None, graph_state=None):
+        return 0.0 if "output" in self.name else 0
+
+    def init_output(self, rng=None, graph_state=None):
+        return Value(x=0 if "output" in self.name else 0.0)
+
+    def step(self, step_state):
+        th = step_state.state + (0.25 if "int" in self.name else 1)
+        return step_state.replace(state=th), Value(x=0.1 * th)
+
+
+class Agent(BaseNode):
+    """Hears the sensor."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Value(x=0.0)
+
+    def step(self, step_state):
+        sensor = next(iter(step_state.inputs.values()))
+        return step_state, Value(x=sensor[-1].data.x * 1.0)
+
+
+def graph(name):
+    sensor, agent = Sensor(name, 10), Agent("agent", 10)
+    agent.connect(sensor)
+    sensor.connect(agent, skip=True)
+    nodes = [sensor, agent]
+    return nodes, agent, draw(nodes, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("int state", r"the state that step returns differs .* the value is float32\[\] instead of int32\[\]"),
+     ("int output", r"the output of step differs .* \.x is float32\[\] instead of int32\[\]")],
+)  # fmt: skip
+def test_no_angle_becomes_0_because_init_said_0(name, words):
+    nodes, agent, timeline = graph(name)
+    compiled = CompiledGraph(nodes, agent, timeline)
+    with pytest.raises(UsageError, match=f"node {name!r}: {words}"):
+        jax.eval_shape(lambda: compiled.rollout(compiled.init(jax.random.key(0))))
+    simulated = AsyncGraph(nodes, agent, Clock.SIMULATED, timeline=timeline)
+    with pytest.raises(UsageError, match=f"node {name!r}: {words}"):
+        simulated.warmup(simulated.init(jax.random.key(0)))
+
+
+def test_what_a_caller_puts_in_is_checked_too():
+    nodes, agent, timeline = graph("whole")
+    compiled = CompiledGraph(nodes, agent, timeline)
+    start = jax.eval_shape(lambda: compiled.reset(compiled.init(jax.random.key(0)))[0])
+    for output, words in (
+        (Value(x=jnp.zeros(2)), r"\.x is float32\[2\] instead of float32\[\]"),
+        (Value(x=jnp.int32(1)), r"\.x is int32\[\] instead of float32\[\]"),
+        (jnp.float32(1.0), "instead of PyTreeDef"),
+    ):
+        with pytest.raises(UsageError, match=f"'agent': the output of step differs .*: .*{words}"):
+            jax.eval_shape(lambda s, o=output: compiled.step(s, output=o), start)
