@@ -214,8 +214,8 @@ def bytes_per_copy(graph: CompiledGraph) -> int:
     )
 
 
-def case(device: str, kind: str, copies: int, repeats: int) -> list[dict]:
-    """Measure one kind of timelines at one number of copies."""
+def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[int] = ()) -> list[dict]:
+    """Measure one kind of timelines at one number of copies; with ``unrolls`` also other rows per pass of the loop."""
     rates, ticks = CASES[kind]
     graph_nodes = nodes(*rates)
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, kind == "hiccups"))
@@ -229,9 +229,17 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[dict]:
         "unrolled": hand_program(pattern_rows, ticks, world, unroll_of(1) if len(ticks) == 1 else 1),
         "graph": graph_program(graph),
     }
+    others = {}
+    for count in unrolls:
+        other = CompiledGraph(graph_nodes, "agent", graph.timeline)
+        other.rows_per_pass = count
+        others[f"rows_per_pass/{count}"] = graph_program(other)
+    programs |= others
     seconds, compile_s = compare(programs, jax.random.split(jax.random.key(0), copies), repeats)
     # The programs may differ by a tick or two in length: compared per tick.
-    per_tick = {n: s / (total if n == "graph" else pattern_rows * sum(ticks)) for n, s in seconds.items()}
+    per_tick = {
+        n: s / (total if n == "graph" or n in others else pattern_rows * sum(ticks)) for n, s in seconds.items()
+    }
     policy_steps = float(graph.timeline.vertices["agent"].count.mean())
     report = graph.report()
     print(kind, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
@@ -246,6 +254,7 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[dict]:
         row(f"{label}/over_bare", round(over["bare"], 3), "1", "physics alone"),
         row(f"{label}/agent_steps_per_s", round(rate), "1/s", f"{hand_rate:.3g} by hand"),
         row(f"{label}/compile_s", round(compile_s["graph"], 2), "s", f"{compile_s['hand']:.2f} by hand", "< 5"),
+        *(row(f"{label}/{n}/over_hand", round(per_tick[n] / per_tick["hand"], 3), "1", "hand-written") for n in others),
     ]
 
 
@@ -275,13 +284,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--build", type=int, nargs="+", default=[1_000, 10_000], help="episodes to draw and to wire")
     parser.add_argument("--mjx", type=int, default=64, help="copies of the MJX arm; 0 leaves it out")
     parser.add_argument("--links", type=int, default=6, help="links of the MJX arm")
+    parser.add_argument("--unroll", type=int, nargs="+", default=[], help="other numbers of rows in a pass of the loop")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Measure on the device that JAX finds."""
     device = f"graph/{options.name or jax.default_backend()}"
     copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
-    rows = [r for count in copies for kind in options.cases for r in case(device, kind, count, options.repeats)]
+    cases = [(device, kind, count, options.repeats, options.unroll) for count in copies for kind in options.cases]
+    rows = [r for arguments in cases for r in case(*arguments)]
     if options.mjx:
         from benches.graph_mjx import mjx_case  # MuJoCo is not needed without it
 

@@ -7,6 +7,7 @@ of each, an episode and a row.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import jax
@@ -43,6 +44,9 @@ class CompiledGraph:
         timeline: What ran when, in one or more episodes.
         given: Nodes that are not run, as their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
+    Attributes:
+        rows_per_pass: Rows that a pass of ``rollout``'s loop holds; a program gets longer with them.
+
     Raises:
         UsageError: When nodes, connections and timeline do not fit each other.
     """
@@ -62,6 +66,7 @@ class CompiledGraph:
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes)
         self._walk = Walk(self.program, self.supervisor)
+        self.rows_per_pass = self._rows_per_pass()
 
     @property
     def rows(self) -> int:
@@ -192,10 +197,7 @@ class CompiledGraph:
             kept = {n: outputs.get(n, []) for n in record}
             return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
 
-        # Two rows a pass: a GPU then copies what is carried half as often (0.8 times the time of one a pass at 100,000
-        # pendulums on an H200; four cost more). A CPU only compiles longer.
-        unroll = 1 if jax.default_backend() == "cpu" else 2
-        gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
+        gs, records = jax.lax.scan(body, gs, length=rows, unroll=self.rows_per_pass)
         merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
         return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
@@ -253,6 +255,19 @@ class CompiledGraph:
         outputs: dict[str, list[Rollout]] = {}
         gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside)
         return self.program.run_world(gs, outputs, inside), outputs
+
+    def _rows_per_pass(self) -> int:
+        """Return how many rows a pass of ``rollout``'s loop holds.
+
+        A CPU only compiles longer with several. A GPU copies what is carried half as often with two (0.8 times the
+        time of one at 100,000 pendulums on an H200; four cost more); where steps and ticks do not divide, with as many
+        as their pattern has steps, as in a program that is written by hand: three at 30 Hz over 100 Hz.
+        """
+        if jax.default_backend() == "cpu":
+            return 1
+        world = self.nodes.get(self.wiring.world or "")
+        ratio = world.rate / self.nodes[self.supervisor].rate if world else 1.0
+        return max(2, Fraction(ratio).limit_denominator(4).denominator)
 
     def _awaited(self, gs: GraphState, call: str) -> Any:
         """Return which step of the supervisor awaits."""
