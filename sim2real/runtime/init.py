@@ -26,6 +26,8 @@ def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: Base
     Raises:
         UsageError: When names clash, a sender is missing, connections form a loop, or ``advance`` cannot work.
     """
+    if not isinstance(supervisor, BaseNode):
+        raise UsageError(f"the supervisor is one node, got {supervisor!r}", hint="pass the node itself, not its name")
     found = by_name(nodes)
     found = found if found.get(supervisor.name) is supervisor else by_name([*found.values(), supervisor])
     check_senders(found)

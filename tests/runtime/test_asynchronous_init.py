@@ -85,3 +85,9 @@ def test_collect_checks_the_graph():
         collect([eager], eager)
     with pytest.raises(UsageError, match="no default output"):
         default_output(init_graph_state({"a": nodes["a"]}, "a", KEY), "b")
+
+
+@pytest.mark.parametrize("wrong", ["a", None, ["a", "b"]])
+def test_the_supervisor_is_one_node(wrong):
+    with pytest.raises(UsageError, match="the supervisor is one node, got "):
+        collect(graph(), wrong)

@@ -1,32 +1,28 @@
 """Which slots a row has: tables alone, nothing is compiled."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim2real.errors import UsageError
-from sim2real.graph import EmpiricalDist
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import hash_node, random_graph
+from sim2real.graph.testing import hash_node, jax_hash_node, random_graph
+from sim2real.runtime.compiled import CompiledGraph
 from sim2real.runtime.wiring import wire
 
 
-def robot(rates, shares, jitter=0.0, seed=0, blocking=()):
+def robot(rates, shares, blocking=(), make=hash_node):
     """World, sensor, agent and actuator; delays as shares of periods, so that nobody overruns."""
-    rng = np.random.default_rng(seed)
-
-    def delay(share, rate):
-        return EmpiricalDist(share / rate * (1.0 + jitter * rng.uniform(-1.0, 1.0, 200)), block=1)
-
     world, sensor, agent, actuator = (
-        hash_node(n, rate, n == "world", **({} if n == "world" else {"delay_dist": delay(share, rate)}))
+        make(n, rate, n == "world", **({} if n == "world" else {"delay_dist": share / rate}))
         for n, rate, share in zip(("world", "sensor", "agent", "actuator"), rates, (0.0, *shares[:3]), strict=True)
     )
-    sensor.connect(world, delay_dist=delay(shares[3], rates[0]))
-    agent.connect(sensor, blocking="agent" in blocking, window=2, delay_dist=delay(shares[4], rates[1]))
-    actuator.connect(agent, blocking="actuator" in blocking, delay_dist=delay(shares[5], rates[2]))
-    world.connect(actuator, skip=True, delay_dist=delay(shares[6], rates[0]))
+    sensor.connect(world, delay_dist=shares[3] / rates[0])
+    agent.connect(sensor, blocking="agent" in blocking, window=2, delay_dist=shares[4] / rates[1])
+    actuator.connect(agent, blocking="actuator" in blocking, delay_dist=shares[5] / rates[2])
+    world.connect(actuator, skip=True, delay_dist=shares[6] / rates[0])
     return {n.name: n for n in (world, sensor, agent, actuator)}
 
 
@@ -34,6 +30,13 @@ def steps_in_a_row(wiring, name):
     """Return the most steps that a node makes in one row."""
     made = [t.seq >= 0 for t, n in zip(wiring.tables, wiring.slots, strict=True) if n == name]
     return int(np.sum(made, axis=0).max())
+
+
+def test_such_a_robot_can_be_trained_row_by_row():
+    twins = robot(RATES[0], [0.1, 0.1, 0.05, 0.1, 0.1, 0.05, 0.2], make=jax_hash_node)
+    graph = CompiledGraph(twins, "agent", draw(twins, 1.0))
+    gs, step_state, acts = jax.eval_shape(lambda: graph.observe(graph.init(jax.random.key(0))))
+    assert (acts.shape, step_state.seq.shape, set(gs.seq)) == ((), (), {"agent"})
 
 
 RATES = [(100, 100, 50, 50), (200, 200, 50, 50), (500, 100, 50, 50), (200, 100, 50, 50), (500, 500, 100, 100)]
