@@ -12,6 +12,9 @@ from sim2real.graph.testing import hash_node, jax_hash_node, random_graph
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.runtime.wiring import wire
 
+RATES = [(100, 100, 50, 50), (200, 200, 50, 50), (500, 100, 50, 50), (200, 100, 50, 50), (500, 500, 100, 100)]
+"""Of world, sensor, agent and actuator [Hz]."""
+
 
 def robot(rates, shares, blocking=(), make=hash_node):
     """World, sensor, agent and actuator; delays as shares of periods, so that nobody overruns."""
@@ -37,9 +40,6 @@ def test_such_a_robot_can_be_trained_row_by_row():
     graph = CompiledGraph(twins, "agent", draw(twins, 1.0))
     gs, step_state, acts = jax.eval_shape(lambda: graph.observe(graph.init(jax.random.key(0))))
     assert (acts.shape, step_state.seq.shape, set(gs.seq)) == ((), (), {"agent"})
-
-
-RATES = [(100, 100, 50, 50), (200, 200, 50, 50), (500, 100, 50, 50), (200, 100, 50, 50), (500, 500, 100, 100)]
 
 
 @pytest.mark.parametrize("rates", RATES, ids=str)
