@@ -201,8 +201,12 @@ class CompiledGraph:
         merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
         return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
-    def observe(self, gs: GraphState) -> tuple[GraphState, StepState, Any]:
+    def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Any]:
         """Run the slots of a row before the supervisor's, and return what it sees.
+
+        Args:
+            gs: A state at the start of a row.
+            inside: Promises that this is not behind the last row, as episodes end before: nothing is selected then.
 
         Returns:
             The graph's state, the supervisor's step state, and whether it makes a step in this row.
@@ -212,15 +216,17 @@ class CompiledGraph:
         """
         self._check_row_start(gs, "observe")
         turn = self._walk.only_turn()
-        gs = self.program.run_slots(gs, 0, turn, {}, inside=not _traced(gs.step))
-        step_state = self.program.step_state(gs, turn)
+        inside = inside or not _traced(gs.step)
+        gs = self.program.run_slots(gs, 0, turn, {}, inside)
+        step_state = self.program.step_state(gs, turn, inside)
         return _replace(gs, seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
-    def advance(self, gs: GraphState, step_state: StepState, output: Any) -> GraphState:
+    def advance(self, gs: GraphState, step_state: StepState, output: Any, inside: bool = False) -> GraphState:
         """Put in the supervisor's step and run the rest of the row; the counterpart of ``observe``."""
         turn, k = self._walk.only_turn(), self._awaited(gs, "advance")
-        gs = self.program.commit(_replace(gs, seq={}), self.supervisor, step_state, output, k >= 0)
-        inside = not _traced(gs.step)
+        inside = inside or not _traced(gs.step)
+        ran = None if inside and self.program.always(turn) else k >= 0
+        gs = self.program.commit(_replace(gs, seq={}), self.supervisor, step_state, output, ran)
         gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
         return self.program.run_world(gs, {}, inside)
 

@@ -51,6 +51,10 @@ class RowProgram:
             one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
             check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
 
+    def always(self, slot: int) -> bool:
+        """Return whether a slot makes a step in every row of every episode."""
+        return self._always[slot]
+
     def run_slots(
         self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]], inside: bool = False
     ) -> GraphState:

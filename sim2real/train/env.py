@@ -80,7 +80,8 @@ class GraphEnvironment:
         self.graph, self.task = graph, task
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high
-        # The last row's observation would lie behind the end of the tables.
+        # The last row's observation would lie behind the end of the tables. As episodes end before it, no row has to
+        # ask whether it is inside: physics run unmasked.
         self.length = graph.rows - 1
         # Traced once each, for shapes, rollouts and evaluations alike: of MuJoCo's worlds that takes 5 s every time.
         self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
@@ -90,7 +91,7 @@ class GraphEnvironment:
         k_eps, k_params, k_init = jax.random.split(key, 3)
         eps = jax.random.randint(k_eps, (), 0, self.graph.episodes)
         gs = self.graph.init(k_init, params=self.task.params(k_params), eps=eps)
-        gs, step_state, _ = self.graph.observe(gs)
+        gs, step_state, _ = self.graph.observe(gs, inside=True)
         state = EnvState(gs, step_state, jnp.float32(0.0), jnp.float32(0.0))
         return state, self.task.observe(step_state)
 
@@ -99,13 +100,13 @@ class GraphEnvironment:
         del key
         valid = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)
-        gs = self.graph.advance(state.graph, step_state, output)
+        gs = self.graph.advance(state.graph, step_state, output, inside=True)
         reward = self.task.reward(gs, action)
         second_half = gs.step > self.length // 2
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
         truncated = gs.step >= self.length
-        gs, step_state, _ = self.graph.observe(gs)
+        gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (self.length - self.length // 2)}
         new = EnvState(gs, step_state, total, good)
         return Step(new, self.task.observe(step_state), reward, jnp.bool_(False), truncated, valid, metrics)
