@@ -30,6 +30,7 @@ EMBEDDED = EmulatorConfig(
     actuation_latency_s=0.025,
     actuation_jitter_s=0.004,
     reply_loss=0.002,
+    model_number=1190,  # an XL330-M077, for 5 V: when its host dies it goes on turning
 )
 """Latencies of the embedded robot; the stages never read them, but ``--reveal`` compares with them."""
 

@@ -17,8 +17,9 @@ from dynamixel_sdk.group_sync_write import GroupSyncWrite
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware import registers as reg
+from sim2real.hardware.guardian import Guardian, torque_off_packet
 from sim2real.hardware.link import BusConfig, BusLink, Transaction, watchdog_message
-from sim2real.hardware.protocol import BROADCAST_ID, Instruction, build
+from sim2real.hardware.models import model
 from sim2real.hardware.registers import OperatingMode, Register
 
 __all__ = ["BusConfig", "ServoBus", "StateReading", "Transaction"]
@@ -52,8 +53,8 @@ class ServoBus:
     """DYNAMIXEL X servos on one port. Every method may be called from any thread.
 
     A missed answer is counted and asked for again; a bus that stays silent raises HardwareLost. Leaving the context,
-    `close`, or the end of the interpreter take the torque off. A signal does not unless its handler calls `make_safe`;
-    a killed host is what the servos' own watchdog is for.
+    `close`, or the end of the interpreter take the torque off. A signal does not unless its handler calls `make_safe`.
+    When this process is killed, or hangs, the guardian takes it off: a process of its own, there before torque goes on.
 
         with ServoBus(BusConfig("/dev/ttyUSB0")) as bus:
             bus.handshake({1: None})
@@ -73,6 +74,7 @@ class ServoBus:
         self.config = config
         self._link = BusLink(config)
         self._ids: tuple[int, ...] = ()
+        self._models: tuple[int, ...] = ()
         self._armed = False
         self._torque_off_packet = b""
         self._halted = False
@@ -106,6 +108,29 @@ class ServoBus:
         """Instructions sent again so far."""
         return self._link.retries
 
+    @property
+    def late_replies(self) -> int:
+        """Answers so far that came too late, or so late that when they were measured is not sure."""
+        return self._link.late_replies
+
+    @property
+    def late_s(self) -> np.ndarray:
+        """By how much each answer so far took longer than its bytes, (N,) [s]."""
+        return np.array(self._link.late_us, np.float64) * 1e-6
+
+    @property
+    def guardian_pid(self) -> int | None:
+        """The guardian's process, once there is one."""
+        return None if self._link.guardian is None else self._link.guardian.pid
+
+    def without_host(self) -> list[str]:
+        """Return for each kind of servo found what it does by itself when this process dies."""
+        kinds: dict[int, list[int]] = {}
+        for servo_id, number in zip(self._ids, self._models, strict=True):
+            kinds.setdefault(number, []).append(servo_id)
+        what = {number: model(number).without_host(self.config.watchdog_s) for number in kinds}
+        return [f"{model(n).name} (servo {', '.join(map(str, ids))}): {what[n]}" for n, ids in kinds.items()]
+
     def handshake(self, expected: Mapping[int, int | None]) -> dict[int, int]:
         """Find the servos; from now on they are the ones whose torque `close` takes off.
 
@@ -121,15 +146,12 @@ class ServoBus:
         models = {servo_id: self._ping(servo_id) for servo_id in expected}
         for servo_id, wanted in expected.items():
             if wanted is not None and models[servo_id] != wanted:
-                names = [reg.MODEL_NAMES.get(model, "unknown") for model in (models[servo_id], wanted)]
+                names = [model(number).name for number in (models[servo_id], wanted)]
                 raise HardwareLost(
                     f"servo {servo_id} is model {models[servo_id]} ({names[0]}), expected {wanted} ({names[1]})"
                 )
-        self._ids = tuple(expected)
-        # Built now, so that make_safe has nothing to compute.
-        head = reg.TORQUE_ENABLE.address.to_bytes(2, "little") + reg.TORQUE_ENABLE.size.to_bytes(2, "little")
-        torque_off = b"".join(bytes((servo_id, 0)) for servo_id in self._ids)
-        self._torque_off_packet = build(BROADCAST_ID, Instruction.SYNC_WRITE, head + torque_off)
+        self._ids, self._models = tuple(expected), tuple(models.values())
+        self._torque_off_packet = torque_off_packet(self._ids)  # now, so that make_safe has nothing to compute
         return models
 
     def scan(self) -> dict[int, int]:
@@ -154,14 +176,18 @@ class ServoBus:
     def torque(self, on: bool) -> None:
         """Switch the torque of all servos; on: with goals at rest (no PWM, no speed, or the present position).
 
-        The bus watchdog is armed once torque is on, and disarmed, which also clears it, before that.
+        The bus watchdog is armed once torque is on, and disarmed, which also clears it, before that. The guardian
+        watches from before torque goes on until it is off.
 
         Raises:
-            SafetyStop: `make_safe` or `close` came before.
+            SafetyStop: `make_safe` or `close` came before, or the guardian has taken over.
+            HardwareLost: A servo does not answer, or the guardian does not start.
         """
         if on and self._halted:
             raise SafetyStop("torque stays off: the bus has been made safe", hint="open the bus again")
         self._armed = False
+        if on:
+            self._guard()
         for servo_id in self._ids:
             if on:
                 self.write(servo_id, reg.BUS_WATCHDOG, 0)
@@ -169,6 +195,8 @@ class ServoBus:
             self.write(servo_id, reg.TORQUE_ENABLE, int(on))
             self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count if on else 0)
         self._armed = on
+        if not on and self._link.guardian is not None:
+            self._link.guardian.disarm()
 
     def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
         """Read position, velocity and load of some servos (default: all) in one transaction."""
@@ -248,18 +276,34 @@ class ServoBus:
     def close(self) -> None:
         """Take the torque off, disarm the watchdogs, close the port. Never raises; closing twice is fine.
 
-        The watchdog of a servo that does not confirm stays armed: it is then what stops that servo.
+        The watchdog of a servo that does not confirm stays armed, and the guardian goes on trying for 10 s.
         """
         if self._link.closed:
             return
         self._halted = True
+        guardian = self._link.guardian
+        if guardian is not None:
+            guardian.settle()
+        confirmed = True
         for servo_id in self._ids:
             if self._link.force(servo_id, reg.TORQUE_ENABLE, 0):
                 self._link.force(servo_id, reg.BUS_WATCHDOG, 0)
             else:
+                confirmed = False
                 _LOGGER.error("servo %d did not confirm that its torque is off", servo_id)
         self._link.close()
+        if guardian is not None:
+            guardian.end(confirmed)
         atexit.unregister(self.close)
+
+    def _guard(self) -> None:
+        """Have the guardian watch; the first time, start it."""
+        if not self.config.guardian:
+            return
+        link = self._link
+        if link.guardian is None:
+            link.guardian = Guardian(link.port.fd, self._ids, self.config.watchdog_s, self.config.reply_timeout_s)
+        link.guardian.arm()
 
     def _ping(self, servo_id: int) -> int:
         """Return the model number of a servo that must be there."""
@@ -300,6 +344,4 @@ class ServoBus:
         """Return blocks of the servos' control tables, one behind the other."""
         if not ids:
             raise UsageError("there are no servos to read", hint="call handshake first")
-        if len(ids) == 1:
-            return self._link.read_bytes(ids[0], address, length, what)
         return self._link.read_bytes_of(ids, address, length, what)

@@ -20,7 +20,7 @@ class GateLimits:
     max_speed_rad_s: float = 60.0
     """Joint speed above which the robot is stopped [rad/s]."""
     servo_watchdog_s: float = 0.1
-    """The servo stops by itself when it has heard nothing for this long [s]; steps of 20 ms."""
+    """Longest silence on the bus: then the guardian takes the torque off, and servos that do so stop [s]; of 20 ms."""
 
     def __post_init__(self) -> None:
         """Check that each limit keeps something out and lets something through."""

@@ -34,6 +34,7 @@ _IDLE_NS: Final = 2_000_000  # the plant is never further behind than this, so t
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
 _REAL_TIME_PRIORITY: Final = 1
+_TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
 
 
 class _Pty:
@@ -118,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     for field in fields(EmulatorConfig):
         flag = f"--{field.name.replace('_', '-')}"
-        parser.add_argument(flag, type=int if field.type == "int" else float, default=field.default)
+        parser.add_argument(flag, type=_TYPES[str(field.type).split()[0]], default=field.default)
     return parser
 
 

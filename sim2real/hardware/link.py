@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final, NoReturn, TypeVar
 
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
-from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
+from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware import registers as reg
+from sim2real.hardware.guardian import Guardian
 from sim2real.hardware.port import WaitingPort
 from sim2real.hardware.protocol import ALERT_BIT, StatusError
 from sim2real.hardware.registers import Register
@@ -29,6 +31,10 @@ _REASONS: Final[dict[int, str]] = {
 }
 _LOCK_TIMEOUT_S: Final = 0.5
 _FORCED_ATTEMPTS: Final = 5
+_LEAST_LOSSES: Final = 3  # fewer in a long time are this process' own fault: it was kept from running
+_PADS: Final = 4
+# What comes before the parameters of a status packet, header to error byte, and its place; and the checksum after them.
+_ID_AT, _ERROR_AT, _HEAD_BYTES, _CRC_BYTES = 4, 8, 9, 2
 
 _T = TypeVar("_T")
 
@@ -42,18 +48,21 @@ class BusConfig:
         baud_rate: Bits per second.
         reply_timeout_s: How long an answer may be late. A USB adapter whose latency timer is 16 ms needs more than
             that, or, better, a latency timer of 1 ms.
-        max_consecutive_losses: So many answers missing in a row are a lost bus.
         max_silence_s: So long without any answer, from the first that is missed, is a lost bus.
-        watchdog_s: The servos stop by themselves when they hear nothing for so long while torque is on; a multiple of
-            20 ms, at most 2.54 s; 0 switches it off. Some firmware of the 330 series notices but does not stop.
+        late_after_s: An answer that takes so much longer than its bytes is late: when its sample was taken is not sure.
+        watchdog_s: So long without an instruction while torque is on, and the servos' bus watchdogs trip, a multiple of
+            20 ms, at most 2.54 s, and the guardian takes the torque off; 0: neither. What a servo does by itself, its
+            model says: `sim2real.hardware.models`.
+        guardian: Whether a process of its own watches over this one; False only where the servos' own is looked at.
     """
 
     port: str
     baud_rate: int = 1_000_000
     reply_timeout_s: float = 0.008
-    max_consecutive_losses: int = 5
     max_silence_s: float = 0.1
+    late_after_s: float = 0.004
     watchdog_s: float = 0.1
+    guardian: bool = True
 
     def __post_init__(self) -> None:
         """Refuse a watchdog that the register cannot hold."""
@@ -76,12 +85,14 @@ class Transaction:
         lock_wait_ns: Waiting for the bus while another thread had it.
         transfer_ns: From having the bus to having the answer, retries included.
         retries: Answers that were missed before.
+        late_ns: By how much the answer took longer than its bytes.
     """
 
     t_sent_ns: int
     lock_wait_ns: int
     transfer_ns: int
     retries: int
+    late_ns: int = 0
 
 
 class BusLink:
@@ -101,8 +112,12 @@ class BusLink:
         self.transactions = 0
         self.retries = 0
         self.lost_replies = 0
+        self.late_replies = 0
+        self.late_us = array("i")
+        self.guardian: Guardian | None = None
         self.closed = False
         self._lock = threading.Lock()
+        self._pad = 0
 
     def read(self, servo_id: int, register: Register) -> int:
         """Return a register's value in counts."""
@@ -111,12 +126,7 @@ class BusLink:
 
     def read_bytes(self, servo_id: int, address: int, length: int, what: str) -> tuple[bytes, Transaction]:
         """Return `length` bytes of a servo's control table."""
-        data, error, transaction = self.exchange(
-            lambda: self.packets.readTxRx(self.port, servo_id, address, length), f"{what} of servo {servo_id}", length
-        )
-        if error:
-            self._refused(error, servo_id, what)
-        return bytes(data), transaction
+        return self.read_bytes_of((servo_id,), address, length, what)
 
     def read_bytes_of(
         self, servo_ids: Sequence[int], address: int, length: int, what: str
@@ -124,20 +134,25 @@ class BusLink:
         """Return `length` bytes of each servo's control table, one behind the other, asked for in one instruction."""
 
         def attempt() -> tuple[tuple[bytes, int], int, int]:
+            # After an answer that was missed the next ones are longer: should it still come, it is told by its length.
+            # Taken for the answer to the instruction sent again, it would be stamped 8 ms too late.
+            asked = length + (self._pad if address + length + _PADS <= reg.TABLE_BYTES else 0)
             # The SDK's GroupSyncRead drops the answers' error bytes, where a servo says that it has stopped itself.
-            result = self.packets.syncReadTx(self.port, address, length, list(servo_ids), len(servo_ids), False)
+            if len(servo_ids) == 1:
+                result = self.packets.readTx(self.port, servo_ids[0], address, asked)
+            else:
+                result = self.packets.syncReadTx(self.port, address, asked, list(servo_ids), len(servo_ids), False)
             blocks, failed_id, failure = b"", 0, 0
             for servo_id in servo_ids:
                 if result != COMM_SUCCESS:
                     break
-                block, result, error = self.packets.readRx(self.port, servo_id, length)
-                blocks += bytes(block)
+                block, result, error = self._receive(servo_id, asked)
+                blocks += block[:length]
                 failed_id, failure = (servo_id, error) if error and not failure else (failed_id, failure)
-                if len(block) != length and not error:
-                    result = COMM_RX_CORRUPT  # late, to another instruction
             return (blocks, failed_id), result, failure
 
-        (blocks, failed_id), error, transaction = self.exchange(attempt, f"{what} of servos {tuple(servo_ids)}")
+        who = f"servo {servo_ids[0]}" if len(servo_ids) == 1 else f"servos {tuple(servo_ids)}"
+        (blocks, failed_id), error, transaction = self.exchange(attempt, f"{what} of {who}")
         if error:
             self._refused(error, failed_id, what)
         return blocks, transaction
@@ -146,10 +161,15 @@ class BusLink:
         """Write a value in counts to a register, and wait for the servo to confirm it."""
         data = list(register.encode(value))
         what = f"write of {value} to {register.name}"
-        _, error, transaction = self.exchange(
-            lambda: ((), *self.packets.writeTxRx(self.port, servo_id, register.address, register.size, data)),
-            f"{what} of servo {servo_id}",
-        )
+
+        def attempt() -> tuple[bytes, int, int]:
+            result = self.packets.writeTxOnly(self.port, servo_id, register.address, register.size, data)
+            if result != COMM_SUCCESS:
+                return b"", result, 0
+            self.port.setPacketTimeout(_HEAD_BYTES + _CRC_BYTES)
+            return self._receive(servo_id, 0)
+
+        _, error, transaction = self.exchange(attempt, f"{what} of servo {servo_id}")
         if error:
             self._refused(error, servo_id, what)
         return transaction
@@ -190,44 +210,69 @@ class BusLink:
             self.port.is_using = False
             yield
 
-    def exchange(
-        self, attempt: Callable[[], tuple[_T, int, int]], what: str, length: int = 0
-    ) -> tuple[_T, int, Transaction]:
+    def exchange(self, attempt: Callable[[], tuple[_T, int, int]], what: str) -> tuple[_T, int, Transaction]:
         """Carry out an instruction until it is answered, or the bus is lost.
 
         Args:
             attempt: Sends and receives; returns the data, the SDK's result, the status packet's error byte.
             what: For messages.
-            length: Number of data bytes that a good answer has; 0: whatever comes.
 
         Returns:
             The data, the error byte, and what it took.
 
         Raises:
             HardwareLost: No answer within the limits of the configuration.
+            SafetyStop: The guardian has taken over, or has died.
         """
         asked_ns = time.monotonic_ns()
         losses = 0
         with self.hold():
             began_ns = time.monotonic_ns()
             while True:
+                if self.guardian is not None:
+                    self.guardian.beat()
                 try:
                     data, result, error = attempt()
                 except OSError as failure:
                     raise HardwareLost(f"{self.config.port} failed during {what}: {failure}") from failure
                 now_ns = time.monotonic_ns()
-                # The late answer to an instruction given up may be taken for this one's: its length tells, mostly.
-                if result == COMM_SUCCESS and (not length or error or len(data) == length):  # pyright: ignore
-                    self.transactions += 1
-                    transfer_ns = now_ns - began_ns
-                    return data, error, Transaction(self.port.t_sent_ns, began_ns - asked_ns, transfer_ns, losses)
+                if result == COMM_SUCCESS:
+                    late_ns = self._count_answer(now_ns)
+                    waited_ns, transfer_ns = began_ns - asked_ns, now_ns - began_ns
+                    return data, error, Transaction(self.port.t_sent_ns, waited_ns, transfer_ns, losses, late_ns)
                 losses += 1
                 self.lost_replies += 1
+                self._pad = (self._pad + 1) % _PADS
                 self._judge(losses, (now_ns - began_ns) * 1e-9, what)
                 self.retries += 1
 
+    def _receive(self, servo_id: int, length: int) -> tuple[bytes, int, int]:
+        """Wait for the status packet of a servo with so many bytes of data, or with an error and none.
+
+        What else comes is late, to an instruction given up, and is dropped.
+
+        Returns:
+            The data, the SDK's result, the error byte.
+        """
+        while True:
+            packet, result = self.packets.rxPacket(self.port, False)
+            if result != COMM_SUCCESS:
+                return b"", result, 0
+            data, error = bytes(packet[_HEAD_BYTES:-_CRC_BYTES]), packet[_ERROR_AT]
+            if packet[_ID_AT] == servo_id and (len(data) == length or (not data and error & ~ALERT_BIT)):
+                return data, result, error
+            self.late_replies += 1
+
+    def _count_answer(self, now_ns: int) -> int:
+        """Count an answer that came now; return by how much it took longer than its bytes [ns]."""
+        self.transactions += 1
+        late_ns = max(0, now_ns - self.port.t_sent_ns - self.port.wire_ns)
+        self.late_us.append(min(late_ns // 1000, 1 << 30))
+        self.late_replies += late_ns > 1e9 * self.config.late_after_s
+        return late_ns
+
     def _judge(self, losses: int, silent_s: float, what: str) -> None:
-        if losses >= self.config.max_consecutive_losses or silent_s > self.config.max_silence_s:
+        if losses >= _LEAST_LOSSES and silent_s > self.config.max_silence_s:
             raise HardwareLost(
                 f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
                 hint="check power and cable; is the adapter's latency timer longer than reply_timeout_s?",
@@ -238,14 +283,14 @@ class BusLink:
         address = reg.HARDWARE_ERROR_STATUS.address
         if error & ALERT_BIT:
             bits, _, _ = self.exchange(
-                lambda: self.packets.readTxRx(self.port, servo_id, address, 1), f"hardware error of {servo_id}", 1
+                lambda: self.packets.readTxRx(self.port, servo_id, address, 1), f"hardware error of {servo_id}"
             )
             raise SafetyStop(
                 f"servo {servo_id} has stopped itself: {reg.describe_hardware_errors(bits[0] if bits else 0)}",
                 hint="remove the cause, then reboot the servo",
             )
         watchdog, _, _ = self.exchange(
-            lambda: self.packets.readTxRx(self.port, servo_id, reg.BUS_WATCHDOG.address, 1), "bus watchdog", 1
+            lambda: self.packets.readTxRx(self.port, servo_id, reg.BUS_WATCHDOG.address, 1), "bus watchdog"
         )
         if watchdog and reg.BUS_WATCHDOG.decode(bytes(watchdog)) == reg.WATCHDOG_TRIPPED:
             raise SafetyStop(*watchdog_message(servo_id))

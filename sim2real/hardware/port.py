@@ -24,6 +24,8 @@ class WaitingPort(PortHandler):
     - The SDK gives a reply 34 ms more than its bytes take; here it is `reply_timeout_s`.
     - The SDK measures timeouts by the wall clock, which may jump; here by the monotonic one.
 
+    `t_sent_ns` is when the last packet left, `wire_ns` how long it and the answer to it take on the line.
+
     Args:
         path: Device file of the port.
         baud_rate: One of `BAUD_RATES`.
@@ -39,7 +41,7 @@ class WaitingPort(PortHandler):
         if baud_rate not in BAUD_RATES:
             raise UsageError(f"baud rate {baud_rate} is none of a DYNAMIXEL servo's. Available: {list(BAUD_RATES)}")
         self._reply_timeout_ms = 1e3 * reply_timeout_s
-        self.t_sent_ns = 0
+        self.t_sent_ns = self.wire_ns = 0
         self.baudrate = baud_rate
         try:
             self.openPort()
@@ -54,8 +56,10 @@ class WaitingPort(PortHandler):
         return self.ser
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the timeout for a status packet of so many bytes."""
-        self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + self._reply_timeout_ms)
+        """Start the timeout for status packets of so many bytes."""
+        wire_ms = self.tx_time_per_byte * packet_length
+        self.wire_ns += round(1e6 * wire_ms)
+        self.setPacketTimeoutMillis(wire_ms + self._reply_timeout_ms)
 
     def getCurrentTime(self) -> float:
         """Return the monotonic clock, in ms."""
@@ -71,6 +75,7 @@ class WaitingPort(PortHandler):
     def writePort(self, packet: list[int]) -> int:
         """Send an instruction, and remember when; return the number of bytes sent."""
         self.t_sent_ns = time.monotonic_ns()
+        self.wire_ns = round(1e6 * self.tx_time_per_byte * len(packet))
         return os.write(self.fd, bytes(packet))
 
     def readPort(self, length: int) -> bytes:

@@ -22,13 +22,6 @@ WATCHDOG_TRIPPED: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
 DRIVE_REVERSED: Final = 1  # bit of Drive Mode; the others: profiles by time instead of speed, goals switch torque on
 
-MODEL_NAMES: Final[dict[int, str]] = {
-    1020: "XM430-W350",
-    1030: "XM430-W210",
-    1060: "XL430-W250",
-    1190: "XL330-M077",
-    1200: "XL330-M288",
-}
 # Bits of Hardware Error Status; the servo switches its own torque off when one of them is set.
 HARDWARE_ERRORS: Final[dict[int, str]] = {
     0: "input voltage",

@@ -20,9 +20,10 @@ _CHECK_PERIOD_S: Final = 0.5
 class ServoRig:
     """Servos behind a safety gate, commanded in the unit of their drive [V or rad].
 
-    Three things stop them: every way out of this context (torque off); the servos' own watchdog when this process dies
-    or hangs; and a watchdog here when commands stop coming while measurements, which feed the servos' one, go on. That
-    one sends what the gate makes of a stale command: zero, or the last one once more.
+    Three things stop them: every way out of this context (torque off); the guardian, a process of its own, when this
+    one dies or hangs; and a watchdog here when commands stop coming while measurements, which show the guardian and the
+    servos that this process lives, go on. That one sends what the gate makes of a stale command: zero, or the last one
+    once more.
 
     Args:
         bus: Port and limits of the bus.

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from sim2real.hardware import registers as reg
+from sim2real.hardware.models import model
 from sim2real.hardware.protocol import ALERT_BIT, StatusError
 from sim2real.hardware.registers import OperatingMode, Register
 
@@ -23,12 +24,19 @@ class Servo:
         model_number: What it says it is.
         return_delay_us: Return Delay Time at power-up, rounded to the register's 2 us.
         encoder_counts: Counts per revolution of the sensor behind Present Position.
+        watchdog_stops: Whether its bus watchdog stops the motor; None: as the model's firmware does.
     """
 
     def __init__(
-        self, servo_id: int, model_number: int = 1060, return_delay_us: int = 500, encoder_counts: int = 4096
+        self,
+        servo_id: int,
+        model_number: int = 1060,
+        return_delay_us: int = 500,
+        encoder_counts: int = 4096,
+        watchdog_stops: bool | None = None,
     ) -> None:
         self.servo_id = servo_id
+        self.watchdog_stops = model(model_number).stops_alone if watchdog_stops is None else watchdog_stops
         self._encoder_counts = encoder_counts
         self._memory = bytearray(reg.TABLE_BYTES)
         self._registered: tuple[int, bytes] | None = None
@@ -61,7 +69,7 @@ class Servo:
         if not self.get(reg.TORQUE_ENABLE):
             return OperatingMode.OFF, 0.0
         mode = self.get(reg.OPERATING_MODE)
-        if self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+        if self.watchdog_stops and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
             return OperatingMode.PWM, 0.0
         if mode == OperatingMode.PWM:
             return mode, reg.fraction_from_pwm(self.get(reg.GOAL_PWM))
@@ -151,8 +159,9 @@ class Servo:
         return self.heard_ns + round(value * reg.WATCHDOG_UNIT_S * 1e9)
 
     def trip_watchdog(self) -> None:
-        """Stop: goals to rest, and no goal can be written until the host has written 0 to Bus Watchdog."""
-        self._rest_goals()
+        """Stop, or not, as the firmware does; either way no goal can be written until Bus Watchdog is set to 0."""
+        if self.watchdog_stops:
+            self._rest_goals()
         self.put(reg.BUS_WATCHDOG, reg.WATCHDOG_TRIPPED)
 
     def overload(self) -> None:

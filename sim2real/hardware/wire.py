@@ -14,69 +14,17 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from sim2real.errors import UsageError
 from sim2real.hardware import registers as reg
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.plant import Plant, PlantClock
 from sim2real.hardware.protocol import BROADCAST_ID, Instruction, Packet, Parser, StatusError, build_status
 from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.servo import Servo
 from sim2real.hardware.truth import Kind, TruthLog
 
+__all__ = ["EmulatedBus", "EmulatorConfig", "truth_header"]
+
 _STALE_PACKET_NS: Final = 5_000_000  # the rest of a packet that pauses for longer never comes
-
-
-@dataclass(frozen=True)
-class EmulatorConfig:
-    """How the emulated bus and its servos behave.
-
-    Args:
-        baud_rate: Bits per second; a byte takes 10 bits.
-        sensing_latency_s: Age of a measurement when the instruction that reads it is complete.
-        sensing_jitter_s: Uniform, plus or minus, on each measurement; at most the latency.
-        actuation_latency_s: From a complete goal instruction to its effect on the motor.
-        actuation_jitter_s: Uniform, plus or minus, on each effect; at most the latency. Order is kept.
-        return_delay_us: The servos' Return Delay Time at power-up.
-        reply_loss: Probability that an answer never leaves.
-        corrupt: Probability that a byte of an answer is flipped.
-        encoder_counts: Positions that the encoder tells apart in one revolution.
-        plant_step_s: Grid on which the plant is stepped and commands take effect; at most 1 ms.
-        model_number: What the servos say they are.
-        seed: Of jitter, loss and corruption.
-        silent_after_s: From then on nothing is heard or answered, as if the cable were pulled.
-        overload_after_s: From then on the servos report an overload, with torque off.
-    """
-
-    baud_rate: int = 1_000_000
-    sensing_latency_s: float = 0.0
-    sensing_jitter_s: float = 0.0
-    actuation_latency_s: float = 0.0
-    actuation_jitter_s: float = 0.0
-    return_delay_us: int = 500
-    reply_loss: float = 0.0
-    corrupt: float = 0.0
-    encoder_counts: int = reg.COUNTS_PER_REVOLUTION
-    plant_step_s: float = 0.0005
-    model_number: int = 1060
-    seed: int = 0
-    silent_after_s: float | None = None
-    overload_after_s: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values that make no sense, by name."""
-        ranges = {
-            "baud_rate": (1, 10_000_000),
-            "sensing_jitter_s": (0.0, self.sensing_latency_s),
-            "actuation_jitter_s": (0.0, self.actuation_latency_s),
-            "return_delay_us": (0, 508),
-            "reply_loss": (0.0, 1.0),
-            "corrupt": (0.0, 1.0),
-            "plant_step_s": (1e-5, 1e-3),
-            "encoder_counts": (2, 1 << 24),
-        }
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
 
 
 @dataclass
@@ -123,7 +71,7 @@ class EmulatedBus:
         history_s = config.sensing_latency_s + config.sensing_jitter_s
         self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), start_ns, round(history_s * 1e9), truth)
         self.servos = {
-            i: Servo(i, config.model_number, config.return_delay_us, config.encoder_counts)
+            i: Servo(i, config.model_number, config.return_delay_us, config.encoder_counts, config.watchdog_stops)
             for i in sorted(plant.servo_ids)
         }
         self._controllers: dict[int, tuple[int, int, float]] = {}
@@ -133,6 +81,8 @@ class EmulatedBus:
         self._parser = Parser()
         self._wire_free_ns = start_ns
         self._last_bytes_ns = start_ns
+        self._delivered_ns = start_ns
+        self._frozen: dict[int, tuple[float, float, float]] = {}
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
         if config.overload_after_s is not None:
@@ -198,6 +148,10 @@ class EmulatedBus:
 
     def _delay_ns(self, latency_s: float, jitter_s: float) -> int:
         return round(1e9 * (latency_s + self._random.uniform(-jitter_s, jitter_s)))
+
+    def _happens(self, probability: float) -> bool:
+        """Return whether a fault happens; robots without it draw the same numbers as if there were no such fault."""
+        return probability > 0.0 and self._random.random() < probability
 
     def _execute(self, request: _Request) -> None:
         packet = request.packet
@@ -317,11 +271,16 @@ class EmulatedBus:
         config = self._config
         sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
         values = self._clock.sample(servo.servo_id, sampled_ns)
-        servo.refresh(*values, tick_ms=(t_ns - self._start_ns) // 1_000_000)
+        shown = values
+        if config.frozen_after_s is not None and t_ns - self._start_ns >= config.frozen_after_s * 1e9:
+            shown = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
+        servo.refresh(*shown, tick_ms=(t_ns - self._start_ns) // 1_000_000)
         return sampled_ns, values
 
     def _answer_read(self, servo: Servo, request: _Request, address: int, length: int) -> None:
         sample = self._measure(servo, request.t_ns)
+        if self._happens(self._config.wild):
+            servo.put(reg.PRESENT_POSITION, self._random.randrange(1 << 24, 1 << 31))
         error, data = servo.read(address, length)
         if servo.get(reg.STATUS_RETURN_LEVEL) >= 1:
             measured = address < reg.PRESENT_POSITION.end and address + length > reg.PRESENT_PWM.address
@@ -344,7 +303,9 @@ class EmulatedBus:
         return_delay_ns = round(servo.get(reg.RETURN_DELAY_TIME) * reg.RETURN_DELAY_UNIT_S * 1e9)
         begin_ns = max(request.t_ns, self._wire_free_ns) + return_delay_ns
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
-        self._at(self._wire_free_ns, self._deliver, self._wire_free_ns, servo.servo_id, answer, request, sample)
+        late_ns = round(self._config.late_s * 1e9) if self._happens(self._config.late) else 0
+        self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
+        self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo.servo_id, answer, request, sample)
 
     def _deliver(
         self,
@@ -369,7 +330,8 @@ class EmulatedBus:
         self._measure(servo, t_ns)
         servo.trip_watchdog()
         self._truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
-        self._stop_motor(servo, t_ns, OperatingMode.PWM)
+        if servo.watchdog_stops:
+            self._stop_motor(servo, t_ns, OperatingMode.PWM)
 
     def _overload(self, t_ns: int) -> None:
         for servo in self.servos.values():

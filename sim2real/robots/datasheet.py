@@ -22,6 +22,7 @@ class DataSheet:
         friction: Dry friction [N m].
         p_gain: Position P Gain, in counts.
         profile_rad_s: Profile Velocity [rad/s].
+        model_number: What the servos say they are; a twin of the robot has that model's firmware.
     """
 
     stall: float
@@ -30,6 +31,7 @@ class DataSheet:
     friction: float
     p_gain: int = 800
     profile_rad_s: float = 5.0
+    model_number: int = 1060
 
     @property
     def full_rad(self) -> float:

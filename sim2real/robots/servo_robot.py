@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -154,7 +154,7 @@ class ServoRobot(ABC):
         """Return a robot inside the computer that is made of this one's model.
 
         Args:
-            emulator: Latencies and losses.
+            emulator: Latencies and losses; the servos' model is the data sheet's.
             **factors: By what it differs from the model: ``gain``, ``damping``, ``armature``, ``friction``.
         """
         s, task = self.servos, self.task
@@ -165,6 +165,7 @@ class ServoRobot(ABC):
             "p_gain": s.sheet.p_gain,
             "factors": factors,
         }
+        emulator = replace(emulator, model_number=s.sheet.model_number)
         return Embedded("sim2real.hardware.twin:TwinPlant", emulator, arguments)
 
     def reward(self, state: Any, action: jax.Array) -> jax.Array:
@@ -254,9 +255,7 @@ class ServoRobot(ABC):
             limits.max_speed_rad_s,
             stale="hold",
         )
-        # Joints that hold their goals can wait for answers: what counts is how long the bus is silent.
-        patience = round(BusConfig.max_silence_s / BusConfig.reply_timeout_s)
-        bus = BusConfig(port, s.baud_rate, max_consecutive_losses=patience, watchdog_s=limits.servo_watchdog_s)
+        bus = BusConfig(port, s.baud_rate, watchdog_s=limits.servo_watchdog_s)
         return ServoSession(bus, gate, s.ids, s.sheet.drive, self.embedded, truth_path, seed)
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:

@@ -28,6 +28,7 @@ from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
+from sim2real.stages.rig import announce
 from sim2real.stages.robot import Robot, Session
 from sim2real.stages.runs import StageFolder, finished, newest, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -53,6 +54,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         values = _identified(pipeline, stage.run_dir)
         logs = [stage.output(f"log_{i}", f"episode_{i}.mcap") for i in range(config.episodes)]
         with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
+            announce(session)
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
             timing = [_deploy(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]

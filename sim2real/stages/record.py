@@ -11,6 +11,7 @@ from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.rig import announce
 from sim2real.stages.robot import Robot
 from sim2real.stages.runs import StageFolder, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -34,6 +35,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         log = stage.output("log", LOG)
         note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
         with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
+            announce(session)
             nodes = robot.recording_nodes(session, signal)
             if session.embedded is not None:
                 stage.output("truth", TRUTH)

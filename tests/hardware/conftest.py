@@ -34,7 +34,7 @@ def open_bus():
     buses = []
 
     def open_(robot, ids=(1,), mode=None, **config):
-        patience = {"max_consecutive_losses": 50, "max_silence_s": 1.0, "watchdog_s": 1.0}
+        patience = {"max_silence_s": 1.0, "watchdog_s": 1.0}
         bus = ServoBus(BusConfig(robot.port, **{**patience, **config}))
         buses.append(bus)
         bus.handshake(dict.fromkeys(ids))

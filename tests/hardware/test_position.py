@@ -30,9 +30,9 @@ COUNT_RAD = reg.RAD_PER_COUNT
 def open_arm(start_robot):
     rigs = []
 
-    def open_(drive=DRIVE, watchdog_s=1.0, robot=None, **gate):
+    def open_(drive=DRIVE, watchdog_s=1.0, robot=None, guardian=True, **gate):
         robot = robot or start_robot("Joints")
-        bus = BusConfig(robot.port, max_consecutive_losses=50, max_silence_s=1.0, watchdog_s=watchdog_s)
+        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s, guardian=guardian)
         rigs.append(ServoRig(bus, GateConfig(**{**GATE, **gate}), IDS, drive))
         return rigs[-1], robot
 
@@ -200,7 +200,7 @@ def test_a_stalled_policy_leaves_the_joints_where_they_were_sent(open_arm):
 
 
 def test_a_tripped_servo_is_noticed_although_goals_are_not_confirmed(open_arm):
-    rig, robot = open_arm(watchdog_s=0.1)
+    rig, robot = open_arm(watchdog_s=0.1, guardian=False)
     rig.start()
     run(rig, [0.4, -0.7, 0.2], 0.3)
     with rig.bus._link.hold():

@@ -30,7 +30,7 @@ def open_rig(start_robot):
     def open_(config=None, watchdog_s=0.1, **gate):
         robot = start_robot("FirstOrder", config)
         # Patient with lost answers, for the machine may be busy; not with the host itself.
-        bus = BusConfig(robot.port, max_consecutive_losses=50, max_silence_s=1.0, watchdog_s=watchdog_s)
+        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s)
         limits = GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate})
         rigs.append(ServoRig(bus, limits, [1], VoltageDrive(SUPPLY_V)))
         return rigs[-1], robot

@@ -34,7 +34,8 @@ def test_a_servo_that_stops_answering(make_pipeline, record):
         "silent_servo",
         """
         def connect(port, limits, truth_path, seed):
-            return hardware.Session(port, limits, truth_path, seed, replace(hardware.EMBEDDED, silent_after_s=4.0))
+            emulator = replace(hardware.EMBEDDED, silent_after_s=4.0, model_number=1060)
+            return hardware.Session(port, limits, truth_path, seed, emulator)
         """,
     )
     code, said, folder = record(name, duration_s=10)
@@ -46,7 +47,7 @@ def test_a_servo_that_stops_answering(make_pipeline, record):
     end = episode.metadata["log"]["session_end"]
     assert end["exit_code"] == errors.HARDWARE_LOST
     assert end["status"].startswith("HardwareLost")
-    # Nothing that the host says arrives any more: the servo's own watchdog has to stop the motor.
+    # Nothing that host or guardian say arrives any more: a servo that can has to stop by itself.
     truth = read_truth(folder / "truth.bin")
     t_ns, modes, goals = motor(truth)
     (trip,) = truth.of(Kind.WATCHDOG)

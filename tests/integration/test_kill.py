@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from live_robots import assert_torque_ends_off, manifest_of, motor, wait_until_running
 
+from sim2real.errors import SAFETY_STOP
+from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
@@ -33,19 +35,39 @@ def check_death(log, killed_ns, truth):
     assert len(inside) > 10
     step = np.searchsorted(starts_ns, inside, side="right") - 1
     assert np.all(inside <= ends_ns[step])
-    t_ns, _, goals = motor(truth)
-    (trip,) = truth.of(Kind.WATCHDOG)
-    assert (trip["t_ns"] - killed_ns) * 1e-9 < 0.2
-    assert goals[-1] == 0.0
-    assert (t_ns[-1] - killed_ns) * 1e-9 < 0.2
+    assert_off_soon(truth, killed_ns)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_kill_9_of_record(tmp_path, lone_robot, start_cli, seed):
+def assert_off_soon(truth, since_ns):
+    """The guardian took the torque off: this servo goes on turning by itself."""
+    t_ns, modes, _ = motor(truth)
+    off = np.flatnonzero((modes == OperatingMode.OFF) & (t_ns > since_ns))
+    assert off.size
+    assert (t_ns[off[0]] - since_ns) * 1e-9 < 0.2
+    assert np.all(modes[off[0] :] == OperatingMode.OFF)
+
+
+def test_a_recording_that_is_stopped_and_wakes_again_ends_in_order(tmp_path, lone_robot, start_cli):
     port, end_robot = lone_robot
     process = start_cli("record", "pendulum", "--port", port, "--duration-s", 20, "--runs", tmp_path)
     log = wait_until_running(tmp_path, "pendulum/*/record/session.mcap", process)
-    time.sleep(random.Random(seed).uniform(0.5, 1.5))
+    since_ns = time.monotonic_ns()
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(0.4)
+    process.send_signal(signal.SIGCONT)
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == SAFETY_STOP
+    assert "the guardian has taken the torque off: this process was silent for 0.1 s" in said
+    assert "if this process dies, XL330-M077 (servo 1): notices after 0.1 s, but goes on" in said
+    assert_off_soon(end_robot(), since_ns)
+    assert (manifest_of(log.parent)["status"], read_log(log).complete) == ("failed", True)
+
+
+def test_kill_9_of_record(tmp_path, lone_robot, start_cli):
+    port, end_robot = lone_robot
+    process = start_cli("record", "pendulum", "--port", port, "--duration-s", 20, "--runs", tmp_path)
+    log = wait_until_running(tmp_path, "pendulum/*/record/session.mcap", process)
+    time.sleep(random.Random(1).uniform(0.5, 1.5))
     killed_ns = time.monotonic_ns()
     process.kill()
     time.sleep(0.5)

@@ -1,0 +1,150 @@
+"""The guardian: takes the torque off when the process that controls the servos is gone, or has fallen silent.
+
+    python -I -S guardian_process.py PORT_FD LINK_FD SILENCE_S ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
+
+It holds the port from before torque goes on, and writes to it only when nobody else does. It imports little, so that it
+is there within 20 ms, and knows no protocol: the packets come from `sim2real.hardware.guardian`, in hexadecimal.
+"""
+
+import os
+import select
+import signal
+import sys
+import time
+
+READY, BEAT, REST, LEAVE = b"r", b"+", b"-", b"q"
+TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
+GIVE_UP_S = 10.0
+_QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
+
+
+class Guard:
+    """What takes the torque off, and decides when.
+
+    Args:
+        port_fd: The open port.
+        answer_s: How long a servo's answer may take [s].
+        off: The packet that takes the torque of all servos off.
+        servos: By servo the packet that asks for its torque, and the answers that mean off.
+    """
+
+    def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
+        self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
+
+    def watch(self, link: int, silence_s: float) -> None:
+        """Wait until the control process leaves; act when it dies, or is silent while torque is on.
+
+        Args:
+            link: Socket to the control process.
+            silence_s: So long without a sign of life, while torque is on, is too long [s]; 0: it may be silent.
+        """
+        armed, tripped, heard_s = False, False, time.monotonic()
+        _write(link, READY)
+        while True:
+            watched = armed and not tripped and silence_s > 0.0
+            wait_s = max(0.0, heard_s + silence_s - time.monotonic()) if watched else None
+            if select.select([link], [], [], wait_s)[0]:  # before the clock: this process may have been late itself
+                said = _hear(link)
+                if said.endswith(LEAVE):
+                    return
+                if not said:
+                    self.make_safe("the control process is gone")
+                    return
+                armed, heard_s = said.endswith(BEAT), time.monotonic()
+            elif watched and time.monotonic() - heard_s >= silence_s:
+                # It may come back, and switch the torque on before it notices: this goes on until it leaves.
+                tripped = True
+                _write(link, TRIPPED)
+                confirmed = self.make_safe(f"the control process was silent for {silence_s:.2f} s")
+                _write(link, SAFE if confirmed else FAILED)
+
+    def make_safe(self, reason: str) -> bool:
+        """Take the torque off, say so, and return whether all servos have confirmed."""
+        begin_s = time.monotonic()
+        failure = self._take_torque_off()
+        took_ms = 1e3 * (time.monotonic() - begin_s)
+        if failure:
+            said = f"torque off could NOT be confirmed, {failure}; cut the servos' power"
+        else:
+            said = f"torque is off, confirmed after {took_ms:.0f} ms"
+        _write(2, f"sim2real guardian: {reason}: {said}\n".encode())
+        return not failure
+
+    def _take_torque_off(self) -> str:
+        """Switch all servos off, again and again until each has confirmed; return why that failed, if it did.
+
+        A packet that its writer died in the middle of swallows the first of ours; what a process that has been woken
+        again reads is lost for us. Either costs another round.
+        """
+        end = time.monotonic() + GIVE_UP_S
+        left = self._servos
+        try:
+            self._drain()
+            while left and time.monotonic() < end:
+                self._send(self._off)
+                left = [(query, answers) for query, answers in left if not self._confirms(query, answers)]
+        except OSError as error:
+            return f"the port failed: {error}"
+        return f"{len(left)} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if left else ""
+
+    def _drain(self) -> None:
+        """Let an answer that is on its way come in: two packets at a time would destroy each other on the line."""
+        end = time.monotonic() + _LONGEST_ANSWER_S
+        while time.monotonic() < end and self._receive(_QUIET_S):
+            pass
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            os.write(self._fd, packet)
+        except BlockingIOError:  # the line is full: lost, like a packet that is not heard
+            time.sleep(_QUIET_S)
+
+    def _confirms(self, query: bytes, answers: list[bytes]) -> bool:
+        self._send(query)
+        end, heard = time.monotonic() + self._answer_s, b""
+        while (left_s := end - time.monotonic()) > 0.0:
+            heard += self._receive(left_s)
+            if any(answer in heard for answer in answers):
+                return True
+        return False
+
+    def _receive(self, wait_s: float) -> bytes:
+        if not select.select([self._fd], [], [], wait_s)[0]:
+            return b""
+        try:
+            data = os.read(self._fd, 4096)
+        except BlockingIOError:  # a process that has been woken again took it
+            return b""
+        if not data:
+            raise OSError("it has been unplugged")
+        return data
+
+
+def _hear(link: int) -> bytes:
+    """Return what the control process says; nothing if it is gone."""
+    try:
+        return os.read(link, 4096)
+    except OSError:
+        return b""
+
+
+def _write(fd: int, message: bytes) -> None:
+    """Tell the control process or the terminal, if it is still there."""
+    try:  # noqa: SIM105 - importing contextlib takes a third of the start
+        os.write(fd, message)
+    except OSError:
+        pass
+
+
+def main(arguments: list[str]) -> None:
+    """Run until the control process leaves or is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    port_fd, link, silence_s, answer_s, off, *rest = arguments
+    packets = [text.partition(":") for text in rest]
+    servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
+    Guard(int(port_fd), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

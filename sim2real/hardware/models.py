@@ -1,0 +1,67 @@
+"""The servos' models, and what each does by itself when the computer that controls it dies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+_MANUAL: Final = "e-Manual, Bus Watchdog(98); not measured by us"
+_FORUM: Final = "reproduced by ROBOTIS, forum.robotis.com/t/4814, firmware 51"
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """A model of servo.
+
+    Args:
+        name: As printed on it.
+        stops_alone: Whether a lost host stops it, once its bus watchdog has noticed.
+        source: How that is known.
+    """
+
+    name: str
+    stops_alone: bool
+    source: str
+
+    def without_host(self, watchdog_s: float) -> str:
+        """Return what it does by itself when its host dies.
+
+        Args:
+            watchdog_s: What its bus watchdog is set to [s]; 0: off.
+        """
+        if not watchdog_s:
+            return "goes on as commanded last (its bus watchdog is off)"
+        after = f"after {watchdog_s:g} s"
+        if self.stops_alone:
+            return f"stops {after}, torque stays on"
+        return f"notices {after}, but goes on as commanded last"
+
+
+MODELS: Final[Mapping[int, ServoModel]] = {
+    1020: ServoModel("XM430-W350", True, _MANUAL),
+    1030: ServoModel("XM430-W210", True, _MANUAL),
+    1060: ServoModel("XL430-W250", True, _MANUAL),
+    1190: ServoModel("XL330-M077", False, _FORUM),
+    1200: ServoModel("XL330-M288", False, _FORUM),
+    1210: ServoModel("XC330-T181", False, _FORUM),
+    1220: ServoModel("XC330-T288", False, _FORUM),
+    1230: ServoModel("XC330-M181", False, _FORUM),
+    1240: ServoModel("XC330-M288", False, _FORUM),
+}
+"""By model number."""
+
+
+def model(number: int) -> ServoModel:
+    """Return a model; of one that is not known nothing good is assumed."""
+    return MODELS.get(number, ServoModel(f"model {number}", False, "unknown model: the worst is assumed"))
+
+
+def table() -> str:
+    """Return the models and what they do by themselves, as the Markdown table of docs/guides/safety.md."""
+    rows = [
+        (m.name, m.without_host(0.1).replace("after 0.1 s", "after `servo_watchdog_s`"), m.source)
+        for m in MODELS.values()
+    ]
+    lines = [("Servo", "By itself, when the computer dies", "Known from"), ("---",) * 3, *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -1,0 +1,185 @@
+"""The guardian, for three servos whose firmware notices a dead host but does not stop; measured on the truth's side."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from sim2real.errors import SAFETY_STOP, SafetyStop
+from sim2real.hardware import guardian_process
+from sim2real.hardware import registers as reg
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.truth import Kind
+from sim2real.hardware.wire import EmulatorConfig
+
+IDS = (1, 2, 3)
+XL330 = 1200
+HOST = """
+import os, signal, sys, time
+from sim2real.errors import Sim2RealError
+from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.registers import OperatingMode
+
+bus = ServoBus(BusConfig({port!r}, watchdog_s=0.1, max_silence_s=1.0, guardian={guardian}))
+
+def die_in_the_middle_of_a_packet(number, frame):
+    os.write(bus._link.port.fd, bus._torque_off_packet[:9] + bytes(3))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+signal.signal(signal.SIGUSR1, die_in_the_middle_of_a_packet)
+ids = (1, 2, 3)
+bus.handshake(dict.fromkeys(ids))
+bus.setup(OperatingMode.PWM)
+bus.torque(True)
+print(bus.guardian_pid, flush=True)
+try:
+    while True:
+        bus.write_goal_pwm(dict.fromkeys(ids, 0.7))
+        bus.read_state()
+        time.sleep(0.01)
+except Sim2RealError as error:
+    bus.close()
+    print(error, flush=True)
+    sys.exit(error.exit_code)
+"""
+
+
+@pytest.fixture
+def start_host(start_robot):
+    """Start servos and a process that turns them; return robot, process and the guardian's process."""
+    hosts = []
+
+    def start(guardian=True, **config):
+        robot = start_robot(config=EmulatorConfig(model_number=XL330, actuation_latency_s=0.01, **config), ids=IDS)
+        code = HOST.format(port=robot.port, guardian=guardian)
+        host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        hosts.append(host)
+        pid = host.stdout.readline().strip()
+        assert pid, host.stderr.read()
+        time.sleep(0.2)
+        return robot, host, pid
+
+    yield start
+    for host in hosts:
+        host.kill()
+        host.communicate()
+
+
+def modes_of(robot):
+    """Return for each servo when commands took effect [ns], and their modes and goals."""
+    robot.stop()
+    truth = robot.truth()
+    rows = [truth.of(Kind.EFFECT, i) for i in IDS]
+    return [(r["t_ns"], r["values"][:, 0], r["values"][:, 1]) for r in rows]
+
+
+def assert_off_soon(robot, since_ns, within_s=0.2):
+    for t_ns, modes, goals in modes_of(robot):
+        before = t_ns <= since_ns
+        assert (modes[before][-1], goals[before][-1]) == (OperatingMode.PWM, pytest.approx(0.7, abs=1e-3))
+        off = np.flatnonzero(modes == OperatingMode.OFF)
+        after = off[t_ns[off] > since_ns]
+        assert after.size
+        assert (t_ns[after[0]] - since_ns) * 1e-9 < within_s
+        assert np.all(modes[after[0] :] == OperatingMode.OFF)  # and nothing switches it on again
+
+
+def test_without_a_guardian_this_firmware_goes_on_when_its_host_is_killed(start_host):
+    robot, host, _ = start_host(guardian=False)
+    host.kill()
+    time.sleep(0.4)
+    for _, modes, goals in modes_of(robot):
+        assert (modes[-1], goals[-1]) == (OperatingMode.PWM, pytest.approx(0.7, abs=1e-3))
+    assert len(robot.truth().of(Kind.WATCHDOG)) == len(IDS)  # they did notice
+
+
+@pytest.mark.parametrize(
+    ("number", "faults"),
+    [
+        (signal.SIGKILL, {}),
+        (signal.SIGSTOP, {}),
+        (signal.SIGUSR1, {}),  # dies in the middle of a packet, which swallows the guardian's first one
+        (signal.SIGKILL, {"reply_loss": 0.3, "corrupt": 0.1, "seed": 3}),
+    ],
+    ids=["killed", "stopped", "half a packet", "bad line"],
+)
+def test_torque_is_off_within_200_ms(start_host, number, faults):
+    robot, host, _ = start_host(**faults)
+    since_ns = time.monotonic_ns()
+    host.send_signal(number)
+    time.sleep(0.5)
+    assert_off_soon(robot, since_ns)
+    host.kill()
+    said = host.communicate()[1]
+    reason = "was silent for 0.11 s" if number == signal.SIGSTOP else "is gone"
+    assert f"sim2real guardian: the control process {reason}: torque is off, confirmed after" in said
+
+
+def test_a_process_that_wakes_again_ends_with_torque_off(start_host):
+    robot, host, _ = start_host()
+    since_ns = time.monotonic_ns()
+    host.send_signal(signal.SIGSTOP)
+    time.sleep(0.3)
+    host.send_signal(signal.SIGCONT)
+    assert host.wait(10.0) == SAFETY_STOP
+    assert "the guardian has taken the torque off: this process was silent for 0.1 s" in host.stdout.read()
+    assert_off_soon(robot, since_ns)
+
+
+def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
+    robot, host, pid = start_host()
+    assert os.getsid(int(pid)) != os.getsid(host.pid)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(int(pid), number)
+    time.sleep(0.1)
+    since_ns = time.monotonic_ns()
+    host.kill()
+    time.sleep(0.3)
+    assert_off_soon(robot, since_ns)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_without_it_the_control_process_stops(start_robot, open_bus, number):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, watchdog_s=0.4)
+    bus.write_goal_pwm({1: 0.5})
+    os.kill(bus.guardian_pid, number)
+    end = time.monotonic() + 10.0
+    with pytest.raises(SafetyStop, match="the guardian has died"):  # noqa: PT012 - it takes its time
+        while time.monotonic() < end:
+            bus.write_goal_pwm({1: 0.5})
+            time.sleep(0.002)
+    bus.close()
+    robot.stop()
+    assert robot.truth().of(Kind.EFFECT)["values"][-1, 0] == OperatingMode.OFF
+
+
+def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, watchdog_s=0.1)
+    first = bus.guardian_pid
+    bus.torque(False)
+    time.sleep(0.3)
+    bus.torque(True)
+    assert bus.guardian_pid == first
+    bus.write_goal_pwm({1: 0.5})
+    bus.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(first, 0)
+    again = open_bus(robot, mode=OperatingMode.PWM)
+    assert again.read(1, reg.TORQUE_ENABLE) == 1
+
+
+def test_it_needs_little_and_so_starts_soon():
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import guardian_process; print(*sys.modules)"
+    command = [sys.executable, "-I", "-S", "-c", code, os.path.dirname(guardian_process.__file__)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert not {"numpy", "sim2real", "re", "typing", "dataclasses", "subprocess", "socket"} & set(loaded)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 0.1
