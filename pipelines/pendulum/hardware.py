@@ -49,7 +49,14 @@ class Session(hardware.ServoSession):
     def __init__(
         self, port: str, limits: GateLimits, truth_path: Path, seed: int, emulator: EmulatorConfig = EMBEDDED
     ) -> None:
-        gate = GateConfig(limits.limit, limits.slew_per_s, limits.command_timeout_s, limits.max_speed_rad_s)
+        gate = GateConfig(
+            limits.limit,
+            limits.slew_per_s,
+            limits.command_timeout_s,
+            limits.max_speed_rad_s,
+            joints=("hinge",),
+            stuck_effort=limits.stuck_effort,
+        )
         bus = BusConfig(port, BAUD_RATE, watchdog_s=limits.servo_watchdog_s)
         embedded = hardware.Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
         super().__init__(bus, gate, [SERVO_ID], VoltageDrive(SUPPLY_V), embedded, truth_path, seed)

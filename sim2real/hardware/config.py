@@ -18,13 +18,15 @@ class GateLimits:
     command_timeout_s: float = 0.1
     """A command older than this becomes zero volts; servos in position mode hold where they are [s]."""
     max_speed_rad_s: float = 60.0
-    """Joint speed above which the robot is stopped [rad/s]."""
+    """Joint speed above which the robot is stopped [rad/s]; so is one whose position leaps further than that allows."""
+    stuck_effort: float = 0.2
+    """A joint that is pushed both ways with more than this share of its torque must move, or the robot is stopped."""
     servo_watchdog_s: float = 0.1
     """Longest silence on the bus: then the guardian takes the torque off, and servos that do so stop [s]; of 20 ms."""
 
     def __post_init__(self) -> None:
         """Check that each limit keeps something out and lets something through."""
-        for name in ("limit", "slew_per_s", "command_timeout_s", "max_speed_rad_s"):
+        for name in ("limit", "slew_per_s", "command_timeout_s", "max_speed_rad_s", "stuck_effort"):
             if not getattr(self, name) > 0.0:
                 raise UsageError(f"gate.{name} must be above 0, got {getattr(self, name)}")
         if not 0.02 <= self.servo_watchdog_s <= 2.54:

@@ -46,6 +46,10 @@ class Drive(Protocol):
         """Write a command to the servos."""
         ...
 
+    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
+        """Return with how much of their torque the servos push, by their command and angles, (n,) in [-1, 1]."""
+        ...
+
     def reading(self, reading: StateReading) -> StateReading:
         """Return a measurement of all servos in this drive's angles."""
         ...
@@ -82,6 +86,11 @@ class VoltageDrive:
     def send(self, bus: ServoBus, command: np.ndarray) -> None:
         """Write voltages [V]."""
         bus.write_goal_pwm({i: float(v) / self.supply_v for i, v in zip(bus.ids, command, strict=True)})
+
+    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
+        """Return the voltage's share of the supply."""
+        del position_rad
+        return np.clip(command / self.supply_v, -1.0, 1.0)
 
     def reading(self, reading: StateReading) -> StateReading:
         """Return the measurement as it is."""
@@ -151,6 +160,11 @@ class PositionDrive:
         """Write joint angles [rad]."""
         angles = command + self._zero_rad
         bus.write_goal_position({i: float(a) for i, a in zip(bus.ids, angles, strict=True)})
+
+    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
+        """Return the share of full duty that the P gain makes of the error; with a profile it gets there later."""
+        error_count = (command - position_rad) / reg.RAD_PER_COUNT
+        return np.clip(error_count * self.p_gain / reg.P_GAIN_UNIT / reg.PWM_FULL_SCALE, -1.0, 1.0)
 
     def reading(self, reading: StateReading) -> StateReading:
         """Return the measurement with joint angles [rad]."""

@@ -20,17 +20,25 @@ class GateConfig:
         limit: Largest magnitude, or (low, high), in the command's unit; low and high: for all, or one per actuator.
         slew_per_s: Largest change per second; None: any.
         command_timeout_s: A command older than this is stale.
-        max_speed_rad_s: A measured speed beyond this stops the robot; None: not watched.
+        max_speed_rad_s: A measured speed beyond this stops the robot, and so does a position that takes one; for all,
+            or one per joint; None: not watched.
         node: Name of the actuator's node, for messages.
         stale: What a stale command becomes: zero, or (hold) what was allowed last, where zero is a place to jump to.
+        joints: Names, for messages.
+        stuck_effort: A joint that is pushed both ways with more than this share of its torque must move: for all, or
+            one per joint; above 1: not watched. See `sim2real.hardware.plausibility`.
+        stuck_s: For how long on end, each way.
     """
 
     limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
     slew_per_s: float | None = None
     command_timeout_s: float = 0.1
-    max_speed_rad_s: float | None = None
+    max_speed_rad_s: float | Sequence[float] | None = None
     node: str = "actuator"
     stale: Literal["zero", "hold"] = "zero"
+    joints: tuple[str, ...] = ()
+    stuck_effort: float | Sequence[float] = 0.2
+    stuck_s: float = 0.2
 
     def __post_init__(self) -> None:
         """Refuse limits that let nothing through, or keep nothing out."""
@@ -41,10 +49,14 @@ class GateConfig:
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
         if self.stale == "zero" and not np.all((low <= 0.0) & (high >= 0.0)):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
-        for name in ("slew_per_s", "command_timeout_s", "max_speed_rad_s"):
+        for name in ("slew_per_s", "command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s"):
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
+            if value is not None and not np.all(np.asarray(value) > 0.0):
                 raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
+
+    def joint(self, index: int) -> str:
+        """Return how messages call a joint."""
+        return f"joint {self.joints[index]!r}" if index < len(self.joints) else f"joint {index}"
 
     @property
     def range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -185,9 +197,11 @@ class SafetyGate:
             return
         speeds = np.array(speed_rad_s, dtype=np.float64, ndmin=1)
         self._require_finite("speed_rad_s", speeds)
-        index = int(np.argmax(np.abs(speeds)))
-        if math.fabs(speeds[index]) > limit:
-            self._halt(f"speed_rad_s[{index}] = {speeds[index]:.4g} is beyond the limit of {limit:.4g} rad/s")
+        limits = np.broadcast_to(np.asarray(limit, np.float64), speeds.shape)
+        index = int(np.argmax(np.abs(speeds) / limits))
+        if math.fabs(speeds[index]) > limits[index]:
+            what = f"speed_rad_s[{index}] = {speeds[index]:.4g} of {self.config.joint(index)}"
+            self._halt(f"{what} is beyond the limit of {limits[index]:.4g} rad/s")
 
     def _halt(self, reason: str) -> None:
         self._stop = SafetyStop(f"node {self.config.node!r} stopped: {reason}")

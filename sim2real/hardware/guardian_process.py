@@ -140,6 +140,11 @@ def main(arguments: list[str]) -> None:
     """Run until the control process leaves or is gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    try:  # noqa: SIM105 - as above
+        # Where it is allowed: on a busy machine this process must not wait for its turn. It hardly ever does anything.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except (AttributeError, OSError):
+        pass
     port_fd, link, silence_s, answer_s, off, *rest = arguments
     packets = [text.partition(":") for text in rest]
     servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]

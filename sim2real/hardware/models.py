@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 _MANUAL: Final = "e-Manual, Bus Watchdog(98); not measured by us"
-_FORUM: Final = "reproduced by ROBOTIS, forum.robotis.com/t/4814, firmware 51"
+_FORUM: Final = "ROBOTIS reproduced it with all 330s: forum.robotis.com/t/4814 (firmware 51)"
 
 
 @dataclass(frozen=True)

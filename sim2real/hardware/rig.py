@@ -13,6 +13,7 @@ from sim2real.errors import HardwareLost, Sim2RealError
 from sim2real.hardware.bus import BusConfig, ServoBus, StateReading
 from sim2real.hardware.drive import Drive
 from sim2real.hardware.gate import GateConfig, SafetyGate
+from sim2real.hardware.plausibility import Plausibility
 
 _CHECK_PERIOD_S: Final = 0.5
 
@@ -39,6 +40,8 @@ class ServoRig:
     def __init__(self, bus: BusConfig, gate: GateConfig, ids: Sequence[int], drive: Drive) -> None:
         drive.check(gate, ids)
         self.gate = SafetyGate(gate)
+        self._plausibility = Plausibility(gate)
+        self._sent: np.ndarray | None = None
         self._drive = drive
         self.ids = tuple(ids)
         self._speed_rad_s: np.ndarray | None = None
@@ -65,6 +68,11 @@ class ServoRig:
         """Take the torque off and close the port."""
         self.close()
 
+    @property
+    def suspects(self) -> list[str]:
+        """What was odd about the measurements since `start`, but not sure enough to stop."""
+        return self._plausibility.suspects
+
     def start(self) -> None:
         """Switch the torque on, at rest, and start watching the age of commands."""
         self._done.set()
@@ -73,16 +81,20 @@ class ServoRig:
         self._drive.prepare(self.bus, self.gate.config)  # again: a servo may have been rebooted, to clear an error
         self.bus.torque(True)
         self.gate.reset(self._drive.rest(self.bus))
+        self._plausibility.reset()
+        self._sent = self.gate.fallback
         threading.Thread(target=self._watch, args=(self._done,), name="sim2real:watchdog", daemon=True).start()
 
     def stop(self) -> None:
         """Switch the torque off; the rig can be started again."""
         self._done.set()
+        self._sent = None
         self.bus.torque(False)
 
     def stop_quietly(self) -> None:
         """Switch the torque off on a way out that has an error of its own to report; never raises."""
         self._done.set()
+        self._sent = None
         self.bus.make_safe()
 
     def close(self) -> None:
@@ -94,12 +106,16 @@ class ServoRig:
         """Read angles [rad], from the drive's zero, and velocities [rad/s] of all servos.
 
         Raises:
-            SafetyStop: A servo has stopped itself.
+            SafetyStop: A servo has stopped itself, or what it measures cannot be true.
             HardwareLost: The bus is silent.
         """
         self._check()
         self._supervise()
+        sent = self._sent
         reading = self._drive.reading(self.bus.read_state(self.ids))
+        position, asked = reading.position_rad, reading.transaction
+        effort = np.zeros(len(self.ids)) if sent is None else self._drive.effort(sent, position)
+        self._plausibility.check(position, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
         self._speed_rad_s = reading.velocity_rad_s
         return reading
 
@@ -119,6 +135,7 @@ class ServoRig:
         with self._lock:
             allowed = self.gate.apply(command, age_s, now_s, self._speed_rad_s)
             self._drive.send(self.bus, allowed)
+            self._sent = allowed
             self._commanded_s = time.monotonic()
         return allowed
 
@@ -174,7 +191,9 @@ class ServoRig:
                 late = not waiting and time.monotonic() - (self._commanded_s or 0.0) > timeout_s
                 if waiting or late:
                     try:
-                        self._drive.send(self.bus, self.gate.fallback)
+                        fallback = self.gate.fallback
+                        self._drive.send(self.bus, fallback)
+                        self._sent = fallback
                     except Sim2RealError as error:
                         self._failure = error
                         return

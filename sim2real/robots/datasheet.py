@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sim2real.hardware.drive import PositionDrive
-from sim2real.hardware.registers import PWM_FULL_SCALE, RAD_PER_COUNT
-
-P_GAIN_UNIT = 256
-"""P gain that gives a step of PWM for a count of error; measured on XL330, where the e-Manual says 128."""
+from sim2real.hardware.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COUNT
 
 
 @dataclass(frozen=True)

@@ -254,6 +254,8 @@ class ServoRobot(ABC):
             limits.command_timeout_s,
             limits.max_speed_rad_s,
             stale="hold",
+            joints=s.joints,
+            stuck_effort=limits.stuck_effort,
         )
         bus = BusConfig(port, s.baud_rate, watchdog_s=limits.servo_watchdog_s)
         return ServoSession(bus, gate, s.ids, s.sheet.drive, self.embedded, truth_path, seed)

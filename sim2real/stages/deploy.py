@@ -28,7 +28,7 @@ from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
-from sim2real.stages.rig import announce
+from sim2real.stages.rig import announce, warn
 from sim2real.stages.robot import Robot, Session
 from sim2real.stages.runs import StageFolder, finished, newest, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -59,6 +59,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
                 stage.output("truth", TRUTH)
             timing = [_deploy(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
         print(table(*timing_rows(timing[-1])))
+        for summary in timing:
+            warn(summary)
         episodes = [read_log(log) for log in logs]
         real = [
             _true_states(stage.folder / TRUTH, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)
@@ -82,6 +84,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
                     f"success, deployment {i}": round(e["real"]["success"], 3) for i, e in enumerate(result["episodes"])
                 },
                 "lost replies": timing[-1]["lost_replies"],
+                "late replies": timing[-1]["late_replies"],
                 "command timeouts": timing[-1]["command_timeouts"],
             }
         )

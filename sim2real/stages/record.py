@@ -11,7 +11,7 @@ from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.rig import announce
+from sim2real.stages.rig import announce, warn
 from sim2real.stages.robot import Robot
 from sim2real.stages.runs import StageFolder, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -42,10 +42,12 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
             summary = run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
         stage.output("timing", "timing.json").write_text(json.dumps(summary, indent=1))
         print(table(*timing_rows(summary)))
+        warn(summary)
         stage.summary(
             {
                 "seconds": config.duration_s,
                 "lost replies": summary["lost_replies"],
+                "late replies": summary["late_replies"],
                 "transactions": summary["transactions"],
                 "commands clamped": summary["gate"]["clamped"],
             }

@@ -22,6 +22,7 @@ from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
 from sim2real.stages.manifest import git_state, plain, versions
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.rig import answer_rows, rig_summary
 from sim2real.stages.robot import Robot, Session
 
 LATE_SHARE = 0.01
@@ -146,7 +147,7 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
         kinds = (node["period_s"], node["lateness_s"], ages)
         times = [q if q is None else round(1e3 * q, 2) for kind in kinds for q in kind]
         rows.append([name, node["steps"], *times, node["overruns"]])
-    return rows, [*headers, "overruns"]
+    return [*rows, *answer_rows(summary)], [*headers, "overruns"]
 
 
 def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str) -> None:
@@ -209,6 +210,7 @@ def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any
         "lost_replies": rig.bus.lost_replies,
         "retries": rig.bus.retries,
         "command_timeouts": rig.timeouts,
+        **rig_summary(rig),
         "gate": asdict(rig.gate.counts),
     }
 

@@ -109,12 +109,11 @@ class Joints:
 
 
 class Ramp:
-    """Position is 0.4 rad/s times time, whatever is commanded: a read tells when it was sampled."""
+    """Position is speed times time, whatever is commanded: a read tells when it was sampled."""
 
-    SPEED_RAD_S = 0.4
-
-    def __init__(self, ids=(1,)):
+    def __init__(self, ids=(1,), speed_rad_s=0.4):
         self.servo_ids = tuple(ids)
+        self.speed_rad_s = speed_rad_s
         self._t_s = 0.0
 
     def advance(self, t_s):
@@ -124,10 +123,10 @@ class Ramp:
         pass
 
     def measure(self, servo_id):
-        return self.SPEED_RAD_S * self._t_s, self.SPEED_RAD_S, 0.0
+        return self.speed_rad_s * self._t_s, self.speed_rad_s, 0.0
 
     def state(self):
-        return {"q": self.SPEED_RAD_S * self._t_s}
+        return {"q": self.speed_rad_s * self._t_s}
 
     def truth(self):
         return {}

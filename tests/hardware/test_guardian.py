@@ -25,7 +25,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.hardware.bus import BusConfig, ServoBus
 from sim2real.hardware.registers import OperatingMode
 
-bus = ServoBus(BusConfig({port!r}, watchdog_s=0.1, max_silence_s=1.0, guardian={guardian}))
+bus = ServoBus(BusConfig({port!r}, watchdog_s={watchdog_s}, max_silence_s=1.0, guardian={guardian}))
 
 def die_in_the_middle_of_a_packet(number, frame):
     os.write(bus._link.port.fd, bus._torque_off_packet[:9] + bytes(3))
@@ -36,6 +36,7 @@ ids = (1, 2, 3)
 bus.handshake(dict.fromkeys(ids))
 bus.setup(OperatingMode.PWM)
 bus.torque(True)
+bus.write_goal_pwm(dict.fromkeys(ids, 0.7))
 print(bus.guardian_pid, flush=True)
 try:
     while True:
@@ -54,9 +55,9 @@ def start_host(start_robot):
     """Start servos and a process that turns them; return robot, process and the guardian's process."""
     hosts = []
 
-    def start(guardian=True, **config):
+    def start(guardian=True, watchdog_s=0.5, **config):
         robot = start_robot(config=EmulatorConfig(model_number=XL330, actuation_latency_s=0.01, **config), ids=IDS)
-        code = HOST.format(port=robot.port, guardian=guardian)
+        code = HOST.format(port=robot.port, guardian=guardian, watchdog_s=watchdog_s)
         host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         hosts.append(host)
         pid = host.stdout.readline().strip()
@@ -90,7 +91,7 @@ def assert_off_soon(robot, since_ns, within_s=0.2):
 
 
 def test_without_a_guardian_this_firmware_goes_on_when_its_host_is_killed(start_host):
-    robot, host, _ = start_host(guardian=False)
+    robot, host, _ = start_host(guardian=False, watchdog_s=0.2)
     host.kill()
     time.sleep(0.4)
     for _, modes, goals in modes_of(robot):
@@ -109,7 +110,7 @@ def test_without_a_guardian_this_firmware_goes_on_when_its_host_is_killed(start_
     ids=["killed", "stopped", "half a packet", "bad line"],
 )
 def test_torque_is_off_within_200_ms(start_host, number, faults):
-    robot, host, _ = start_host(**faults)
+    robot, host, _ = start_host(watchdog_s=0.1 if number == signal.SIGSTOP else 0.5, **faults)
     since_ns = time.monotonic_ns()
     host.send_signal(number)
     time.sleep(0.5)
@@ -121,7 +122,7 @@ def test_torque_is_off_within_200_ms(start_host, number, faults):
 
 
 def test_a_process_that_wakes_again_ends_with_torque_off(start_host):
-    robot, host, _ = start_host()
+    robot, host, _ = start_host(watchdog_s=0.1)
     since_ns = time.monotonic_ns()
     host.send_signal(signal.SIGSTOP)
     time.sleep(0.3)

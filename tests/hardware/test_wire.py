@@ -51,7 +51,7 @@ def test_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
     (sample,) = bench.truth().of(Kind.SAMPLE)
     assert sample["t_ns"] == complete_ns - round(latency_s * 1e9)
     # The plant's position is a ramp: what was read tells when it was sampled.
-    expected_rad = bench.plant.SPEED_RAD_S * sample["t_ns"] * 1e-9
+    expected_rad = bench.plant.speed_rad_s * sample["t_ns"] * 1e-9
     assert sample["values"][0] == pytest.approx(expected_rad, abs=1e-9)
     assert position_rad(bench.sent[0][1]) == pytest.approx(expected_rad, abs=reg.RAD_PER_COUNT / 2 * 1.001)
 

@@ -1,5 +1,6 @@
 """What goes wrong while the robot moves: the exit code says it, the log is readable, the motor is off."""
 
+import json
 import time
 
 import numpy as np
@@ -55,6 +56,28 @@ def test_a_servo_that_stops_answering(make_pipeline, record):
     assert (modes[-1], goals[-1]) == (OperatingMode.PWM, 0.0)
     assert t_ns[-1] - trip["t_ns"] < 1e6
     assert np.any(goals != 0.0)
+
+
+ILL = """
+    def connect(port, limits, truth_path, seed):
+        return hardware.Session(port, limits, truth_path, seed, replace(hardware.EMBEDDED, {fault}))
+    """
+
+
+def test_an_encoder_that_stands_still_ends_the_recording(make_pipeline, record):
+    name = make_pipeline("frozen_encoder", ILL.format(fault="frozen_after_s=2.0"))
+    code, said, folder = record(name, "--excitation", "steps", duration_s=20)
+    assert code == errors.SAFETY_STOP
+    assert "joint 'hinge' has read " in said
+    assert "though it was pushed both ways with more than 20% of its torque" in said
+    assert_torque_ends_off(read_truth(folder / "truth.bin"))
+
+
+def test_late_answers_are_told(make_pipeline, record):
+    code, said, folder = record(make_pipeline("late_answers", ILL.format(fault="late=0.3")), duration_s=1)
+    assert code == errors.OK
+    assert "of the answers came late: when those samples were taken is not sure" in said
+    assert json.loads((folder / "timing.json").read_text())["late_replies"] >= 10
 
 
 @pytest.mark.parametrize("culprit", ["sensor", "agent"])

@@ -1,0 +1,112 @@
+"""Whether what the joints are said to do can be true: no motor leaps, none stands still while it is pushed about."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim2real.errors import SafetyStop
+from sim2real.hardware.gate import GateConfig
+
+_STAMP_S = 0.01
+"""By how much the time between two samples may be wrong [s]: a servo may answer with a sample that it took before."""
+_PLAY_RAD = 0.05
+"""What a reading may jump besides [rad]: 33 counts."""
+_HARD = 10.0
+"""So many times ``stuck_s`` a push one way, which a weight explains, is suspect."""
+
+
+class Plausibility:
+    """Judges measured positions; the limits are the gate's.
+
+    **A leap.** No position may change by more than the fastest joint could have moved, ``max_speed_rad_s`` times the
+    time since the last sample, plus what times and readings may be wrong by.
+
+    **A joint that stands still** reads exactly the same, to the count. That is normal for one that rests, holds, sticks
+    or has come to a stop. It is not for one that was pushed both ways, each time with more than ``stuck_effort`` of its
+    torque for ``stuck_s`` on end: the robot is stopped. One whose push has only changed, by twice as much for as long,
+    may lie on something, and one that is pushed one way, twice as hard for ten times as long, may hold a weight: those
+    are suspect, and said to be so.
+
+    Args:
+        config: The gate's limits.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was measured: torque goes on, or off."""
+        self.suspects: list[str] = []
+        self._t_s: float | None = None
+        self._unsure_s = 0.0
+        self._position = self._since_s = self._start = self._held_s = self._longest_s = np.zeros(0)
+
+    def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+        """Take in a measurement.
+
+        Args:
+            position_rad: Of the joints (n,).
+            t_s: When it was taken.
+            unsure_s: By how much that may be wrong.
+            effort: With how much of their torque the joints are pushed (n,) in [-1, 1].
+
+        Raises:
+            SafetyStop: A joint leapt, or stands still while it is pushed about.
+        """
+        if self._t_s is None or len(position_rad) != len(self._position):
+            self._begin(position_rad, t_s, unsure_s, effort)
+            return
+        elapsed_s = max(0.0, t_s - self._t_s)
+        self._require_reachable(position_rad, elapsed_s + unsure_s + self._unsure_s)
+        self._t_s, self._unsure_s = t_s, unsure_s
+        moved = position_rad != self._position
+        self._position = position_rad.copy()
+        self._since_s[moved], self._start[moved] = t_s, effort[moved]
+        self._held_s[:, moved] = self._longest_s[:, moved] = 0.0
+        self._require_motion(effort, elapsed_s)
+
+    def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+        n = len(position_rad)
+        self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
+        self._since_s, self._start = np.full(n, t_s), effort.copy()
+        # Rows: pushed up, down, otherwise than at first, hard up, hard down; how long until now, and at the longest.
+        self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+
+    def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
+        if self._config.max_speed_rad_s is None:
+            return
+        limit = np.broadcast_to(np.asarray(self._config.max_speed_rad_s, np.float64), position_rad.shape)
+        most = limit * (elapsed_s + _STAMP_S) + _PLAY_RAD
+        leap = np.abs(position_rad - self._position)
+        worst = int(np.argmax(leap - most))
+        if leap[worst] > most[worst]:
+            raise SafetyStop(
+                f"{self._config.joint(worst)} reads {position_rad[worst]:.6g} rad, {leap[worst]:.6g} rad from the last "
+                f"reading: at its fastest, {limit[worst]:.4g} rad/s, it can have moved by {most[worst]:.3g} rad",
+                hint="look at the encoder and the cable; max_speed_rad_s sets what is possible",
+            )
+
+    def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
+        config = self._config
+        limit = np.broadcast_to(np.asarray(config.stuck_effort, np.float64), effort.shape)
+        more = 2.0 * limit
+        other = np.abs(effort - self._start) >= more
+        pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
+        self._held_s = np.where(pushed, self._held_s + elapsed_s, 0.0)
+        before = self._longest_s
+        self._longest_s = np.maximum(before, self._held_s)
+        enough_s = config.stuck_s * np.array([[1.0], [1.0], [1.0], [_HARD], [_HARD]])
+        was_long, long = before >= enough_s, self._longest_s >= enough_s
+        for i in np.flatnonzero(long[0] & long[1]):
+            raise SafetyStop(
+                f"{self._standing(int(i))}, though it was pushed both ways with more than {limit[i]:.0%} of its torque",
+                hint="is it blocked, its encoder stuck, its supply off? stuck_effort sets the limit",
+            )
+        for i in np.flatnonzero(long[2:].any(axis=0) & ~was_long[2:].any(axis=0)):
+            how = "what pushes it changed by" if long[2, i] else "it is pushed with"
+            self.suspects.append(f"{self._standing(int(i))}, though {how} {more[i]:.0%} of its torque")
+
+    def _standing(self, index: int) -> str:
+        lasted_s = (self._t_s or 0.0) - self._since_s[index]
+        return f"{self._config.joint(index)} has read {self._position[index]:.6g} rad for {lasted_s:.2f} s"

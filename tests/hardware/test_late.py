@@ -1,0 +1,39 @@
+"""Answers that come late, or not at all: the time of a sample is right, or said to be unsure."""
+
+import numpy as np
+import pytest
+
+from sim2real.hardware.wire import EmulatorConfig
+
+SPEED_RAD_S = 40.0
+
+
+@pytest.mark.parametrize("ids", [(1,), (1, 2)])
+@pytest.mark.parametrize("late_s", [0.009, 0.006])
+def test_late_answers_do_not_move_the_time_of_a_sample(start_robot, open_bus, ids, late_s):
+    """The position tells when it was sampled: 0.04 ms a count."""
+    robot = start_robot("Ramp", EmulatorConfig(late=0.3, late_s=late_s, seed=5), ids=ids, speed_rad_s=SPEED_RAD_S)
+    bus = open_bus(robot, ids)
+    readings = [bus.read_state() for _ in range(60)]
+    sampled_s = np.array([r.position_rad for r in readings]) / SPEED_RAD_S
+    sent_s = np.array([r.transaction.t_sent_ns - robot.truth().header["start_ns"] for r in readings]) * 1e-9
+    # None was taken before its instruction was sent, as a stamp that is too late says; later ones are the machine's.
+    assert (sent_s[:, None] - sampled_s).max() < 0.002
+    assert bus.late_replies >= 10
+    assert np.count_nonzero([r.transaction.late_ns > 4e6 for r in readings]) >= (10 if late_s < 0.008 else 0)
+    assert bus.late_s.max() < 0.1
+
+
+def test_answers_in_time_are_not_called_late(start_robot, open_bus):
+    bus = open_bus(start_robot(config=EmulatorConfig(reply_loss=0.1, seed=1)))
+    for _ in range(40):
+        bus.read_state()
+    assert bus.lost_replies >= 2
+    assert bus.late_replies < 10  # a busy machine may have some
+
+
+def test_misses_in_a_row_are_no_lost_bus_while_they_are_short(start_robot, open_bus):
+    """Five times 8 ms: on a busy laptop that happens, and a command may be 0.1 s old anyway."""
+    robot = start_robot(config=EmulatorConfig(reply_loss=0.7, seed=1))
+    bus = open_bus(robot, max_silence_s=0.2)
+    assert max(bus.read_state().transaction.retries for _ in range(12)) >= 5

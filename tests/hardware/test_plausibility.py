@@ -1,0 +1,151 @@
+"""What cannot be true of a measurement stops the robot; what is normal does not."""
+
+import time
+
+import numpy as np
+import pytest
+
+from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.bus import BusConfig
+from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.plausibility import Plausibility
+from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.wire import EmulatorConfig
+
+PERIOD_S = 0.02
+CONFIG = GateConfig(max_speed_rad_s=(10.0, 2.0), joints=("pan", "tilt"))
+STILL = np.array([0.5, -0.25])
+
+
+def judge(efforts, positions=STILL, config=CONFIG):
+    """Feed one row of efforts (N, 2) and positions a period; return the judge."""
+    judge = Plausibility(config)
+    efforts = np.asarray(efforts, float)
+    for i, (effort, position) in enumerate(zip(efforts, np.broadcast_to(positions, efforts.shape), strict=True)):
+        judge.check(position, i * PERIOD_S, 0.0, effort)
+    return judge
+
+
+def pushes(*rows):
+    """Return efforts (N, 2) of the second joint from (effort, seconds)."""
+    tilt = np.concatenate([np.full(round(s / PERIOD_S), e) for e, s in rows])
+    return np.stack([np.zeros_like(tilt), tilt], axis=1)
+
+
+@pytest.mark.parametrize(
+    "efforts",
+    [
+        pushes((0.0, 5.0)),
+        pushes((0.15, 2.0), (-0.15, 2.0)),  # sticks
+        pushes((0.3, 5.0)),  # holds a weight
+        pushes((0.6, 1.5)),  # a heavy one, for a while
+        pushes((-0.3, 5.0), (0.3, 0.1)),  # has held, and has not answered yet
+        np.where(np.arange(500)[:, None] // 4 % 2, [0.0, 0.5], [0.0, -0.5]),  # shivers at 6 Hz
+    ],
+    ids=["rest", "friction", "weight", "heavy weight", "latency", "shiver"],
+)
+def test_a_joint_that_stands_still_is_normal(efforts):
+    assert judge(efforts).suspects == []
+
+
+def test_a_joint_that_is_pushed_both_ways_and_stands_still_is_stopped():
+    message = r"joint 'tilt' has read -0.25 rad for 0\.\d+ s, though it was pushed both ways with more than 20%"
+    with pytest.raises(SafetyStop, match=message):
+        judge(pushes((0.25, 0.3), (-0.25, 0.3)))
+    moving = np.stack([np.zeros(30), 0.001 * np.arange(30)], axis=1)
+    assert judge(pushes((0.25, 0.3), (-0.25, 0.3)), moving).suspects == []
+    patient = GateConfig(joints=("pan", "tilt"), stuck_effort=(0.2, 0.4))
+    assert judge(pushes((0.3, 0.3), (-0.3, 0.3)), config=patient).suspects == []
+
+
+def test_a_joint_that_is_pushed_otherwise_than_before_is_suspect_once():
+    (said,) = judge(pushes((0.3, 1.0), (0.8, 2.0), (0.3, 1.0), (0.8, 1.0))).suspects
+    assert said.startswith("joint 'tilt' has read -0.25 rad for 1.")
+    assert said.endswith("though what pushes it changed by 40% of its torque")
+    (said,) = judge(pushes((0.5, 5.0))).suspects
+    assert said == "joint 'tilt' has read -0.25 rad for 2.00 s, though it is pushed with 40% of its torque"
+
+
+def test_a_leap_names_joint_value_and_limit():
+    def leap(index, by_rad, after_s=PERIOD_S, unsure_s=0.0):
+        judge = Plausibility(CONFIG)
+        judge.check(STILL, 1.0, 0.0, np.zeros(2))
+        position = STILL.copy()
+        position[index] += by_rad
+        judge.check(position, 1.0 + after_s, unsure_s, np.zeros(2))
+
+    leap(0, 0.3)
+    leap(1, 0.1)
+    leap(1, 1.9, after_s=1.0)  # torque was off, and a hand was there
+    leap(1, 0.15, unsure_s=0.05)  # a late answer
+    message = (
+        r"joint 'tilt' reads 0.05 rad, 0.3 rad from the last reading: at its fastest, 2 rad/s, it can have moved by "
+    )
+    with pytest.raises(SafetyStop, match=message + r"0\.11 rad"):
+        leap(1, 0.3)
+
+
+def test_limits_that_make_no_sense():
+    for limits in ({"stuck_effort": 0.0}, {"stuck_s": -1.0}, {"max_speed_rad_s": (1.0, 0.0)}):
+        with pytest.raises(UsageError, match="must be larger than 0"):
+            GateConfig(**limits)
+
+
+@pytest.fixture
+def open_rig(start_robot):
+    rigs = []
+
+    def open_(plant, drive, gate, config, ids):
+        robot = start_robot(plant, config)
+        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
+        rigs.append(ServoRig(bus, gate, ids, drive))
+        return rigs[-1]
+
+    yield open_
+    for rig in rigs:
+        rig.close()
+
+
+SERVOS = {
+    "volts": ("FirstOrder", VoltageDrive(5.0), {"limit": 4.0}, (1,)),
+    "angles": ("Joints", PositionDrive(800, 5.0), {"limit": 2.0, "stale": "hold"}, (1, 2, 3)),
+}
+
+
+def swing(rig, duration_s):
+    """Push to and fro for a while, 0.3 s each way, as far as the drive lets a joint be pushed that does not follow."""
+    rig.start()
+    begin_s = time.monotonic()
+    while (t_s := time.monotonic() - begin_s) < duration_s:
+        sign = 1.0 if int(t_s / 0.3) % 2 else -1.0
+        rig.measure()
+        rig.command(np.full(len(rig.ids), sign * 1.9), 0.0, time.monotonic())
+        time.sleep(PERIOD_S)
+
+
+@pytest.mark.parametrize("kind", SERVOS)
+def test_an_encoder_that_stands_still_stops_the_robot(open_rig, kind):
+    plant, drive, gate, ids = SERVOS[kind]
+    gate = GateConfig(**gate, max_speed_rad_s=60.0)
+    rig = open_rig(plant, drive, gate, EmulatorConfig(frozen_after_s=0.8), ids)
+    with pytest.raises(SafetyStop, match=r"joint \d has read .* rad for .* s, though it was pushed both ways"):
+        swing(rig, 5.0)
+
+
+@pytest.mark.parametrize("kind", SERVOS)
+def test_a_position_that_no_motor_reaches_stops_the_robot(open_rig, kind):
+    plant, drive, gate, ids = SERVOS[kind]
+    gate = GateConfig(**gate, max_speed_rad_s=60.0)
+    rig = open_rig(plant, drive, gate, EmulatorConfig(wild=0.05, seed=2), ids)
+    with pytest.raises(SafetyStop, match=r"joint \d reads \S+ rad, \S+ rad from the last reading"):
+        swing(rig, 5.0)
+
+
+@pytest.mark.parametrize("kind", SERVOS)
+def test_joints_that_follow_are_not_suspect(open_rig, kind):
+    plant, drive, gate, ids = SERVOS[kind]
+    rig = open_rig(plant, drive, GateConfig(**gate, max_speed_rad_s=60.0), None, ids)
+    swing(rig, 1.0)
+    assert rig.suspects == []
+    rig.stop()
