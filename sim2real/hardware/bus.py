@@ -186,8 +186,11 @@ class ServoBus:
         if on and self._halted:
             raise SafetyStop("torque stays off: the bus has been made safe", hint="open the bus again")
         self._armed = False
+        guardian = self._link.guardian
         if on:
             self._guard()
+        elif guardian is not None and not guardian.settle():
+            guardian.disarm()  # that it has acted, or died, is no reason to leave the torque on
         for servo_id in self._ids:
             if on:
                 self.write(servo_id, reg.BUS_WATCHDOG, 0)
@@ -195,8 +198,8 @@ class ServoBus:
             self.write(servo_id, reg.TORQUE_ENABLE, int(on))
             self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count if on else 0)
         self._armed = on
-        if not on and self._link.guardian is not None:
-            self._link.guardian.disarm()
+        if not on and guardian is not None:
+            guardian.disarm()
 
     def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
         """Read position, velocity and load of some servos (default: all) in one transaction."""

@@ -98,14 +98,22 @@ class Guardian:
         return self._process.pid
 
     def arm(self) -> None:
-        """Ask it to watch for silence, before torque goes on."""
+        """Ask it to watch for silence, before torque goes on.
+
+        Raises:
+            SafetyStop: As of `beat`.
+        """
         with self._lock:
             self._armed, self._beat_s = True, 0.0
-        self.beat()
+        try:
+            self.beat()
+        except SafetyStop:
+            self._armed = False
+            raise
 
     def disarm(self) -> None:
-        """Allow silence: torque is off."""
-        with self._lock:  # a sign of life after this one would have it watch on
+        """Allow silence: torque is off. Never raises: if it has died, the next `arm` tells."""
+        with self._lock, suppress(SafetyStop):  # locked: a sign of life after this one would have it watch on
             self._armed = False
             self._say(process.REST)
 
@@ -129,12 +137,20 @@ class Guardian:
             hint="was it stopped, or the machine too busy? servo_watchdog_s sets the limit",
         )
 
-    def settle(self) -> None:
-        """Let it finish what it is doing on the bus, if it has taken over. Never raises."""
-        with suppress(SafetyStop):
-            self._listen()
-            if self._said and process.SAFE not in self._said:
-                self._hears(process.SAFE, _SETTLE_TIMEOUT_S)
+    def settle(self) -> bool:
+        """Let it finish what it is doing on the bus, if it has taken over. Never raises.
+
+        Returns:
+            Whether it still watches: it has neither taken over nor died.
+        """
+        try:
+            with self._lock:
+                self._listen()
+        except SafetyStop:
+            return False
+        if self._said and process.SAFE not in self._said:
+            self._hears(process.SAFE, _SETTLE_TIMEOUT_S)
+        return not self._said
 
     def end(self, confirmed: bool) -> None:
         """Let it go. Never raises.

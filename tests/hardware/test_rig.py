@@ -27,7 +27,7 @@ def open_rig(start_robot):
     """Open a rig on a servo whose speed follows its voltage: 6 rad/s at 5 V."""
     rigs = []
 
-    def open_(config=None, watchdog_s=0.1, **gate):
+    def open_(config=None, watchdog_s=0.4, **gate):
         robot = start_robot("FirstOrder", config)
         # Patient with lost answers, for the machine may be busy; not with the host itself.
         bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s)
