@@ -129,7 +129,7 @@ class ServoBus:
         for servo_id, number in zip(self._ids, self._models, strict=True):
             kinds.setdefault(number, []).append(servo_id)
         what = {number: model(number).without_host(self.config.watchdog_s) for number in kinds}
-        return [f"{model(n).name} (servo {', '.join(map(str, ids))}): {what[n]}" for n, ids in kinds.items()]
+        return [f"{model(n).name} (servo {', '.join(map(str, ids))}) {what[n]}" for n, ids in kinds.items()]
 
     def handshake(self, expected: Mapping[int, int | None]) -> dict[int, int]:
         """Find the servos; from now on they are the ones whose torque `close` takes off.

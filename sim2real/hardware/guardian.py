@@ -54,7 +54,7 @@ class Guardian:
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = 0.0
         self._armed = False
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal's handler may close the bus in the middle of `beat`
         self._said = b""
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)

@@ -18,7 +18,7 @@ LATE_SHARE = 0.01
 def announce(session: Session) -> None:
     """Say what the servos do by themselves when this computer's side dies, and what stops them then."""
     for line in session.rig.bus.without_host():
-        note(f"if this process dies, {line}; the guardian takes the torque off")
+        note(f"if this process dies: {line}; the guardian takes the torque off")
 
 
 def rig_summary(rig: ServoRig) -> dict[str, Any]:

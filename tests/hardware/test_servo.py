@@ -142,6 +142,20 @@ def test_tripped_watchdog_blocks_goals_until_zero_is_written(servo):
     assert write(servo, reg.GOAL_PWM, 300) == StatusError.NONE
 
 
+@pytest.mark.parametrize(("model", "stops", "goal"), [(1200, None, 300), (1200, True, 0), (1060, False, 300)])
+def test_a_330_that_has_tripped_refuses_goals_but_turns_on_until_torque_is_off(model, stops, goal):
+    servo = Servo(1, model, watchdog_stops=stops)
+    in_mode(servo, OperatingMode.PWM)
+    write(servo, reg.GOAL_PWM, 300)
+    write(servo, reg.BUS_WATCHDOG, 5)
+    servo.trip_watchdog()
+    assert servo.read(reg.BUS_WATCHDOG.address, 1) == (StatusError.NONE, b"\xff")
+    assert servo.command() == (OperatingMode.PWM, reg.fraction_from_pwm(goal))
+    assert write(servo, reg.GOAL_PWM, 0) == StatusError.DATA_RANGE
+    assert write(servo, reg.TORQUE_ENABLE, 0) == StatusError.NONE
+    assert servo.command() == (OperatingMode.OFF, 0.0)
+
+
 def test_watchdog_watches_only_while_torque_is_on(servo):
     write(servo, reg.BUS_WATCHDOG, 5)
     assert servo.watchdog_deadline_ns() is None

@@ -1,6 +1,7 @@
 """Timing of the emulated bus in virtual time, where every instant can be told exactly."""
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -340,3 +341,40 @@ def test_watchdog_stops_position_servos_and_refuses_goals_without_a_word(make_be
     truth = bench.truth()
     assert truth.of(Kind.WATCHDOG)["servo_id"].tolist() == [1, 2]
     assert truth.of(Kind.EFFECT)["values"][-2:, :2].tolist() == [[16.0, 0.0]] * 2
+
+
+def read_state(bench, t_ns):
+    """Return velocity and position [counts] of servo 1, read at a time, and when the answer came."""
+    bench.send(t_ns, build(1, Instruction.READ, bytes((128, 0, 8, 0))))
+    bench.run_until(t_ns + 19 * MS)
+    ((arrived_ns, answer),) = [bench.sent.pop() for _ in range(len(bench.sent))]
+    return *struct.unpack("<ii", answer[9:17]), arrived_ns
+
+
+def test_an_encoder_stands_still_while_the_plant_goes_on(make_bench):
+    bench = make_bench("Ramp", EmulatorConfig(frozen_after_s=0.1))
+    before, at, after = (read_state(bench, t * MS) for t in (60, 120, 300))
+    assert 0 < before[1] < at[1] == after[1]
+    assert before[0] > 0 == at[0] == after[0]
+    assert bench.truth().of(Kind.SAMPLE)["values"][-1, 0] == pytest.approx(0.4 * 0.3, abs=1e-3)
+
+
+def test_wild_positions_have_a_good_checksum_and_no_motor_reaches_them(make_bench):
+    bench = make_bench("Ramp", EmulatorConfig(wild=0.5))
+    counts = np.array([read_state(bench, 20 * i * MS)[1] for i in range(1, 30)])
+    wild = np.abs(counts * reg.RAD_PER_COUNT) > 10_000.0
+    assert 5 < wild.sum() < 25
+    assert np.all(np.abs(counts[~wild]) < 1000)
+
+
+def test_late_answers_come_in_order(make_bench):
+    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, late=0.3, late_s=0.009))
+    arrived_ms = np.array([read_state(bench, 20 * i * MS)[2] / MS - 20 * i for i in range(1, 30)])
+    late = arrived_ms > 8.0
+    assert 3 < late.sum() < 20
+    assert np.ptp(arrived_ms[~late]) < 0.01
+    np.testing.assert_allclose(arrived_ms[late] - arrived_ms[~late].mean(), 9.0, atol=0.01)
+    for i in range(6):
+        bench.send((700 + i) * MS, build(1, Instruction.PING))
+    bench.run_until(900 * MS)
+    assert np.all(np.diff([t_ns for t_ns, _ in bench.sent]) >= 0)

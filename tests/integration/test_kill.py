@@ -59,7 +59,7 @@ def test_a_recording_that_is_stopped_and_wakes_again_ends_in_order(tmp_path, lon
     said = process.communicate(timeout=20)[1]
     assert process.returncode == SAFETY_STOP
     assert "the guardian has taken the torque off: this process was silent for 0.1 s" in said
-    assert "if this process dies, XL330-M077 (servo 1): notices after 0.1 s, but goes on" in said
+    assert "if this process dies: XL330-M077 (servo 1) notices after 0.1 s, but goes on" in said
     assert_off_soon(end_robot(), since_ns)
     assert (manifest_of(log.parent)["status"], read_log(log).complete) == ("failed", True)
 
