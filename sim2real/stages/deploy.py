@@ -85,6 +85,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
                 },
                 "lost replies": timing[-1]["lost_replies"],
                 "late replies": timing[-1]["late_replies"],
+                "odd measurements": sum(len(summary["suspects"]) for summary in timing),
                 "command timeouts": timing[-1]["command_timeouts"],
             }
         )

@@ -191,6 +191,19 @@ def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(
     assert again.read(1, reg.TORQUE_ENABLE) == 1
 
 
+def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM)
+    for _ in range(50):
+        bus.read_state()
+        time.sleep(0.005)
+    asked = bus.transactions + bus.retries
+    bus.close()  # which asks twice more, or so
+    robot.stop()
+    kinds = robot.truth().rows["kind"]
+    assert 50 < np.count_nonzero(np.isin(kinds, (Kind.SAMPLE, Kind.REPLY))) <= asked + 4
+
+
 def test_it_needs_little_and_so_starts_soon():
     code = "import sys; sys.path.insert(0, sys.argv[1]); import guardian_process; print(*sys.modules)"
     command = [sys.executable, "-I", "-S", "-c", code, os.path.dirname(guardian_process.__file__)]

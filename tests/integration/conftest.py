@@ -18,7 +18,10 @@ TINY = [
     *("--identify.generations=10", "--identify.population=8", "--train.episode-s=2", "--train.timelines=4"),
     *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
     *("--train.ppo.evaluations=1", "--train.ppo.eval-envs=4", "--deploy.episodes=1", "--deploy.duration-s=2"),
+    "--deploy.gate.servo-watchdog-s=0.4",
 ]
+"""Budgets, and patience with a busy machine."""
+RECORDING = ["--duration-s", "12", "--seed", "1", "--gate.servo-watchdog-s", "0.4"]
 
 FAULTY = """
 import time
@@ -49,7 +52,7 @@ def root(tmp_path_factory):
 @pytest.fixture(scope="session")
 def recorded(root):
     """The run folder of a recording of 12 s."""
-    assert cli.main(["record", "pendulum", "--duration-s", "12", "--seed", "1", "--runs", str(root)]) == 0
+    assert cli.main(["record", "pendulum", *RECORDING, "--runs", str(root)]) == 0
     (run_dir,) = (root / "pendulum").iterdir()
     return run_dir
 
