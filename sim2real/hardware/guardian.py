@@ -37,7 +37,7 @@ class Guardian:
     """A process of its own that takes the torque off when this one dies, or says nothing while torque is on.
 
     It shares the open port and its lock: nobody else gets the port before the torque is off. In normal operation it
-    only listens to `beat`, which costs 3 us every tenth of `silence_s`. What it did is said on stderr.
+    only listens to `beat`, which costs 2 us every tenth of `silence_s`. What it did is said on stderr.
 
     Args:
         port_fd: The open port.
