@@ -17,6 +17,8 @@ from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.truth import Kind
 from sim2real.hardware.wire import EmulatorConfig
 
+pytestmark = pytest.mark.realtime
+
 IDS = (1, 2, 3)
 XL330 = 1200
 HOST = """

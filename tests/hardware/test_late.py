@@ -5,6 +5,8 @@ import pytest
 
 from sim2real.hardware.wire import EmulatorConfig
 
+pytestmark = pytest.mark.realtime
+
 SPEED_RAD_S = 40.0
 
 

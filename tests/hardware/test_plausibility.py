@@ -13,6 +13,8 @@ from sim2real.hardware.plausibility import Plausibility
 from sim2real.hardware.rig import ServoRig
 from sim2real.hardware.wire import EmulatorConfig
 
+pytestmark = pytest.mark.realtime
+
 PERIOD_S = 0.02
 CONFIG = GateConfig(max_speed_rad_s=(10.0, 2.0), joints=("pan", "tilt"))
 STILL = np.array([0.5, -0.25])
