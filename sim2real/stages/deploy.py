@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,7 +29,7 @@ from sim2real.stages.console import note, table
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
 from sim2real.stages.rig import announce, warn
-from sim2real.stages.robot import Robot, Session
+from sim2real.stages.robot import Robot, Session, moving_robot
 from sim2real.stages.runs import StageFolder, finished, newest, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 from sim2real.stages.train import computation_delays, load_parameters
@@ -47,7 +47,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the bundle.
     """
-    robot = cast(Robot, pipeline.load())
+    robot = moving_robot(pipeline)
     bundle, run_dir = _find_bundle(pipeline, config, root, run_dir)
     policy = _load_policy(robot, bundle)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir) as stage:

@@ -15,6 +15,7 @@ from sim2real.identify.uncertainty import Uncertainty, sum_of
 from sim2real.identify.verdict import Verdict
 from sim2real.stages.console import note, table
 from sim2real.stages.manifest import sha256
+from sim2real.stages.runs import portable
 
 ROUND_TRIP = "round_trip_delay"
 SURE_S = 0.005
@@ -24,15 +25,16 @@ SURE_S = 0.005
 def document(
     pipeline: str,
     logs: Sequence[Path],
+    run_dir: Path,
     found: Fit,
     spread: Uncertainty,
     check: Check,
     verdict: Verdict,
     truth: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return what an identification found, as JSON takes it."""
+    """Return what an identification found, as JSON takes it; logs in the run folder are named relative to it."""
     names = list(found.problem.table.names)
-    hashes = [{"path": str(p.resolve()), "sha256": sha256(p)} for p in logs]
+    hashes = [{"path": portable(p, run_dir), "sha256": sha256(p)} for p in logs]
     return {
         "format": 2,
         "pipeline": pipeline,

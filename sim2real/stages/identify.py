@@ -84,7 +84,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         outside = beyond(model, logs.episodes, windows, config.settle_s + config.horizon_s)
         verdict = judge(errors, spread, found.problem.table.names, check, shifted, outside)
         truth = true_values(paths[0].with_name(TRUTH), logs.episodes[0]) if config.reveal else {}
-        document = identified.document(pipeline.name, logs.paths, found, spread, check, verdict, truth)
+        document = identified.document(pipeline.name, logs.paths, stage.run_dir, found, spread, check, verdict, truth)
         document |= {
             "units": dict(robot.UNITS),
             "prediction": errors,

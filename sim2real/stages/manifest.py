@@ -19,6 +19,9 @@ from typing import Any
 from sim2real.errors import Sim2RealError
 
 MANIFEST = "manifest.json"
+_DRAFT = f".{MANIFEST}.tmp"
+# Most manifests have 4 kB; the rest is for summaries.
+_RESERVED_BYTES = 32 * 1024
 PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
 
 
@@ -38,12 +41,22 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
         TypeError: When a value has no plain JSON form.
     """
     text = json.dumps(plain(manifest), indent=2, allow_nan=False)
-    draft = folder / f".{MANIFEST}.tmp"
-    with draft.open("w", encoding="utf-8") as file:
-        file.write(text + "\n")
+    draft = folder / _DRAFT
+    # Written over what `reserve` left: cut to its length only afterwards.
+    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
+        file.write(f"{text}\n".encode())
+        file.truncate()
         file.flush()
         os.fsync(file.fileno())
     os.replace(draft, folder / MANIFEST)
+
+
+def reserve(folder: Path) -> None:
+    """Take room on the disk for the folder's next manifest: on a full one it must still say how the stage ended."""
+    with (folder / _DRAFT).open("wb") as file:
+        file.write(b" " * _RESERVED_BYTES)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def plain(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import cast
 
 from sim2real.runtime.clock import realtime
 from sim2real.stages.config import RecordConfig
@@ -12,7 +11,7 @@ from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.rig import announce, warn
-from sim2real.stages.robot import Robot
+from sim2real.stages.robot import moving_robot
 from sim2real.stages.runs import StageFolder, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 
@@ -29,7 +28,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         root: Folder of all runs.
         run_dir: Run folder to add to; None makes a new one.
     """
-    robot = cast(Robot, pipeline.load())
+    robot = moving_robot(pipeline)
     signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
     with open_stage(root, pipeline.name, "record", config, run_dir=run_dir) as stage:
         log = stage.output("log", LOG)

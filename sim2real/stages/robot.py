@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.rig import ServoRig
 from sim2real.identify.model import IdentifiableModel
+from sim2real.stages.pipeline import Pipeline
 from sim2real.train.env import Task
 
 
@@ -108,3 +110,19 @@ class Robot(Identifiable, Protocol):
                 the command that reached the motors, ``command`` where it is one number.
         """
         ...
+
+
+def moving_robot(pipeline: Pipeline) -> Robot:
+    """Return the parts of a robot that can be recorded, trained for and deployed on.
+
+    Raises:
+        UsageError: When the pipeline is of recordings alone: it only knows what identification needs.
+    """
+    robot = pipeline.load()
+    if not hasattr(robot, "connect"):
+        name = pipeline.name
+        raise UsageError(
+            f"pipeline {name!r} is of recordings that somebody else made: there is no robot to record, train or deploy",
+            hint=f"import a recording with `sim2real import FILE --pipeline {name}`, then `sim2real identify {name}`",
+        )
+    return cast(Robot, robot)

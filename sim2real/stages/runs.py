@@ -1,11 +1,15 @@
 """Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a manifest.
 
-A stage that is run again in the same run folder moves the earlier attempt to ``<stage>.1``, ``<stage>.2``, ...: nothing
-recorded is ever overwritten, and a failed attempt does not hide a finished one.
+A stage that is run again in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: a folder is made once, by the
+process that writes into it, and never renamed. So two processes cannot meet in one, nothing recorded is overwritten,
+what refers to a file in one goes on being right, and a failed attempt does not hide a finished one.
 """
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -16,10 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
-from sim2real.stages.manifest import git_state, plain, read_manifest, sha256, versions, write_manifest
+from sim2real.stages.manifest import git_state, plain, read_manifest, reserve, sha256, versions, write_manifest
 
 STAGES = ("record", "identify", "train", "deploy")
 INTERRUPTED = 130
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NAME = re.compile(r"\w[\w.-]*")
 
 
 @dataclass(frozen=True)
@@ -133,13 +139,19 @@ def open_stage(
         signal), with the exit code that the command ends with.
 
     Raises:
-        UsageError: When there is no such stage.
-        Sim2RealError: When an input, or an output after the block, does not exist.
+        UsageError: When there is no such stage, or the pipeline's name is none for a folder.
+        Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
     if stage not in STAGES:
         raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
-    hashed = {n: {"path": str(Path(p).resolve()), "sha256": sha256(Path(p))} for n, p in (inputs or {}).items()}
+    # The name may come out of a file of somebody else's: it must not lead out of the folder of runs.
+    if not _NAME.fullmatch(pipeline):
+        raise UsageError(
+            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
+        )
+    hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
+    hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
     running = OpenStage(folder)
     manifest: dict[str, Any] = {
         "format": 1,
@@ -157,15 +169,35 @@ def open_stage(
         "versions": versions(),
         "git": git_state(),
     }
-    write_manifest(folder, manifest)
     start = time.monotonic()
     try:
+        write_manifest(folder, manifest)
+        reserve(folder)
         yield running
         _close(running, manifest, start, "finished", OK)
     except BaseException as error:
-        status, code = _failure(error)
-        _close(running, manifest, start, status, code, error)
-        raise
+        told = _in_words(error, folder)
+        try:
+            _close(running, manifest, start, *_failure(told), told)
+        except OSError as other:
+            told.add_note(f"then: the manifest could not be written: {other}")
+        if told is error:
+            raise
+        raise told from error
+
+
+def portable(path: Path, run_dir: Path) -> str:
+    """Return a path as an artifact of a run refers to it: relative to the run folder where it lies inside.
+
+    A run that is moved, or copied to another machine, still finds what it refers to; `resolved` is the way back.
+    """
+    full, home = path.resolve(), run_dir.resolve()
+    return full.relative_to(home).as_posix() if full.is_relative_to(home) else str(full)
+
+
+def resolved(path: str, run_dir: Path) -> Path:
+    """Return the path that an artifact of a run refers to."""
+    return run_dir / path
 
 
 def new_run(root: Path, pipeline: str) -> Path:
@@ -185,14 +217,10 @@ def new_run(root: Path, pipeline: str) -> Path:
 
 def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
     """Return all attempts at a stage in a run folder, the latest first."""
-
-    def age(folder: Path) -> int:
-        # `train` is the current attempt; of the earlier ones the highest number is the latest.
-        return -int(folder.suffix[1:]) if folder.suffix else -sys.maxsize
-
     folders = [run_dir / stage, *(f for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdigit())]
-    found = [(folder, read_manifest(folder)) for folder in sorted(folders, key=age)]
-    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
+    found = [(folder, read_manifest(folder)) for folder in folders]
+    there = [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
+    return sorted(there, key=lambda a: (str(a.manifest.get("started", "")), a.folder.name), reverse=True)
 
 
 def finished(run_dir: Path, stage: str) -> StageFolder | None:
@@ -234,6 +262,9 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
 def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
     """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
 
+    Of a pipeline's runs the newest in which a stage is finished counts, if there is any: one that failed at its start
+    does not hide those before it.
+
     Args:
         root: Folder of all runs.
         target: What the user typed.
@@ -243,7 +274,9 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
         UsageError: When there is no such run, or it belongs to another pipeline.
     """
     path = Path(target)
-    options = [path, path.parent, *([Path(root) / pipeline / path] if pipeline else Path(root).glob(f"*/{path.name}"))]
+    # What is above counts for a stage folder only: above a pipeline's name is wherever the user happens to be.
+    options = [path.parent if read_manifest(path) is not None else path]
+    options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
     for folder in options:
         owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
         if owners and pipeline and pipeline not in owners:
@@ -251,7 +284,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
         if owners:
             return folder
     if pipeline is None and (known := run_folders(root, str(target))):
-        return known[-1]
+        return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
     names = [f"{f.parent.name}/{f.name}" for p in Path(root).glob("*") for f in run_folders(root, p.name)]
     raise UsageError(
         f"no run folder or pipeline with runs: {str(target)!r}. Runs in {root}: {', '.join(names[-5:]) or 'none'}",
@@ -260,23 +293,34 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
 
 
 def _stage_folder(run_dir: Path, stage: str) -> Path:
-    """Make a stage's folder; an earlier attempt is moved aside, under the next free number."""
-    folder = run_dir / stage
-    try:
-        if folder.exists():
-            number = 1
-            while (run_dir / f"{stage}.{number}").exists():
-                number += 1
-            folder.rename(run_dir / f"{stage}.{number}")
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise _not_writable(folder, error) from error
-    return folder
+    """Make a stage's folder, under the first free number; making it takes it, whoever else is at work here."""
+    number = 1
+    while True:
+        folder = run_dir / (stage if number == 1 else f"{stage}.{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+        else:
+            return folder
 
 
 def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
     return Sim2RealError(
         f"cannot write the run folder {folder}: {error.strerror}", hint="name a folder of your own with --runs DIR"
+    )
+
+
+def _in_words(error: BaseException, folder: Path) -> BaseException:
+    """Return what the user is told of an exception: the cause, where a full disk is behind it."""
+    if not isinstance(error, OSError) or error.errno not in _FULL:
+        return error
+    where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
+    return Sim2RealError(
+        f"the disk is full: {error.strerror}{where}",
+        hint=f"free some space, or name a folder elsewhere with --runs DIR; what was written is in {folder}",
     )
 
 

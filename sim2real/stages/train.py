@@ -28,8 +28,8 @@ from sim2real.stages.console import note, progress, table
 from sim2real.stages.identify import load_log
 from sim2real.stages.manifest import sha256
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.robot import Robot
-from sim2real.stages.runs import StageFolder, newest, open_stage
+from sim2real.stages.robot import Identifiable, Robot, moving_robot
+from sim2real.stages.runs import StageFolder, newest, open_stage, resolved
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult, train
 
@@ -51,10 +51,10 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the parameters.
     """
-    robot = cast(Robot, pipeline.load())
+    robot = moving_robot(pipeline)
     path, run_dir = _find_parameters(pipeline, config, root, run_dir)
     identified = load_parameters(path, pipeline)
-    log = Path(identified["log"]["path"])
+    log = resolved(identified["log"]["path"], path.resolve().parent.parent)
     if log.is_file() and sha256(log) != identified["log"].get("sha256"):
         note(f"warning: {log} is not the log that {path} was identified from: it has changed since")
     values, draws = model_values(robot, identified, config)
@@ -113,7 +113,7 @@ def load_parameters(path: Path, pipeline: Pipeline) -> dict[str, Any]:
         raise Sim2RealError(f"{path} holds no identified parameters: {reason}", hint=hint) from None
     if owner != pipeline.name:
         raise Sim2RealError(f"{path} holds parameters of pipeline {owner!r}, not of {pipeline.name!r}", hint=hint)
-    robot = cast(Robot, pipeline.load())
+    robot = cast(Identifiable, pipeline.load())
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
     lacking = [n for n in expected if n not in rows or not np.isfinite(numbers[n]).all()]
     if lacking or not isinstance(log, str) or not kinds <= {"dynamics", "delay", "measurement", "derived"}:

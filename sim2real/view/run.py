@@ -71,13 +71,14 @@ def open_artifact(folder: Path, stage: str) -> Artifact:
 
 
 def attempts(run_dir: Path, stage: str) -> list[Artifact]:
-    """Return a stage's folders in a run, newest first: ``STAGE``, then ``STAGE.2``, ``STAGE.1``."""
-    numbered = {}
+    """Return a stage's folders in a run (``STAGE``, ``STAGE.2``, ``STAGE.3``, ...), newest first."""
+    found = []
     for folder in Path(run_dir).glob(f"{stage}*"):
         suffix = folder.name.removeprefix(stage)
         if folder.is_dir() and (suffix == "" or (suffix[0] == "." and suffix[1:].isdigit())):
-            numbered[float(suffix[1:]) if suffix else float("inf")] = folder
-    return [Artifact(numbered[n], stage, _manifest(numbered[n])) for n in sorted(numbered, reverse=True)]
+            found.append((int(suffix[1:] or 1), Artifact(folder, stage, _manifest(folder))))
+    found.sort(key=lambda f: (str(f[1].manifest.get("started", "")), f[0]), reverse=True)
+    return [artifact for _, artifact in found]
 
 
 def finished(run_dir: Path) -> dict[str, Artifact]:

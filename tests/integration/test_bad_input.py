@@ -214,3 +214,11 @@ def test_bundles_of_another_robot(fails, tmp_path, completed, what):
     said = fails(errors.ERROR, "deploy", "pendulum", "--bundle", bundle, "--runs", tmp_path)
     assert "this robot" in said
     assert not (tmp_path / "pendulum").exists()
+
+
+@pytest.mark.parametrize("pipeline", ["disk", "so101", "xl330"])
+@pytest.mark.parametrize("stage", ["record", "train", "deploy", "run"])
+def test_robots_that_are_known_from_recordings_alone(fails, tmp_path, pipeline, stage):
+    said = fails(errors.USAGE, stage, pipeline, "--runs", tmp_path / "runs")
+    assert f"sim2real import FILE --pipeline {pipeline}" in said
+    assert not (tmp_path / "runs").exists()

@@ -37,6 +37,9 @@ def test_a_resumed_run_is_complete(completed):
     inputs = manifest_of(completed / "train")["inputs"]
     assert inputs["log"]["sha256"] == manifest_of(completed / "record")["outputs"]["log"]["sha256"]
     assert inputs["parameters"]["sha256"] == manifest_of(completed / "identify")["outputs"]["parameters"]["sha256"]
+    # Relative to the run folder: a run that is moved can still be trained.
+    assert inputs["log"]["path"] == "record/session.mcap"
+    assert strict_json(completed / "identify" / "parameters.json")["log"]["path"] == "record/session.mcap"
 
 
 def test_resuming_a_finished_run_does_nothing(completed, root, capsys):
@@ -52,10 +55,11 @@ def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
     first = manifest_of(run_dir / "deploy")["started"]
     flags = ["--episodes", "2", "--duration-s", "1", "--runs", str(tmp_path / "runs"), "--strict-timing"]
     assert cli.main(["deploy", "pendulum", *flags]) in (0, 5)  # a busy machine may miss deadlines; all is written
-    assert manifest_of(run_dir / "deploy.1")["started"] == first
-    assert {p.name for p in (run_dir / "deploy").glob("*.mcap")} == {"episode_0.mcap", "episode_1.mcap"}
-    assert all(read_log(p).complete for p in (run_dir / "deploy").glob("*.mcap"))
-    assert len(strict_json(run_dir / "deploy" / "result.json")["episodes"]) == 2
+    assert manifest_of(run_dir / "deploy")["started"] == first
+    again = run_dir / "deploy.2"
+    assert {p.name for p in again.glob("*.mcap")} == {"episode_0.mcap", "episode_1.mcap"}
+    assert all(read_log(p).complete for p in again.glob("*.mcap"))
+    assert len(strict_json(again / "result.json")["episodes"]) == 2
 
 
 def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):

@@ -1,6 +1,8 @@
 """Run folders and manifests."""
 
+import errno
 import json
+import os
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -11,7 +13,7 @@ import pytest
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.stages import runs
 from sim2real.stages.config import RecordConfig, TrainConfig
-from sim2real.stages.manifest import git_state, plain, sha256, write_manifest
+from sim2real.stages.manifest import git_state, plain, read_manifest, sha256, write_manifest
 
 
 def record(root, run_dir=None, pipeline="pendulum", text="log"):
@@ -141,6 +143,68 @@ def test_running_a_stage_again_keeps_the_earlier_attempts(tmp_path):
     assert found.output("log").read_text() == "3"
 
 
+def test_two_at_work_in_one_run_do_not_meet(tmp_path):
+    with runs.open_stage(tmp_path, "pendulum", "train", {"who": "A"}) as a:
+        a.output("policy", "policy").write_text("A")
+        with runs.open_stage(tmp_path, "pendulum", "train", {"who": "B"}, run_dir=a.run_dir) as b:
+            b.output("policy", "policy").write_text("B")
+            b.summary({"who": "B"})
+        a.summary({"who": "A"})
+    assert [f.name for f in (a.folder, b.folder)] == ["train", "train.2"]
+    for one, who in ((a, "A"), (b, "B")):
+        read = runs.StageFolder(one.folder, read_manifest(one.folder))
+        assert read.manifest["config"] == read.manifest["summary"] == {"who": who}
+        assert read.output("policy").read_text() == who
+        assert sha256(read.output("policy")) == read.manifest["outputs"]["policy"]["sha256"]
+    assert runs.finished(a.run_dir, "train").folder == b.folder, "the one that started last"
+
+
+def test_what_refers_to_an_attempt_stays_right_when_the_stage_runs_again(tmp_path):
+    log = record(tmp_path, text="1").output("log")
+    with runs.open_stage(tmp_path, "pendulum", "identify", None, {"log": log}, log.parent.parent) as stage:
+        pass
+    record(tmp_path, stage.run_dir, text="2")
+    source = stage.result.manifest["inputs"]["log"]
+    assert source["path"] == "record/session.mcap"
+    moved = tmp_path / "elsewhere"
+    stage.run_dir.rename(moved)
+    assert sha256(runs.resolved(source["path"], moved)) == source["sha256"]
+
+
+@pytest.mark.parametrize("name", ["../../../etc", "..", "a/b", "", ".hidden", "/etc", "a\nb"])
+def test_names_that_lead_out_of_the_runs_folder(tmp_path, name):
+    with (
+        pytest.raises(UsageError, match="no name for a pipeline"),
+        runs.open_stage(tmp_path / "r", name, "record", None),
+    ):
+        pass
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_said_in_words_and_the_manifest_tells(tmp_path, number, monkeypatch):
+    opened = os.open
+
+    def full(path, flags, mode=0o777):
+        if flags & os.O_CREAT and not os.path.exists(path):
+            raise OSError(number, os.strerror(number), str(path))
+        return opened(path, flags, mode)
+
+    def fill():
+        with runs.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
+            monkeypatch.setattr(os, "open", full)  # from here on no file can be made; those that are there have room
+            stage.output("log", "session.mcap")
+            raise OSError(number, os.strerror(number), "timing.json")
+
+    with pytest.raises(Sim2RealError, match=r"(?s)the disk is full: .*timing\.json.*hint: free some space"):
+        fill()
+    monkeypatch.undo()
+    (path,) = tmp_path.glob("pendulum/*/record/manifest.json")
+    manifest = json.loads(path.read_text())
+    assert (manifest["status"], manifest["exit_code"]) == ("failed", 1)
+    assert "disk is full" in manifest["error"]
+
+
 def test_outputs_that_are_unknown_or_gone(tmp_path):
     done = record(tmp_path)
     with pytest.raises(Sim2RealError, match=r"no output 'bundle'\. Available: log"):
@@ -163,6 +227,28 @@ def test_runs_are_found_by_path_name_stage_folder_and_pipeline(tmp_path, monkeyp
         runs.find_run(root, run_dir, "arm")
     with pytest.raises(UsageError, match=latest.name):
         runs.find_run(root, "nothing")
+
+
+def test_a_run_folder_as_working_directory_does_not_stand_for_every_name(tmp_path, monkeypatch):
+    here, there = record(tmp_path / "here").run_dir, record(tmp_path / "there").run_dir
+    monkeypatch.chdir(here)
+    assert runs.find_run(tmp_path / "there", "pendulum") == there
+    assert runs.find_run(tmp_path / "there", there.name) == there
+    assert runs.find_run(tmp_path / "there", ".").resolve() == here
+    assert runs.find_run(tmp_path / "there", "record").resolve() == here
+    with pytest.raises(UsageError, match="nothing"):
+        runs.find_run(tmp_path / "there", "nothing")
+
+
+def test_a_run_that_failed_does_not_hide_those_before(tmp_path):
+    good = record(tmp_path).run_dir
+    with pytest.raises(SafetyStop), runs.open_stage(tmp_path, "pendulum", "record", None) as failed:
+        raise SafetyStop("too fast")
+    assert runs.find_run(tmp_path, "pendulum") == good
+    assert runs.find_run(tmp_path, failed.run_dir.name) == failed.run_dir
+    with pytest.raises(SafetyStop), runs.open_stage(tmp_path, "arm", "record", None) as only:
+        raise SafetyStop("too fast")
+    assert runs.find_run(tmp_path, "arm") == only.run_dir, "there is no other to show"
 
 
 class Colour(Enum):

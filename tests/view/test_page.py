@@ -167,12 +167,12 @@ def test_a_record_alone_makes_a_report(tmp_path):
 
 def test_the_newest_finished_attempt_is_shown_and_a_newer_failure_is_told(only):
     run = only("identify")
-    (run / "identify").rename(run / "identify.1")
-    failed = run / "identify"
+    failed = run / "identify.2"
     failed.mkdir()
-    (failed / "manifest.json").write_text(json.dumps({"stage": "identify", "status": "failed", "error": "<i>no</i>"}))
+    manifest = {"stage": "identify", "status": "failed", "error": "<i>no</i>", "started": "2026-11-22T08:00:00+00:00"}
+    (failed / "manifest.json").write_text(json.dumps(manifest))
     text = report(run).read_text(encoding="utf-8")
-    assert "The newest attempt at identify is failed (&lt;i&gt;no&lt;/i&gt;): this page shows identify.1." in text
+    assert "The newest attempt at identify is failed (&lt;i&gt;no&lt;/i&gt;): this page shows identify." in text
     assert "21.078" in text
 
 
