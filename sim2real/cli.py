@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import signal
@@ -11,7 +12,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 from sim2real.stages.interruption import Signals
@@ -67,39 +68,58 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name; None takes the process's own.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
     with Signals() as signals:
-        try:
-            _dispatch(arguments)
-            sys.stdout.flush()
-        except Sim2RealError as error:
-            if os.environ.get(DEBUG):
-                traceback.print_exc()
-            # The notes name nodes and what failed on the way out; the hint stays last.
-            message, *hint = str(error).split("\n\nhint: ", 1)
-            print("\n".join([f"error: {message}", *_notes(error)]), file=sys.stderr)
-            if hint:
-                print(f"\nhint: {hint[0]}", file=sys.stderr)
-            return error.exit_code
-        except BrokenPipeError:  # the reader of our output has enough, such as `head`: nothing is wrong with us
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return ERROR
-        except KeyboardInterrupt:
-            return _ended_by(signal.SIGINT)
-        except SystemExit as end:
-            if isinstance(end.code, int) and end.code > 128:
-                return _ended_by(end.code - 128)
-            return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
-        except Exception as error:
-            if signals.received:  # an extension that is interrupted while it is imported raises ImportError
-                return _ended_by(signals.received)
-            if os.environ.get(DEBUG):
-                traceback.print_exc()
-            reason = " ".join(str(error).split()) or "no message"
-            text = f"error: {type(error).__name__}: {reason} (traceback in {_save_traceback()})"
-            print("\n".join([text, *_notes(error)]), file=sys.stderr)
-            return ERROR
+        code = _run_command(list(sys.argv[1:] if argv is None else argv), signals)
+        if argv is None and code != OK:
+            _leave(code)
+    return code
+
+
+def _run_command(arguments: list[str], signals: Signals) -> int:
+    """Run a command; say what went wrong, and return the exit code that stands for it."""
+    try:
+        _dispatch(arguments)
+        sys.stdout.flush()
+    except Sim2RealError as error:
+        if os.environ.get(DEBUG):
+            traceback.print_exc()
+        # The notes name nodes and what failed on the way out; the hint stays last.
+        message, *hint = str(error).split("\n\nhint: ", 1)
+        print("\n".join([f"error: {message}", *_notes(error)]), file=sys.stderr)
+        if hint:
+            print(f"\nhint: {hint[0]}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:  # the reader of our output has enough, such as `head`: nothing is wrong with us
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ERROR
+    except KeyboardInterrupt:
+        return _ended_by(signal.SIGINT)
+    except SystemExit as end:
+        if isinstance(end.code, int) and end.code > 128:
+            return _ended_by(end.code - 128)
+        return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
+    except Exception as error:
+        if signals.received:  # an extension that is interrupted while it is imported raises ImportError
+            return _ended_by(signals.received)
+        if os.environ.get(DEBUG):
+            traceback.print_exc()
+        reason = " ".join(str(error).split()) or "no message"
+        text = f"error: {type(error).__name__}: {reason} ({_save_traceback()})"
+        print("\n".join([text, *_notes(error)]), file=sys.stderr)
+        return ERROR
     return OK
+
+
+def _leave(code: int) -> NoReturn:
+    """End this process, which is a command that ended early, at once.
+
+    Everything of ours has been unwound by now. But a program of XLA's that was begun goes on in threads of its own, and
+    taking the interpreter down under them is a segmentation fault, or a wait until they are done.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _dispatch(arguments: list[str]) -> None:
@@ -345,10 +365,13 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _save_traceback() -> str:
-    """Write the traceback of the exception at hand to a file and return its path."""
-    with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
-        file.write(traceback.format_exc())
-    return file.name
+    """Write the traceback of the exception at hand to a file and say where it is."""
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
+            file.write(traceback.format_exc())
+    except OSError:  # a full disk, perhaps the very error at hand
+        return f"{DEBUG}=1 shows the traceback"
+    return f"traceback in {file.name}"
 
 
 if __name__ == "__main__":

@@ -6,8 +6,12 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+_LOOK_S = 0.25
 
 
 class Signals:
@@ -58,3 +62,33 @@ class Signals:
         self._raised = None
         # A moment later: until this hook returns, it would be dropped again.
         threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
+
+
+def patiently(work: Callable[[], Result]) -> Result:
+    """Run a long computation so that a signal ends the wait for it at once.
+
+    Python raises what a signal becomes between two of its own instructions of the main thread. XLA compiles for a
+    minute in one instruction, so the work is done beside the main thread. It is not ended by a signal: a command that is
+    interrupted takes it along when it ends its process, so it must do nothing but compute.
+
+    Args:
+        work: What to do; what it raises is raised here.
+    """
+    outcome: list[Result] = []
+    failure: list[BaseException] = []
+    done = threading.Event()
+
+    def run() -> None:
+        try:
+            outcome.append(work())
+        except BaseException as error:
+            failure.append(error)
+        finally:
+            done.set()
+
+    threading.Thread(target=run, name="sim2real:work", daemon=True).start()
+    while not done.wait(_LOOK_S):  # a signal that another thread of the process gets does not wake this one
+        pass
+    if failure:
+        raise failure[0]
+    return outcome[0]

@@ -26,6 +26,7 @@ from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.identify import load_log
+from sim2real.stages.interruption import patiently
 from sim2real.stages.manifest import sha256
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import Identifiable, Robot, moving_robot
@@ -70,7 +71,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         env = GraphEnvironment(CompiledGraph(nodes, robot.SUPERVISOR, timeline), task)
         ppo = replace(config.ppo, eval_steps=env.length + 1)
         with progress(ppo.evaluations, "train (compiling)") as bar:
-            result = train(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p))
+            result = patiently(lambda: train(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
         hashes = {"log": sha256(log), "parameters": sha256(path)}
         contract = _contract(robot, task, values, hashes)
         save_bundle(stage.output("bundle", "bundle"), result.best.to_weights(), contract)

@@ -1,10 +1,16 @@
 """A signal that comes where Python drops exceptions must stop the robot all the same."""
 
+import json
+import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
+
+from sim2real.stages.interruption import Signals, patiently
 
 pytestmark = pytest.mark.realtime
 
@@ -62,3 +68,61 @@ def test_a_signal_inside_a_finaliser_is_not_lost(tmp_path, number, code, by_coll
     assert process.returncode == code
     assert "torque off" in out
     assert "Traceback" not in err
+
+
+AT_WORK = """
+import sys, time
+from types import ModuleType
+import jax, jax.numpy as jnp
+from sim2real import cli
+from sim2real.stages import runs
+
+def run(pipeline, config, root, run_dir):
+    with runs.open_stage(root, pipeline.name, "train", config, run_dir=run_dir):
+        work = jax.jit(lambda x: jax.lax.fori_loop(0, 10**9, lambda i, y: jnp.tanh(y @ y), x), donate_argnums=0)
+        work(jnp.ones((300, 300)))  # comes back at once: XLA goes on by itself
+        print("started", flush=True)
+        time.sleep(30)
+
+module = ModuleType("sim2real.stages.train")
+module.run = run
+sys.modules[module.__name__] = module
+sys.argv[1:] = ["train", "pendulum"]
+sys.exit(cli.main())
+"""
+
+
+def test_a_command_that_is_interrupted_while_xla_is_at_work_ends_in_order(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", AT_WORK], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "started\n"
+    process.send_signal(signal.SIGINT)
+    try:
+        _, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert err == "interrupted\n"
+    (manifest,) = tmp_path.glob("runs/pendulum/*/train/manifest.json")
+    assert json.loads(manifest.read_text())["status"] == "interrupted"
+
+
+def test_a_signal_does_not_wait_for_a_long_computation():
+    def compile_for_a_minute():
+        threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
+        forever.wait(60)
+
+    forever = threading.Event()
+    begin = time.monotonic()
+    with Signals(), pytest.raises(KeyboardInterrupt):
+        patiently(compile_for_a_minute)
+    assert time.monotonic() - begin < 30
+    forever.set()
+
+
+def test_what_a_computation_returns_and_raises_comes_back():
+    assert patiently(lambda: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        patiently(lambda: 1 // 0)
