@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import signal
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.stages import ending
 from sim2real.stages.interruption import Signals
 
 if TYPE_CHECKING:
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
     from sim2real.stages.runs import StageFolder
 
 DEMO_PIPELINE = "pendulum"
-DEBUG = "SIM2REAL_DEBUG"
 
 EXIT_CODES = """\
 exit codes
@@ -47,6 +44,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   info      about the installation, a pipeline, a log or a run
   check     judge what a recording, or a planned one, can tell about the parameters
   import    turn files of other recorders into logs
+  log       recover what is readable of a damaged log into a new one
 
 examples
   sim2real demo --seed 1
@@ -71,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with Signals() as signals:
         code = _run_command(list(sys.argv[1:] if argv is None else argv), signals)
         if argv is None and code != OK:
-            _leave(code)
+            ending.leave(code)
     return code
 
 
@@ -81,45 +79,21 @@ def _run_command(arguments: list[str], signals: Signals) -> int:
         _dispatch(arguments)
         sys.stdout.flush()
     except Sim2RealError as error:
-        if os.environ.get(DEBUG):
-            traceback.print_exc()
-        # The notes name nodes and what failed on the way out; the hint stays last.
-        message, *hint = str(error).split("\n\nhint: ", 1)
-        print("\n".join([f"error: {message}", *_notes(error)]), file=sys.stderr)
-        if hint:
-            print(f"\nhint: {hint[0]}", file=sys.stderr)
-        return error.exit_code
+        return ending.failed(error)
     except BrokenPipeError:  # the reader of our output has enough, such as `head`: nothing is wrong with us
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ERROR
     except KeyboardInterrupt:
-        return _ended_by(signal.SIGINT)
+        return ending.ended_by(signal.SIGINT)
     except SystemExit as end:
         if isinstance(end.code, int) and end.code > 128:
-            return _ended_by(end.code - 128)
+            return ending.ended_by(end.code - 128)
         return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
     except Exception as error:
         if signals.received:  # an extension that is interrupted while it is imported raises ImportError
-            return _ended_by(signals.received)
-        if os.environ.get(DEBUG):
-            traceback.print_exc()
-        reason = " ".join(str(error).split()) or "no message"
-        text = f"error: {type(error).__name__}: {reason} ({_save_traceback()})"
-        print("\n".join([text, *_notes(error)]), file=sys.stderr)
-        return ERROR
+            return ending.ended_by(signals.received)
+        return ending.unexpected(error)
     return OK
-
-
-def _leave(code: int) -> NoReturn:
-    """End this process, which is a command that ended early, at once.
-
-    Everything of ours has been unwound by now. But a program of XLA's that was begun goes on in threads of its own, and
-    taking the interpreter down under them is a segmentation fault, or a wait until they are done.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(code)
 
 
 def _dispatch(arguments: list[str]) -> None:
@@ -265,6 +239,24 @@ def _import(command: str, arguments: list[str]) -> None:
     importing.run(asked)
 
 
+def _log(command: str, arguments: list[str]) -> None:
+    """``sim2real log recover FILE [--out FILE]``."""
+    from sim2real.stages import config, flags
+
+    action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
+    if action in ("-h", "--help"):
+        action, rest = "recover", ["--help"]
+    if action != "recover":
+        said = f"there is no `{command} {action}`" if action else f"{command} needs to be told what to do"
+        raise UsageError(f"{said}. Available: recover", hint=f"sim2real {command} recover FILE")
+    own, prog = config.RecoverConfig(), f"sim2real {command} recover"
+    epilog = _epilog(f"{prog} session.mcap", f"{prog} session.mcap --out saved.mcap")
+    asked = flags.parse(own, rest, prog, _summary(own), epilog)
+    from sim2real.stages import recovering  # imports JAX
+
+    recovering.run(asked)
+
+
 def _check(command: str, arguments: list[str]) -> None:
     """``sim2real check PIPELINE [flags]``."""
     from sim2real.stages import config, flags
@@ -293,6 +285,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "info": _info,
     "import": _import,
     "check": _check,
+    "log": _log,
 }
 
 
@@ -351,27 +344,6 @@ def _summary(config: Any) -> str:
 
 def _epilog(*examples: str) -> str:
     return "\n".join(["examples", *(f"  {example}" for example in examples), "", EXIT_CODES])
-
-
-def _ended_by(number: int) -> int:
-    """Say which signal ended the command and return its exit code."""
-    print("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}", file=sys.stderr)
-    return 128 + number
-
-
-def _notes(error: BaseException) -> list[str]:
-    """Return an exception's notes, one line each."""
-    return [f"  {' '.join(note.split())}" for note in getattr(error, "__notes__", [])]
-
-
-def _save_traceback() -> str:
-    """Write the traceback of the exception at hand to a file and say where it is."""
-    try:
-        with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
-            file.write(traceback.format_exc())
-    except OSError:  # a full disk, perhaps the very error at hand
-        return f"{DEBUG}=1 shows the traceback"
-    return f"traceback in {file.name}"
 
 
 if __name__ == "__main__":

@@ -50,7 +50,8 @@ class EmbeddedRobot:
         self.truth_path = Path(truth_path) if truth_path is not None else folder / "truth.bin"
         self.truth_path.parent.mkdir(parents=True, exist_ok=True)
         self._messages_path = folder / "messages.txt"
-        command = [sys.executable, "-m", "sim2real.hardware.emulator", "--until-stdin-closes", "--plant", plant]
+        # -P: the working directory is somebody's data, and must not lend its files as modules.
+        command = [sys.executable, "-P", "-m", "sim2real.hardware.emulator", "--until-stdin-closes", "--plant", plant]
         command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
         for name, value in asdict(config or EmulatorConfig()).items():
             if value is not None:

@@ -3,27 +3,45 @@
 from __future__ import annotations
 
 import mmap
-import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata
 
 from sim2real.errors import Sim2RealError
 from sim2real.log import document
 from sim2real.log.cdr import Layout
-from sim2real.log.recover import Damage, Record, chunk_content, chunk_times, cut_before_session, opened, parsed, records
+from sim2real.log.records import (
+    BROKEN,
+    Damage,
+    Record,
+    chunk_content,
+    chunk_records,
+    chunk_times,
+    cut_before_session,
+    opened,
+    parsed,
+    records,
+)
 from sim2real.log.session_file import LIBRARY
 
-# A message record: opcode, length, channel; then sequence, log time, publish time and the message itself.
-_MESSAGE_PREFIX = struct.Struct("<BQH")
-_DATA_AT = 31
+# A message record: opcode and length; then channel, sequence, log time, publish time and the message itself.
+_PREFIX_BYTES, _DATA_AT = 9, 31
+# Role -> what the metadata of a channel in that role must have.
+_ROLES = {
+    "step": {"node"},
+    "output": {"node", "fields"},
+    "input": {"node", "input"},
+    "events": set(),
+    "joint_states": set(),
+}
 _DECODED_ROLES = ("step", "output", "input", "events")
+_DIGITS = 19
 
 
 @dataclass(frozen=True)
@@ -120,7 +138,7 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
         Sim2RealError: When the file is missing, no MCAP, no log of ours or cut before the end of its session metadata.
     """
     found = Contents()
-    with opened(path) as data:
+    with in_words(path), opened(path) as data:
         for record in records(data, found.damage):
             if record.opcode == Opcode.MESSAGE_INDEX:
                 channel = data[record.start] | data[record.start + 1] << 8
@@ -141,6 +159,24 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
     return found
 
 
+@contextmanager
+def in_words(path: str | Path) -> Iterator[None]:
+    """Turn what a file's bytes make the block raise into an error about the file: they may be anything.
+
+    Raises:
+        Sim2RealError: When the file is damaged beyond what the block can pass over.
+    """
+    try:
+        yield
+    except Sim2RealError:
+        raise
+    except BROKEN as error:
+        raise Sim2RealError(
+            f"the log {path} is damaged: {type(error).__name__}: {error}",
+            hint="`sim2real log recover FILE` saves what is readable, or record again",
+        ) from error
+
+
 def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | None) -> None:
     found.chunks += 1
     first, last = chunk_times(data, record)
@@ -148,27 +184,28 @@ def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | 
     if span is None:
         return
     begin, end = span.log_times(found.epoch_ns)
-    # The channels stand before the first chunk; where those are damaged there is no time 0 yet, and the chunk has them.
-    if found.channels and (last < begin or first >= end):
+    # The channels stand before the first chunk, where nothing guards them, and in it, where a checksum does.
+    if found.chunks > 1 and found.channels and (last < begin or first >= end):
         return
     content = chunk_content(data, record, found.damage)
-    position = 0
-    while position < len(content):
-        opcode, length, channel = _MESSAGE_PREFIX.unpack_from(content, position)
-        stop = position + 9 + length
-        if opcode == Opcode.MESSAGE:
+    for inner in chunk_records(content):
+        if inner.opcode == Opcode.MESSAGE:
+            channel = int.from_bytes(content[inner.start : inner.start + 2], "little")
             if channel in found.messages:
-                found.messages[channel].append(content[position:stop])
-        elif opcode == Opcode.CHANNEL:
-            _take_channel(found, Channel.read(ReadDataStream(BytesIO(content[position + 9 : stop]))))
-        position = stop
+                found.messages[channel].append(content[inner.start - _PREFIX_BYTES : inner.end])
+        elif inner.opcode == Opcode.CHANNEL:
+            _take_channel(found, parsed(Channel, content, inner, found.damage))
 
 
 def _take_channel(found: Contents, channel: Channel | None) -> None:
-    if channel is not None and channel.metadata.get("epoch_ns", "").isdigit() and "role" in channel.metadata:
+    about = {} if channel is None else channel.metadata
+    needed, epoch_ns = _ROLES.get(about.get("role", "")), about.get("epoch_ns", "")
+    if channel is None or needed is None or not needed <= set(about):
+        return
+    if epoch_ns.isascii() and epoch_ns.isdigit() and len(epoch_ns) <= _DIGITS:
         found.channels[channel.id] = channel
-        found.epoch_ns = int(channel.metadata["epoch_ns"])
-        if channel.metadata["role"] in _DECODED_ROLES:
+        found.epoch_ns = int(epoch_ns)
+        if about["role"] in _DECODED_ROLES:
             found.messages.setdefault(channel.id, [])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
 from sim2real.log.cdr import read_text
-from sim2real.log.contents import Contents, Range, walk
+from sim2real.log.contents import Contents, Range, in_words, walk
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields
 
 # Where an event's level stands, and where its name begins before alignment.
@@ -51,7 +51,9 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
     span = Range(start_s, end_s)
     contents = walk(path, span)
-    steps, outputs, sequences = _steps_and_outputs(contents, span)
+    with in_words(path):
+        steps, outputs, sequences = _steps_and_outputs(contents, span)
+        messages, events = _connections(contents, span, sequences), _events(contents, span)
     # A log that starts in the middle lost its beginning, unless only a range was asked for.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
@@ -62,14 +64,14 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         "epoch_ns": contents.epoch_ns,
         "session_end": contents.end,
         "attachments": list(contents.attachments),
-        "events": _events(contents, span),
+        "events": events,
         "first_seq": firsts,
         "missing_steps": missing,
         "skipped": contents.damage.skipped,
     }
     return Episode(
         steps=steps,
-        messages=_connections(contents, span, sequences),
+        messages=messages,
         outputs=outputs,
         metadata={**(contents.session or {}), "log": facts},
         complete=contents.end is not None,

@@ -1,144 +1,21 @@
-"""Reading a damaged log: from its first byte on, past whatever is broken."""
+"""Saving what is readable of a damaged MCAP file into a new one."""
 
 from __future__ import annotations
 
 import mmap
-import re
-import struct
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
-from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import Sim2RealError
+from sim2real.log.records import Damage, Record, chunk_content, chunk_records, opened, parsed, records, stream_of
 
-_PREFIX = struct.Struct("<BQ")
-_CHUNK_TIMES = struct.Struct("<QQ")
-# As plain numbers: they are compared for every record of a file.
-_CHUNK, _MESSAGE_INDEX, _DATA_END = int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX), int(Opcode.DATA_END)
-_INDEX_BYTES = struct.Struct("<2xI")
-# What reading can resume at: a chunk, by its compression's name (behind the prefix, two times, a size and a checksum),
-# and the session's end, by its own name (behind the prefix).
-_LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
-_CHUNK_NAME_AT = 37
-_METADATA_NAME_AT = _PREFIX.size
-# What a record that is cut or bent raises while it is parsed.
-_BROKEN = (McapError, struct.error, ValueError)
-
-
-class Record(NamedTuple):
-    """A record's kind and the place of its content in the file."""
-
-    opcode: int
-    start: int
-    end: int
-
-
-@dataclass
-class Damage:
-    """What could not be read.
-
-    Attributes:
-        skipped: What is unreadable and where, in words, in the file's order.
-        cut: Whether the file ends before its data does.
-    """
-
-    skipped: list[str] = field(default_factory=list)
-    cut: bool = False
-
-
-@contextmanager
-def opened(path: str | Path) -> Iterator[mmap.mmap]:
-    """Map an MCAP file into memory.
-
-    Raises:
-        Sim2RealError: When there is no such file, it cannot be read or is no MCAP.
-    """
-    path = Path(path)
-    if not path.is_file():
-        found = sorted(p.name for p in path.parent.glob("*.mcap"))
-        raise Sim2RealError(
-            f"there is no log {path}", hint=f"logs in that folder: {', '.join(found)}" if found else "check the path"
-        )
-    with open(path, "rb") as stream:
-        magic = stream.read(len(MCAP0_MAGIC))
-        if len(magic) < len(MCAP0_MAGIC) and MCAP0_MAGIC.startswith(magic):
-            raise cut_before_session(path)
-        if magic != MCAP0_MAGIC:
-            raise Sim2RealError(f"{path} is no MCAP file", hint="logs are recorded with `sim2real record`")
-        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            yield data
-
-
-def cut_before_session(path: str | Path) -> Sim2RealError:
-    """Return the error for a log that ends before anything was recorded."""
-    return Sim2RealError(
-        f"the log {path} was cut before the end of its session metadata: it holds no data",
-        hint="the recording stopped while it was set up; record again",
-    )
-
-
-def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
-    """Yield the records of the data section without reading their content.
-
-    Where the chain of lengths is broken, reading resumes at the next thing that looks like a chunk or a session's end.
-
-    Args:
-        data: The file.
-        damage: Takes note of what is broken.
-    """
-    position = trusted = len(MCAP0_MAGIC)
-    while position < len(data):
-        record = _record(data, position)
-        if record is not None:
-            yield record
-            position = record.end
-            if record.opcode in (_CHUNK, _MESSAGE_INDEX):
-                trusted = position
-            elif record.opcode == _DATA_END:
-                return
-            continue
-        # A bent length may have led here, past good chunks: search from behind the last record that was surely whole.
-        resume = _next_landmark(data, trusted)
-        if resume is None:
-            break
-        damage.skipped.append(f"{resume - trusted} bytes at {trusted}")
-        position, trusted = resume, resume + 1
-    damage.cut = True
-
-
-def chunk_times(data: mmap.mmap, record: Record) -> tuple[int, int]:
-    """Return the first and the last log time in a chunk [ns]."""
-    first, last = _CHUNK_TIMES.unpack_from(data, record.start)
-    return first, last
-
-
-def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
-    """Return the records in a chunk, decompressed and checked; nothing where it is damaged."""
-    try:
-        stream, size = get_chunk_data_stream(Chunk.read(_stream(data, record)), validate_crc=True)
-        return stream.read(size)
-    except Exception as error:  # every decompressor has errors of its own
-        damage.skipped.append(_lost_chunk(record, error))
-        return b""
-
-
-def parsed(kind: type[Any], data: mmap.mmap, record: Record, damage: Damage) -> Any | None:
-    """Return a record's content as an ``mcap.records`` class, or None where it is damaged."""
-    try:
-        return kind.read(_stream(data, record))
-    except _BROKEN as error:
-        damage.skipped.append(f"a {kind.__name__.lower()} record at {record.start} ({error})")
-        return None
+# Channel, sequence and two times stand before a message's own bytes.
+_MESSAGE_BYTES = 22
 
 
 @dataclass(frozen=True)
@@ -172,52 +49,104 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
     if Path(target).exists():
         raise Sim2RealError(f"{target} exists already", hint="choose another name")
     with opened(source) as data:
+        known = _definitions(data)
         try:
             with open(target, "xb") as stream:
-                copier = _Copier(Writer(stream, chunk_size=64 * 1024, compression=CompressionType.LZ4))
+                copier = _Copier(Writer(stream, chunk_size=64 * 1024, compression=CompressionType.LZ4), known)
                 for record in records(data, damage):
                     copier.take(data, record, damage)
                 copier.finish()
+        except OSError as error:
+            Path(target).unlink(missing_ok=True)
+            raise Sim2RealError(f"cannot write {target}: {error.strerror}", hint="name another with --out") from error
         except BaseException:
             Path(target).unlink(missing_ok=True)
             raise
     return Recovery(copier.counts, tuple(damage.skipped), damage.cut)
 
 
+@dataclass
+class _Definitions:
+    """What a file says its schemas and channels are.
+
+    Attributes:
+        schemas: Number -> schema.
+        channels: Number -> channel.
+        sure: Numbers of channels that stand in a chunk, which has a checksum; elsewhere nothing guards them.
+    """
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    sure: set[int] = field(default_factory=set)
+
+
+def _definitions(data: mmap.mmap) -> _Definitions:
+    """Go through a file for its schemas and channels: those in chunks count before those that stand alone."""
+    loose, sure = _Definitions(), _Definitions()
+    unheeded = Damage()  # the second walk, which copies, tells of it
+
+    def take(found: _Definitions, source: mmap.mmap | bytes, record: Record) -> None:
+        if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, unheeded)) is not None:
+            found.schemas[schema.id] = schema
+        elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, unheeded)) is not None:
+            found.channels[channel.id] = channel
+
+    for record in records(data, unheeded):
+        if record.opcode != Opcode.CHUNK:
+            take(loose, data, record)
+            continue
+        content = chunk_content(data, record, unheeded)
+        for inner in _whole(content):
+            take(sure, content, inner)
+    return _Definitions(loose.schemas | sure.schemas, loose.channels | sure.channels, set(sure.channels))
+
+
+def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
+    """Return the records in a chunk's content; none where they do not fill it."""
+    try:
+        return list(chunk_records(content))
+    except ValueError as error:
+        if damage is not None:
+            damage.skipped.append(str(error))
+        return []
+
+
 class _Copier:
     """Puts the records of one file into another, with numbers of its own for schemas and channels."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: Writer, known: _Definitions) -> None:
         self.counts: dict[str, int] = {}
         self._writer = writer
+        self._known = known
         self._header = Header(profile="", library="")
         self._started = False
         self._schemas: dict[int, int] = {0: 0}
-        self._channels: dict[int, tuple[int, str]] = {}
+        self._channels: dict[int, int] = {}
 
     def take(self, data: mmap.mmap, record: Record, damage: Damage) -> None:
         """Copy a record of the data section."""
-        kinds = {
-            Opcode.HEADER: Header,
-            Opcode.METADATA: Metadata,
-            Opcode.ATTACHMENT: Attachment,
-            Opcode.SCHEMA: Schema,
-            Opcode.CHANNEL: Channel,
-        }
-        if record.opcode == Opcode.CHUNK:
-            try:
-                for content in breakup_chunk(Chunk.read(_stream(data, record)), validate_crc=True):
-                    self._copy(content)
-            except Exception as error:  # every decompressor has errors of its own
-                damage.skipped.append(_lost_chunk(record, error))
+        if record.opcode == Opcode.HEADER:
+            self._header = parsed(Header, data, record, damage) or self._header
+        elif record.opcode == Opcode.CHUNK:
+            content = chunk_content(data, record, damage)
+            for inner in _whole(content, damage):
+                if inner.opcode == Opcode.MESSAGE:
+                    self._message(content, inner, damage)
         elif record.opcode == Opcode.MESSAGE:
-            self._copy(Message.read(_stream(data, record), record.end - record.start))
-        elif record.opcode in kinds:
-            self._copy(parsed(kinds[Opcode(record.opcode)], data, record, damage))
+            self._message(data, record, damage)
+        elif record.opcode == Opcode.METADATA and (entry := parsed(Metadata, data, record, damage)) is not None:
+            self._begin()
+            self._writer.add_metadata(entry.name, entry.metadata)
+        elif record.opcode == Opcode.ATTACHMENT and (file := parsed(Attachment, data, record, damage)) is not None:
+            self._begin()
+            self._writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, file.data)
 
     def finish(self) -> None:
-        """Write the index."""
+        """Write channels that no message was on, and the index."""
         self._begin()
+        # One that stands alone, in a file whose chunks define others, is a damaged copy of one of those.
+        for number in sorted(self._known.sure or self._known.channels):
+            self._channel(number)
         self._writer.finish()
 
     def _begin(self) -> None:
@@ -225,70 +154,30 @@ class _Copier:
             self._started = True
             self._writer.start(profile=self._header.profile, library=self._header.library)
 
-    def _copy(self, record: Any) -> None:
-        if isinstance(record, Header):
-            self._header = record
+    def _message(self, source: mmap.mmap | bytes, record: Record, damage: Damage) -> None:
+        message = None
+        if record.end - record.start >= _MESSAGE_BYTES:
+            message = Message.read(stream_of(source, record), record.end - record.start)
+        if message is None or message.channel_id not in self._known.channels:
+            damage.skipped.append(f"a message at {record.start}, of no known channel")
             return
         self._begin()
-        if isinstance(record, Metadata):
-            self._writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Attachment):
-            self._writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
+        channel, topic = self._channel(message.channel_id), self._known.channels[message.channel_id].topic
+        self._writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+
+    def _channel(self, number: int) -> int:
+        if number not in self._channels:
+            channel = self._known.channels[number]
+            self._channels[number] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, self._schema(channel.schema_id), channel.metadata
             )
-        elif isinstance(record, Schema) and record.id not in self._schemas:
-            self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel) and record.id not in self._channels and record.schema_id in self._schemas:
-            schema = self._schemas[record.schema_id]
-            channel = self._writer.register_channel(record.topic, record.message_encoding, schema, record.metadata)
-            self._channels[record.id] = channel, record.topic
-        elif isinstance(record, Message) and record.channel_id in self._channels:
-            channel, topic = self._channels[record.channel_id]
-            self._writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
-            self.counts[topic] = self.counts.get(topic, 0) + 1
+        return self._channels[number]
 
-
-def _lost_chunk(record: Record, error: Exception) -> str:
-    return f"a chunk of {record.end - record.start} bytes at {record.start} ({error})"
-
-
-def _stream(data: mmap.mmap, record: Record) -> ReadDataStream:
-    return ReadDataStream(BytesIO(data[record.start : record.end]))
-
-
-def _record(data: mmap.mmap, position: int) -> Record | None:
-    """Return the record at a position, or None if there is no whole and plausible one."""
-    start = position + _PREFIX.size
-    if start > len(data):
-        return None
-    opcode, length = _PREFIX.unpack_from(data, position)
-    end = start + length
-    if end > len(data) or not 0 < opcode <= _DATA_END:
-        return None
-    # Most of a file is chunks and their indices, whose lengths can be checked; a bent opcode must not end the reading.
-    if opcode == _MESSAGE_INDEX:
-        plausible = length >= 6 and length == 6 + _INDEX_BYTES.unpack_from(data, start)[0]
-    elif opcode == _CHUNK:
-        plausible = _is_chunk(data, start, length)
-    else:
-        plausible = opcode != _DATA_END or length == 4
-    return Record(opcode, start, end) if plausible else None
-
-
-def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
-    if length < 40:
-        return False
-    name = int.from_bytes(data[start + 28 : start + 32], "little")
-    if 40 + name > length:
-        return False
-    return length == 40 + name + int.from_bytes(data[start + 32 + name : start + 40 + name], "little")
-
-
-def _next_landmark(data: mmap.mmap, position: int) -> int | None:
-    """Return where the next plausible chunk or end of a session begins at or after a position, or None."""
-    for match in _LANDMARK.finditer(data, position):
-        begin = match.start() - (_CHUNK_NAME_AT if match["chunk"] else _METADATA_NAME_AT)
-        kind = Opcode.CHUNK if match["chunk"] else Opcode.METADATA
-        if begin >= position and (record := _record(data, begin)) is not None and record.opcode == kind:
-            return begin
-    return None
+    def _schema(self, number: int) -> int:
+        """Return a schema's new number; 0, which stands for none, where it is lost."""
+        if number not in self._schemas:
+            schema = self._known.schemas.get(number)
+            new = 0 if schema is None else self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[number] = new
+        return self._schemas[number]

@@ -217,6 +217,27 @@ class ImportConfig:
 
 
 @dataclass(frozen=True)
+class RecoverConfig:
+    """Write what is readable of a damaged MCAP file into a new one."""
+
+    log: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
+    """The damaged file; it is left as it is."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The new file; default: beside the damaged one, as NAME.recovered.mcap."""
+
+    @property
+    def source(self) -> Path:
+        """The damaged file.
+
+        Raises:
+            UsageError: When none was named.
+        """
+        if self.log is None:
+            raise UsageError("log recover needs a file", hint="sim2real log recover FILE")
+        return self.log
+
+
+@dataclass(frozen=True)
 class CheckConfig:
     """Judge what a recording, or a planned one, can tell about the parameters, before anything is searched."""
 

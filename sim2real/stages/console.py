@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tqdm import tqdm
+
+
+# What makes a terminal do something: control characters but line feed and tab, and what turns the direction of text.
+_ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def clean(text: str) -> str:
+    """Return a text as it may go to a terminal: names in files of others may hold sequences that a terminal obeys."""
+    return _ACTS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -> str:
@@ -60,15 +70,15 @@ def note(text: str) -> None:
     if "tqdm" in sys.modules:
         from tqdm import tqdm
 
-        tqdm.write(text, file=sys.stderr)
+        tqdm.write(clean(text), file=sys.stderr)
     else:
-        print(text, file=sys.stderr)
+        print(clean(text), file=sys.stderr)
     sys.stderr.flush()
 
 
 def wrote(path: Path | str) -> None:
     """Name a file or folder that was written, on stdout."""
-    print(f"wrote {shown(path)}", flush=True)
+    print(f"wrote {clean(shown(path))}", flush=True)
 
 
 def shown(path: Path | str) -> str:
@@ -89,7 +99,7 @@ def _cell(value: Any) -> str:
         return ", ".join(_cell(v) for v in value)
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_cell(v)}" for name, v in value.items())
-    return str(value)
+    return clean(str(value)).replace("\n", "\\n")
 
 
 def _is_numeric(column: Sequence[Any]) -> bool:

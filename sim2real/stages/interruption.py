@@ -68,7 +68,7 @@ def patiently(work: Callable[[], Result]) -> Result:
     """Run a long computation so that a signal ends the wait for it at once.
 
     Python raises what a signal becomes between two of its own instructions of the main thread. XLA compiles for a
-    minute in one instruction, so the work is done beside the main thread. It is not ended by a signal: a command that is
+    minute in one instruction, so the work is done beside the main thread. No signal ends it: a command that is
     interrupted takes it along when it ends its process, so it must do nothing but compute.
 
     Args:

@@ -128,16 +128,34 @@ def git_state(folder: Path | None = None) -> dict[str, Any] | None:
     Files that git does not track do not make it dirty: run folders usually lie beside the code. None outside of a
     repository, or without git.
     """
+    safe = {"core.fsmonitor": "false", "core.hooksPath": os.devnull}
 
     def git(*arguments: str) -> str:
-        command = ["git", *arguments]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True)
+        entries = enumerate(safe.items())
+        over = {
+            f"GIT_CONFIG_{what}_{i}": v for i, pair in entries for what, v in zip(("KEY", "VALUE"), pair, strict=True)
+        }
+        done = subprocess.run(
+            ["git", "--no-optional-locks", *arguments],
+            cwd=folder,
+            env={**os.environ, **over, "GIT_CONFIG_COUNT": str(len(safe))},
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
         return done.stdout.strip()
 
     try:
+        # A repository may come from anywhere, and its own settings name programs that git runs: file system monitors,
+        # hooks, and filters of contents. Those of the user's settings stay.
+        for line in git("config", "--list", "--name-only", "--show-scope").splitlines():
+            scope, _, key = line.partition("\t")
+            if scope in ("local", "worktree") and key.startswith("filter."):
+                safe[key] = "false" if key.endswith(".required") else ""
         return {
             "sha": git("rev-parse", "--verify", "HEAD"),
-            "dirty": bool(git("status", "--porcelain", "--untracked-files=no")),
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")),
         }
     except (OSError, subprocess.SubprocessError):
         return None

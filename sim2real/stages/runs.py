@@ -7,6 +7,7 @@ what refers to a file in one goes on being right, and a failed attempt does not 
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import re
@@ -21,6 +22,7 @@ from typing import Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 from sim2real.stages.manifest import git_state, plain, read_manifest, reserve, sha256, versions, write_manifest
+from sim2real.stages.pipeline import available
 
 STAGES = ("record", "identify", "train", "deploy")
 INTERRUPTED = 130
@@ -285,11 +287,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
             return folder
     if pipeline is None and (known := run_folders(root, str(target))):
         return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
-    names = [f"{f.parent.name}/{f.name}" for p in Path(root).glob("*") for f in run_folders(root, p.name)]
-    raise UsageError(
-        f"no run folder or pipeline with runs: {str(target)!r}. Runs in {root}: {', '.join(names[-5:]) or 'none'}",
-        hint="make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR",
-    )
+    raise _nothing_there(root, str(target))
 
 
 def _stage_folder(run_dir: Path, stage: str) -> Path:
@@ -305,6 +303,20 @@ def _stage_folder(run_dir: Path, stage: str) -> Path:
             raise _not_writable(folder, error) from error
         else:
             return folder
+
+
+def _nothing_there(root: Path, target: str) -> UsageError:
+    """Return the error for a name that is none: it says what there is."""
+    pipelines = sorted(available())
+    names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
+    said = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
+    if target in pipelines:
+        hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
+    elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
+        hint = f"did you mean {close[0]}?"
+    else:
+        hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
+    return UsageError(f"there is no file, pipeline or run {target!r}. {said}", hint=hint)
 
 
 def _not_writable(folder: Path, error: OSError) -> Sim2RealError:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -13,19 +14,24 @@ import fake_sessions
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord
 from sim2real.log import McapRecorder, TruncatedLogWarning, read_log, read_session, recover, summary
+from sim2real.log.session_file import SessionFile
+
+
+def quietly(call, *arguments):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TruncatedLogWarning)
+        return call(*arguments)
 
 pytestmark = pytest.mark.realtime
 
 
 def read_quietly(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TruncatedLogWarning)
-        return read_log(path)
+    return quietly(read_log, path)
 
 
 def chunks(path):
@@ -128,6 +134,64 @@ def test_a_flipped_bit_loses_at_most_one_chunk(session_log, tmp_path, whole_file
             assert len(part.steps[node]) == kept.sum()
             for name, values in whole.outputs[node].items():
                 np.testing.assert_array_equal(part.outputs[node][name], values[kept])
+
+
+@pytest.fixture(scope="module")
+def short_log(tmp_path_factory):
+    """A finished log of half a second, and where its first chunk begins."""
+    path = tmp_path_factory.mktemp("short") / "session.mcap"
+    file = SessionFile(path, *fake_sessions.arguments())
+    file.start(fake_sessions.EPOCH_NS, 0)
+    fake_sessions.feed(range(100), fake_sessions.Flushed(file))
+    file.finish({"status": "finished", "exit_code": 0})
+    return path, chunks(path)[0][0]
+
+
+def test_what_is_bent_before_the_first_chunk_costs_no_data(short_log, tmp_path):
+    path, first = short_log
+    whole, content = read_log(path), bytearray(path.read_bytes())
+    bent, clean = tmp_path / "bent.mcap", tmp_path / "clean.mcap"
+    rng = np.random.default_rng(3)
+    for place in rng.integers(8, first, 60).tolist():
+        bit = 1 << int(rng.integers(8))
+        content[place] ^= bit
+        bent.write_bytes(content)
+        content[place] ^= bit
+        clean.unlink(missing_ok=True)
+        assert sum(recover(bent, clean).messages.values())
+        for part in (read_quietly(bent), read_quietly(clean)):
+            assert part.steps.keys() == whole.steps.keys(), place
+            assert all(len(part.steps[n]) == len(s) for n, s in whole.steps.items()), place
+            assert_prefix(part, whole)
+        tail = quietly(read_log, bent, 0.4)
+        assert len(tail.steps["world"]) == len(read_log(path, 0.4).steps["world"]), place
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.NONE])
+@pytest.mark.parametrize("opcode", [0x10, 0x80, 0xFF])
+def test_records_that_others_may_use_are_passed_over(tmp_path, compression, opcode):
+    source = tmp_path / "private.mcap"
+    with open(source, "wb") as stream:
+        writer = Writer(stream, chunk_size=256, compression=compression)
+        writer.start("", "other")
+        channel = writer.register_channel("/x", "cdr", writer.register_schema("s", "ros2msg", b"int64 x\n"))
+        for k in range(40):
+            if k == 20:
+                writer.flush()
+                stream.write(struct.pack("<BQ", opcode, 4) + b"mine")
+            writer.add_message(channel, 10 * k, struct.pack("<4sq", b"\0\1\0\0", k), 10 * k, k)
+        writer.finish()
+    recovery = recover(source, tmp_path / "clean.mcap")
+    assert (recovery.messages, recovery.skipped, recovery.cut) == ({"/x": 40}, (), False)
+
+
+def test_a_chunk_whose_opcode_became_private_is_missed(session_log, tmp_path):
+    content = bytearray(session_log.read_bytes())
+    content[chunks(session_log)[3][0]] |= 0x80
+    bent = tmp_path / "bent.mcap"
+    bent.write_bytes(content)
+    with pytest.warns(TruncatedLogWarning, match=r"unreadable: \d+ bytes at"):
+        read_log(bent)
 
 
 def test_a_lost_chunk_is_reported(session_log, tmp_path):

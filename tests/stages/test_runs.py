@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import subprocess
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -289,3 +290,24 @@ def test_hash_of_a_folder_depends_on_names_and_contents(tmp_path):
 
 def test_no_git_state_outside_of_a_repository(tmp_path):
     assert git_state(tmp_path) is None
+
+
+@pytest.mark.parametrize("key", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "filter.a=b.clean"])
+def test_a_repository_from_elsewhere_runs_no_programs(tmp_path, key):
+    def git(*arguments):
+        subprocess.run(["git", *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    git("init", "-q")
+    (tmp_path / "f").write_text("1")
+    (tmp_path / ".gitattributes").write_text(f"f filter={'x' if '.x.' in key else 'a=b'}\n")
+    git("add", "-A")
+    git("-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "x")
+    program = tmp_path / "program.sh"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\ncat\n")
+    program.chmod(0o755)
+    git("config", key, str(program))
+    (tmp_path / "f").write_text("2")  # git must look into it: its size is the same
+    state = git_state(tmp_path)
+    assert not (tmp_path / "ran").exists()
+    assert state is not None
+    assert state["dirty"]
