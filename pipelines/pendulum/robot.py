@@ -20,7 +20,7 @@ from sim2real.stages.config import GateLimits
 
 from . import hardware, parameters
 from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, SimActuator
-from .task import SwingUp, upright
+from .task import LIMIT_V, SwingUp, upright
 
 RATE_HZ = 50.0
 SUPERVISOR = "agent"
@@ -35,6 +35,7 @@ OBSERVATION = [
     ("past voltage", ("V",), HISTORY),
 ]
 ACTION = [("voltage", "V")]
+ACTION_BOUNDS = [(-LIMIT_V, LIMIT_V)]
 WORLD_HZ = 100.0
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 DELAY_SPREAD_S = 0.002

@@ -26,6 +26,12 @@ PARITY = 1e-5
 """Largest difference between numpy and ONNX that an export may have, as a share of the action range."""
 
 
+LARGEST = 1e6
+"""Largest magnitude in a policy's weights and normaliser: trained ones stay below 1e3."""
+LEAST_STD = 1e-6
+"""Smallest standard deviation of a normaliser: trained ones are at least 1e-3."""
+
+
 def save_bundle(
     folder: str | Path, weights: Mapping[str, np.ndarray], contract: PolicyContract, samples: np.ndarray | None = None
 ) -> Path:
@@ -118,7 +124,9 @@ def _read_about(folder: Path) -> dict[str, Any]:
             f"{folder} holds no {CONTRACT}: it is no policy bundle, or its export did not finish",
             hint="make one with: sim2real train",
         ) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise Sim2RealError(f"{path} cannot be read: {error.strerror}", hint="check its permissions") from error
+    except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
         raise Sim2RealError(f"{path} is no JSON: {error}", hint="copy or export the bundle again") from error
     version = about.get("format_version") if isinstance(about, dict) else None
     if version != FORMAT_VERSION:
@@ -126,6 +134,8 @@ def _read_about(folder: Path) -> dict[str, Any]:
             f"{path} has format version {version!r}, this sim2real reads {FORMAT_VERSION}",
             hint="export the policy again, or install the sim2real that wrote it (see 'versions' in the file)",
         )
+    if not isinstance(about.get("files"), dict):
+        raise Sim2RealError(f"{path} does not say which files are its own", hint="copy or export the bundle again")
     return about
 
 
@@ -135,7 +145,11 @@ def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
         content = (folder / name).read_bytes()
     except FileNotFoundError as error:
         raise Sim2RealError(f"{folder} lacks {name}", hint="copy or export the whole bundle again") from error
-    expected = about.get("files", {}).get(name)
+    except OSError as error:
+        raise Sim2RealError(
+            f"{folder / name} cannot be read: {error.strerror}", hint="check its permissions"
+        ) from error
+    expected = about["files"].get(name)
     if hashlib.sha256(content).hexdigest() != expected:
         raise Sim2RealError(
             f"{folder / name} is not what was exported: its sha256 differs from the one in {CONTRACT}",
@@ -162,6 +176,16 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> N
             )
         if not np.isfinite(weights[name]).all():
             raise Sim2RealError(f"the policy's {name} holds values that are not finite", hint="train the policy again")
+        if np.abs(weights[name]).max(initial=0.0) > LARGEST:
+            raise Sim2RealError(
+                f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {LARGEST:g} is the most",
+                hint="no training ends there: train the policy again, and scale observations that are this large",
+            )
+    if weights["std"].min() < LEAST_STD:
+        raise Sim2RealError(
+            f"the policy divides by standard deviations down to {weights['std'].min():g}; {LEAST_STD:g} is the least",
+            hint="train the policy again",
+        )
     for side in ("low", "high"):
         promised = np.array([getattr(term, side) for term in contract.action], np.float32)
         if not np.array_equal(promised, weights[side]):

@@ -135,7 +135,9 @@ class PolicyContract:
                 limits=dict(data["limits"]),
                 hashes=dict(data["hashes"]),
             )
-        except (KeyError, TypeError, AttributeError) as error:
+        except Sim2RealError:
+            raise
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise Sim2RealError(
                 f"the policy's contract is incomplete: {type(error).__name__} {error}",
                 hint="export the policy again: sim2real train",

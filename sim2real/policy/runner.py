@@ -104,6 +104,8 @@ class PolicyRunner:
     def __init__(self, contract: PolicyContract, backend: Backend) -> None:
         self.contract = contract
         self._backend = backend
+        self._low = np.array([term.low for term in contract.action], np.float32)
+        self._high = np.array([term.high for term in contract.action], np.float32)
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return the action, float32 of shape ``(A,)`` within the contract's bounds.
@@ -130,4 +132,4 @@ class PolicyRunner:
         if not np.isfinite(action).all():
             names = [term.name for term, ok in zip(self.contract.action, np.isfinite(action), strict=True) if not ok]
             raise SafetyStop(f"the policy's action {', '.join(names)} is not finite", hint="train the policy again")
-        return action
+        return np.clip(action, self._low, self._high)  # a graph may be anything: the contract is what holds

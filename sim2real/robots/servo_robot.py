@@ -209,6 +209,11 @@ class ServoRobot(ABC):
         """Names and units of the policy's actions."""
         return [(f"speed of {joint}'s goal", "rad/s") for joint in self.servos.joints]
 
+    @property
+    def ACTION_BOUNDS(self) -> list[tuple[float, float]]:
+        """Fastest the goals may go, either way [rad/s]."""
+        return [(-self.servos.speed, self.servos.speed)] * len(self.servos.joints)
+
     @cached_property
     def task(self) -> GoalTask:
         """The composed task of this robot's world."""

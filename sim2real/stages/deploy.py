@@ -129,6 +129,13 @@ def _load_policy(robot: Robot, bundle: Path) -> Policy:
             f"the policy in {bundle} sends {sends}, this robot takes {robot.ACTION}",
             hint="train a policy for this pipeline",
         )
+    for action, (low, high) in zip(contract.action, robot.ACTION_BOUNDS, strict=True):
+        if action.low < np.float32(low) or action.high > np.float32(high):  # training rounds them so
+            raise Sim2RealError(
+                f"the policy in {bundle} sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}, "
+                f"this robot bears {low:g} to {high:g}",
+                hint="train a policy for this pipeline",
+            )
     return Policy.from_weights(read_weights(bundle))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -53,6 +53,7 @@ class Robot(Identifiable, Protocol):
         JOINTS: For the log: node -> joint -> quantity -> field, see ``McapRecorder``.
         OBSERVATION: Terms of the policy's observation in order: name, units of its entries, steps of history.
         ACTION: Names of the actions, with units, in order.
+        ACTION_BOUNDS: Lowest and highest value of each that the robot bears [its unit].
     """
 
     RATE_HZ: float
@@ -61,6 +62,7 @@ class Robot(Identifiable, Protocol):
     JOINTS: Mapping[str, Any]
     OBSERVATION: list[tuple[str, tuple[str, ...], int]]
     ACTION: list[tuple[str, str]]
+    ACTION_BOUNDS: Sequence[tuple[float, float]]
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
         """Open the robot, with torque off."""

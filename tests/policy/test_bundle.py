@@ -1,5 +1,6 @@
 """A policy that leaves one machine and arrives on another."""
 
+import contextlib
 import hashlib
 import json
 import subprocess
@@ -7,9 +8,10 @@ import sys
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
-from sim2real.policy import load_bundle, read_weights, save_bundle
+from sim2real.policy import PolicyRunner, load_bundle, read_weights, save_bundle
 
 
 @pytest.fixture
@@ -134,6 +136,54 @@ def test_weights_must_fit_the_contract(tmp_path, weights, contract):
     with pytest.raises(Sim2RealError, match="std holds values that are not finite"):
         save_bundle(tmp_path / "a", weights | {"std": np.full(5, np.nan)}, contract)
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("std", 0.0, "standard deviations down to 0"),
+        ("std", -1.0, "standard deviations down to -1"),
+        ("layers.1.kernel", 1e38, r"layers\.1\.kernel holds values up to 1e\+38"),
+        ("layers.0.bias", -1e9, r"layers\.0\.bias holds values up to 1e\+09"),
+        ("mean", 3e38, "mean holds values up to 3e"),
+    ],
+)
+def test_absurd_weights_are_refused(bundle, tmp_path, weights, contract, name, value, message):
+    bent = {n: v.copy() for n, v in weights.items()}
+    bent[name].flat[0] = value
+    with pytest.raises(Sim2RealError, match=rf"(?s){message}.*hint: "):
+        save_bundle(tmp_path / "a", bent, contract)
+    content = safetensors.numpy.save(bent)  # and a bundle that was made by hand, with the right hash
+    (bundle / "policy.safetensors").write_bytes(content)
+    about = json.loads((bundle / "policy.json").read_text())
+    about["files"]["policy.safetensors"] = hashlib.sha256(content).hexdigest()
+    (bundle / "policy.json").write_text(json.dumps(about))
+    with pytest.raises(Sim2RealError, match=message):
+        load_bundle(bundle)
+
+
+def test_a_graph_that_breaks_the_contract_is_held_to_it(contract):
+    runner = PolicyRunner(contract, lambda observation: np.array([[1e9, -1e9]], np.float32))
+    np.testing.assert_array_equal(runner.act(np.zeros(5)), np.array([2.0, 0.0], np.float32))
+
+
+def test_bytes_bent_at_random_are_refused_in_words(bundle):
+    path, rng = bundle / "policy.json", np.random.default_rng(0)
+    whole = path.read_bytes()
+    weird = [None, [], {}, "x", -1, 1e400, float("nan"), True, "\ud800"]
+    for _ in range(150):
+        about = json.loads(whole)
+        place = about
+        while isinstance(place, dict | list) and place:
+            keys = list(place) if isinstance(place, dict) else range(len(place))
+            key = keys[rng.integers(len(keys))]
+            if rng.random() < 0.5 or not isinstance(place[key], dict | list):
+                place[key] = weird[rng.integers(len(weird))]
+                break
+            place = place[key]
+        path.write_text(json.dumps(about))
+        with contextlib.suppress(Sim2RealError):
+            load_bundle(bundle).act(np.zeros(5))
 
 
 def test_an_unknown_backend_is_refused(bundle):

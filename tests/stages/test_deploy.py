@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
+from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, save_bundle
 from sim2real.robots.loop import control_nodes
 from sim2real.stages import deploy
 from sim2real.stages.pipeline import load_pipeline
@@ -98,3 +100,26 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("name", ["pendulum", "arm"])
+def test_a_policy_may_not_ask_for_more_than_the_robot_bears(tmp_path, name):
+    robot = load_pipeline(name).load()
+    size = sum(len(units) * history for _, units, history in robot.OBSERVATION)
+
+    def bundle(factor):
+        low, high = (factor * np.array(side, np.float32) for side in zip(*robot.ACTION_BOUNDS, strict=True))
+        terms = zip(robot.ACTION, low.tolist(), high.tolist(), strict=True)
+        contract = PolicyContract(
+            tuple(ObservationTerm(*term) for term in robot.OBSERVATION),
+            tuple(ActionTerm(*action, a, b) for action, a, b in terms),
+            robot.RATE_HZ,
+        )
+        zeros, actions = np.zeros(size, np.float32), len(low)
+        weights = {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(actions)}
+        weights |= {"layers.0.kernel": np.zeros((size, actions)), "layers.0.bias": np.zeros(actions)}
+        return save_bundle(tmp_path / str(factor), weights, contract, np.zeros((1, size)))
+
+    deploy._load_policy(robot, bundle(1))
+    with pytest.raises(Sim2RealError, match=r"(?s)this robot bears -.*hint: train a policy"):
+        deploy._load_policy(robot, bundle(50))
