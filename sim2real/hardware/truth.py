@@ -6,6 +6,7 @@ file cut anywhere can be read. All times are CLOCK_MONOTONIC nanoseconds, which 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 from collections.abc import Sequence
@@ -76,6 +77,7 @@ class TruthLog:
         self._padding = (0.0,) * self._values
         self._rows: list[bytes] = []
         self._flushed_ns = 0
+        self._full = False
         self._file = path.open("wb")
         self._file.write(json.dumps({**header, "values": self._values}).encode() + b"\n")
         self._file.flush()
@@ -104,11 +106,19 @@ class TruthLog:
         """Write what is left and close the file; closing twice is fine."""
         if not self._file.closed:
             self._flush()
-            self._file.close()
+            with contextlib.suppress(OSError):
+                self._file.close()
 
     def _flush(self) -> None:
-        self._file.write(b"".join(self._rows))
-        self._file.flush()
+        """Write the buffered rows; a robot does not stop because its account cannot be written: that ends, then."""
+        if self._full:
+            self._rows.clear()
+            return
+        try:
+            self._file.write(b"".join(self._rows))
+            self._file.flush()
+        except OSError:
+            self._full = True
         self._rows.clear()
 
 

@@ -87,14 +87,20 @@ class SessionFile:
         except OSError as error:
             raise Sim2RealError(f"the log {path} cannot be created: {error.strerror}") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True)
-        self._writer.start(profile="ros2", library=LIBRARY)
-        self._writer.add_metadata(document.SESSION, session)
-        now = time.time_ns()
-        for name, data in attachments.items():
-            media_type = mimetypes.guess_type(name)[0] or "application/octet-stream"
-            self._writer.add_attachment(now, now, name, media_type, data)
-        self.flush()
-        self.sync()
+        try:
+            self._writer.start(profile="ros2", library=LIBRARY)
+            self._writer.add_metadata(document.SESSION, session)
+            now = time.time_ns()
+            for name, data in attachments.items():
+                media_type = mimetypes.guess_type(name)[0] or "application/octet-stream"
+                self._writer.add_attachment(now, now, name, media_type, data)
+            self.flush()
+            self.sync()
+        except OSError as error:
+            self.abandon()
+            raise Sim2RealError(
+                f"the log {path} cannot be written: {error.strerror}", hint="check the disk's free space"
+            ) from error
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Write the channels: they carry the episode's time 0."""

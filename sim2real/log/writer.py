@@ -65,6 +65,7 @@ class McapRecorder:
         self._queue: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
         self._longest_queue = 0
         self._error: BaseException | None = None
+        self._failed: Sim2RealError | None = None
         self._started = False
         self._closed = False
         self._lock = threading.Lock()
@@ -163,10 +164,13 @@ class McapRecorder:
         self._queue.put((write, *arguments))
 
     def _failure(self) -> Sim2RealError:
-        hint = None
-        if isinstance(self._error, OSError):
-            hint = "check the disk's free space; what was written before opens with a warning"
-        return Sim2RealError(f"writing the log {self.path} failed: {self._error}", hint)
+        """Return the error that every call raises from now on: one object, so that whoever meets it twice can tell."""
+        if self._failed is None:
+            hint = None
+            if isinstance(self._error, OSError):
+                hint = "check the disk's free space; what was written before opens with a warning"
+            self._failed = Sim2RealError(f"writing the log {self.path} failed: {self._error}", hint)
+        return self._failed
 
     def _run(self) -> None:
         """Write what comes out of the queue until None does."""

@@ -223,6 +223,8 @@ class WallClockRun:
                 if not self._threads[name].is_alive():
                     for record in channel.leftover():
                         self._recorder.message(record)
+        except Sim2RealError as error:
+            self._shared.fail(error)
         except Exception as error:  # the nodes' own failure, if there is one, must still reach the caller
             self._shared.fail(Sim2RealError(f"the recorder failed at the end: {type(error).__name__}: {error}"))
 

@@ -17,7 +17,7 @@ from sim2real.hardware import registers as reg
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.plant import load_plant
 from sim2real.hardware.protocol import Instruction, Parser, StatusError, build
-from sim2real.hardware.truth import Kind, read_truth
+from sim2real.hardware.truth import Kind, TruthLog, read_truth
 from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
@@ -295,3 +295,24 @@ def test_plants_may_be_dataclasses():
 def test_plants_that_cannot_be_found(spec, message):
     with pytest.raises(UsageError, match=message):
         load_plant(spec)
+
+
+def test_an_account_that_cannot_be_written_does_not_stop_the_robot(tmp_path):
+    log = TruthLog(tmp_path / "truth.bin", {"state_names": ["q"]})
+    log.write(Kind.STATE, 0, 0, 1, 0, 0, (1.0,))
+    log.flush_if_due(10**9)
+    log._file.close()
+    log._file = open("/dev/full", "wb")  # noqa: SIM115 - the log closes it
+    for second in range(2, 5):
+        log.write(Kind.STATE, 0, 0, second, 0, 0, (1.0,))
+        log.flush_if_due(second * 10**9)
+    log.close()
+    assert read_truth(tmp_path / "truth.bin").rows["t_ns"].tolist() == [1]
+
+
+def test_the_embedded_robot_imports_nothing_from_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "numpy.py").write_text("open('ran', 'w')")
+    monkeypatch.chdir(tmp_path)
+    with EmbeddedRobot(f"{PLANTS}:Ramp") as robot:
+        assert robot.running
+    assert not (tmp_path / "ran").exists()

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import struct
 import subprocess
 import sys
 import textwrap
+import time
 import warnings
 from pathlib import Path
 
@@ -292,3 +294,41 @@ def test_a_full_disk_reaches_the_caller(tmp_path, monkeypatch):
     with pytest.raises(Sim2RealError, match="No space left"):
         log.close()
     log.close()
+
+
+def test_a_disk_that_fills_up_leaves_the_log_readable_up_to_there(tmp_path):
+    path = tmp_path / "x.mcap"
+    values = np.random.default_rng(0).normal(size=100_000)
+    log = McapRecorder(path, {"pipeline": "fake"}, {}, {"a": {"x": 0.0}}, [])
+    log.start(10**18, 0)
+
+    def feed(steps):
+        for k in steps:
+            log.step(StepRecord("a", k, k, k, k, -1, k + 1, 0), {"x": values[k]})
+
+    feed(range(500))
+    while len(read_quietly(path).steps.get("a", ())) < 500:  # until it is flushed
+        time.sleep(0.05)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))
+    try:
+        with pytest.raises(Sim2RealError, match=r"(?s)failed: .*hint: check the disk") as caught:
+            feed(range(500, 100_000))
+        with pytest.raises(Sim2RealError) as again:
+            log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert again.value is caught.value, "one failure is told once"
+    with pytest.warns(TruncatedLogWarning, match="no end"):
+        episode = read_log(path)
+    np.testing.assert_array_equal(episode.outputs["a"]["x"], values[: len(episode.steps["a"])])
+    assert len(episode.steps["a"]) >= 500
+
+
+def test_a_disk_that_is_full_from_the_start(tmp_path, monkeypatch):
+    def full(self):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(SessionFile, "flush", full)
+    with pytest.raises(Sim2RealError, match=r"(?s)cannot be written: No space left.*hint: "):
+        McapRecorder(tmp_path / "x.mcap", {}, {}, {"a": {"x": 0.0}}, [])
