@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from tqdm import tqdm
-
+# A line of progress in a log file, at most so often: few to read, and none of them a sign that nothing goes on.
+_LINE_EVERY_S = 15.0
 
 # What makes a terminal do something: control characters but line feed and tab, and what turns the direction of text.
 _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -52,17 +53,88 @@ def pairs(values: Mapping[str, Any]) -> str:
     return "\n".join(line.rstrip() for line in table([[name, _cell(v)] for name, v in values.items()]).splitlines())
 
 
-def progress(total: int | None, desc: str, *, always: bool = False) -> tqdm:
-    """Return a progress bar on stderr; it shows nothing unless stderr is a terminal.
+class Bar(Protocol):
+    """What `progress` shows: as much of tqdm's bar as is used."""
+
+    n: float
+    total: float | None
+
+    def update(self, n: float = 1) -> Any:
+        """Add steps that were done."""
+        ...
+
+    def refresh(self) -> Any:
+        """Show the state."""
+        ...
+
+    def set_description_str(self, desc: str) -> None:
+        """Say what is being done now."""
+        ...
+
+    def set_postfix_str(self, s: str) -> None:
+        """Say how far it has come."""
+        ...
+
+
+@contextmanager
+def progress(total: int | None, desc: str) -> Iterator[Bar]:
+    """Show a progress bar on stderr; plain lines where that is no terminal, such as a log file.
 
     Args:
         total: Number of steps; None if unknown.
         desc: What is being done.
-        always: Show the bar without a terminal too.
     """
-    from tqdm import tqdm  # not needed for --help
+    if sys.stderr.isatty():
+        from tqdm import tqdm  # not needed for --help
 
-    return tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not (always or sys.stderr.isatty()))
+        with tqdm(total=total, desc=desc, file=sys.stderr, leave=False) as bar:
+            yield bar
+        return
+    lines = _Lines(total, desc)
+    try:
+        yield lines
+    except BaseException:
+        lines.end("ended")
+        raise
+    lines.end("finished")
+
+
+class _Lines:
+    """Progress as lines: one when something begins, one when it ends, and in between one now and then."""
+
+    def __init__(self, total: float | None, desc: str) -> None:
+        self.n: float = 0
+        self.total = total
+        self._postfix = ""
+        self._begin(desc)
+
+    def update(self, n: float = 1) -> None:
+        self.n += n
+        self.refresh()
+
+    def refresh(self) -> None:
+        now = time.monotonic()
+        if now - self._told_s >= _LINE_EVERY_S:
+            self._told_s = now
+            done = f"{self.n:g} of {self.total:g}" if self.total else f"{self.n:g}"
+            note(f"{self._desc}: {', '.join(filter(None, [done, self._postfix]))}, {now - self._begun_s:.0f} s so far")
+
+    def set_description_str(self, desc: str) -> None:
+        if desc != self._desc:
+            self.end("finished")
+            self._begin(desc)
+
+    def set_postfix_str(self, s: str) -> None:
+        self._postfix = s
+
+    def _begin(self, desc: str) -> None:
+        self._desc = desc
+        self._begun_s = self._told_s = time.monotonic()
+        note(f"{desc}: started")
+
+    def end(self, how: str) -> None:
+        said = f" ({self._postfix})" if self._postfix else ""
+        note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{said}")
 
 
 def note(text: str) -> None:

@@ -25,7 +25,7 @@ from sim2real.runtime.bursts import make_room
 from sim2real.runtime.clock import realtime
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import DeployConfig
-from sim2real.stages.console import note, table
+from sim2real.stages.console import note, progress, table
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
 from sim2real.stages.rig import announce, warn
@@ -65,7 +65,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         real = [
             _true_states(stage.folder / TRUTH, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)
         ]
-        simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs))
+        with progress(None, "simulate the same"):
+            simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs))
         result = _compare(robot, real, simulated)
         result["gap"] += _age_rows(robot, episodes, timeline)
         stage.output("result", "result.json").write_text(

@@ -36,10 +36,39 @@ def test_talk_goes_to_stderr_and_results_to_stdout(capsys, tmp_path, monkeypatch
     assert capsys.readouterr() == ("wrote x/y\nwrote /elsewhere/z\n", "hello\n")
 
 
-@pytest.mark.parametrize("always", [False, True])
-def test_progress_is_silent_without_a_terminal_unless_asked(capsys, always):
-    with console.progress(3, "train", always=always) as bar:
-        bar.update()
+def test_progress_is_plain_lines_without_a_terminal(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with console.progress(3, "train (compiling)") as bar:
+        now[0] += 57.0
+        bar.set_description_str("train")
+        for _ in range(3):
+            now[0] += 10.0
+            bar.set_postfix_str("return -245")
+            bar.update()
+    with pytest.raises(KeyError), console.progress(None, "record"):
+        raise KeyError
     out, err = capsys.readouterr()
     assert not out
-    assert ("train" in err) is always
+    assert err.splitlines() == [
+        "train (compiling): started",
+        "train (compiling): finished after 57.0 s",
+        "train: started",
+        "train: 2 of 3, return -245, 20 s so far",
+        "train: finished after 30.0 s (return -245)",
+        "record: started",
+        "record: ended after 0.0 s",
+    ]
+
+
+def test_what_a_terminal_would_obey_is_shown_instead(capsys):
+    evil = "\x1b]0;mine\x07 \x9b2J \u202egnp.exe \ud800 ü\ttab"
+    console.note(evil)
+    console.wrote(f"/x/{evil}")
+    print(console.table([[evil, "two\nlines"]], ["a", "b"]), console.pairs({evil: evil}))
+    out, err = capsys.readouterr()
+    for text in (out, err):
+        assert not set("\x1b\x07\x9b\u202e\ud800") & set(text)
+        assert "\\x1b]0;mine\\x07" in text
+        assert "ü\ttab" in text
+    assert "two\\nlines" in out
