@@ -89,6 +89,8 @@ def _run_command(arguments: list[str], signals: Signals) -> int:
         if isinstance(end.code, int) and end.code > 128:
             return ending.ended_by(end.code - 128)
         return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
+    except OSError as error:
+        return ending.ended_by(signals.received) if signals.received else ending.refused(error)
     except Exception as error:
         if signals.received:  # an extension that is interrupted while it is imported raises ImportError
             return ending.ended_by(signals.received)

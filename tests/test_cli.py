@@ -285,6 +285,39 @@ def test_recover_saves_what_is_readable_and_says_what_is_not(capsys, tmp_path):
     assert "\x1b" not in out + err
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"started": None},
+        {"outputs": "x"},
+        {"outputs": {"log": 3}},
+        {"outputs": {"log": {"path": "../../../../etc/passwd", "sha256": "x"}}},
+        {"outputs": {"log": {"path": "/etc/passwd", "sha256": "x"}}},
+        {"inputs": []},
+        {"pipeline": 3},
+    ],
+)
+def test_manifests_that_are_none_are_passed_over(capsys, tmp_path, change):
+    with runs.open_stage(tmp_path, "pendulum", "record", None) as stage:
+        stage.output("log", "session.mcap").write_text("x")
+    path = stage.folder / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    assert cli.main(["info", str(stage.run_dir)]) == errors.USAGE
+    assert cli.main(["report", str(stage.run_dir)]) == errors.USAGE
+    assert cli.main(["identify", "pendulum", "--runs", str(tmp_path)]) == errors.ERROR
+    said = capsys.readouterr().err
+    assert said.count("\nhint: ") == 3
+    assert "raceback" not in said
+
+
+def test_what_the_operating_system_refuses_is_said_in_words(capsys):
+    assert cli.main(["info", "a" * 5000]) == errors.ERROR
+    said = capsys.readouterr().err
+    assert said.startswith("error: File name too long: ")
+    assert "\n\nhint: " in said
+    assert len(said) < 500
+
+
 def test_info_of_something_else_is_an_error(capsys, tmp_path):
     path = tmp_path / "notes.mcap"
     path.write_text("no log at all, though its name says so")

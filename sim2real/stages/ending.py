@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 import traceback
+from textwrap import shorten
 from typing import NoReturn
 
 from sim2real.errors import ERROR, Sim2RealError, UsageError
@@ -26,6 +27,17 @@ def failed(error: Sim2RealError) -> int:
         hint = ["see `sim2real COMMAND --help`"]
     _complain(f"error: {message}", *_notes(error), *(f"\nhint: {h}" for h in hint))
     return error.exit_code
+
+
+def refused(error: OSError) -> int:
+    """Say what the operating system refused, and about which file; return the exit code."""
+    if not isinstance(error.filename, str | bytes):
+        return unexpected(error)
+    if os.environ.get(DEBUG):
+        traceback.print_exc()
+    name = shorten(os.fsdecode(error.filename), 200)
+    _complain(f"error: {error.strerror}: {name}", *_notes(error), f"\nhint: check its name; {DEBUG}=1 shows more")
+    return ERROR
 
 
 def unexpected(error: Exception) -> int:

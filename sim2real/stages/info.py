@@ -51,7 +51,9 @@ def run(run_dir: Path) -> str:
             manifest = attempt.manifest
             started, sha = manifest["started"][:19], (manifest.get("git") or {}).get("sha") or "-"
             duration = manifest.get("duration_s")
-            rows.append([attempt.folder.name, manifest["status"], manifest["exit_code"], started, duration, sha[:10]])
+            rows.append(
+                [attempt.folder.name, manifest["status"], manifest.get("exit_code"), started, duration, sha[:10]]
+            )
             for kind in ("inputs", "outputs"):
                 entries = manifest[kind].items()
                 files += [[attempt.folder.name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]

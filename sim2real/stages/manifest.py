@@ -13,12 +13,13 @@ from collections.abc import Mapping
 from enum import Enum
 from importlib import metadata
 from numbers import Integral, Real
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from sim2real.errors import Sim2RealError
 
 MANIFEST = "manifest.json"
+_TEXTS = ("pipeline", "stage", "status", "started")
 _DRAFT = f".{MANIFEST}.tmp"
 # Most manifests have 4 kB; the rest is for summaries.
 _RESERVED_BYTES = 32 * 1024
@@ -31,7 +32,24 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return manifest if isinstance(manifest, dict) else None
+    return manifest if _is_manifest(manifest) else None
+
+
+def _is_manifest(value: Any) -> bool:
+    """Whether a JSON document has what is asked of a manifest, and its outputs lie in its folder."""
+    if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
+        return False
+    for kind in ("inputs", "outputs"):
+        entries = value.get(kind)
+        if not isinstance(entries, dict):
+            return False
+        for entry in entries.values():
+            if not (isinstance(entry, dict) and all(isinstance(entry.get(k), str) for k in ("path", "sha256"))):
+                return False
+            path = PurePath(entry["path"])
+            if kind == "outputs" and (path.is_absolute() or ".." in path.parts):
+                return False
+    return True
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:

@@ -115,4 +115,13 @@ def _manifest(folder: Path) -> Mapping[str, Any]:
         manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return manifest if isinstance(manifest, dict) else {}
+    if not isinstance(manifest, dict):
+        return {}
+    return manifest if _inside(manifest.get("outputs")) else {**manifest, "outputs": {}}
+
+
+def _inside(outputs: Any) -> bool:
+    """Whether outputs are as a manifest names them, with paths that stay in their folder."""
+    entries = outputs.values() if isinstance(outputs, dict) else [None]
+    paths = [entry.get("path") if isinstance(entry, dict) else None for entry in entries]
+    return all(isinstance(p, str) and not Path(p).is_absolute() and ".." not in Path(p).parts for p in paths)

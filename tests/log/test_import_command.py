@@ -155,3 +155,21 @@ def test_the_pipelines_mappings_are_for_them(pipeline):
     mapping = load_mapping(REPOSITORY / "pipelines" / pipeline / "import.toml")
     assert mapping.pipeline == pipeline
     assert set(mapping.nodes) == {"actuator", "sensor"}
+
+
+def test_a_mapping_cannot_lead_out_of_the_folder_of_runs(tmp_path, capsys):
+    np.savez(tmp_path / "x.npz", a=np.arange(10.0))
+    (tmp_path / "m.toml").write_text(
+        'pipeline = "../../../out"\n[nodes.sensor]\nrate_hz = 10\nfields.th = { source = "a" }\n'
+    )
+    arguments = [
+        "import",
+        tmp_path / "x.npz",
+        "--mapping",
+        tmp_path / "m.toml",
+        "--runs",
+        tmp_path / "a" / "b" / "runs",
+    ]
+    assert cli.main([str(a) for a in arguments]) == 2
+    assert "no name for a pipeline" in capsys.readouterr().err
+    assert {p.name for p in tmp_path.iterdir()} == {"x.npz", "m.toml"}
