@@ -72,6 +72,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         begin = time.monotonic()
         with _told("identify") as told:
             found = _fit(model, logs, windows, config, table, told)
+        note("identify: errors, predictions and baselines")
         spread = uncertainty.from_linearised(found.problem, at := uncertainty.linearise(found.problem, found.z))
         check = identifiability.from_linearised(found.problem, at)
         seconds = time.monotonic() - begin
