@@ -32,6 +32,7 @@ from sim2real.log.session_file import LIBRARY
 
 # A message record: opcode and length; then channel, sequence, log time, publish time and the message itself.
 _PREFIX_BYTES, _DATA_AT = 9, 31
+_MESSAGE = int(Opcode.MESSAGE)  # a plain number: it is compared for every message
 # Role -> what the metadata of a channel in that role must have.
 _ROLES = {
     "step": {"node"},
@@ -188,13 +189,14 @@ def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | 
     if found.chunks > 1 and found.channels and (last < begin or first >= end):
         return
     content = chunk_content(data, record, found.damage)
-    for inner in chunk_records(content):
-        if inner.opcode == Opcode.MESSAGE:
-            channel = int.from_bytes(content[inner.start : inner.start + 2], "little")
-            if channel in found.messages:
-                found.messages[channel].append(content[inner.start - _PREFIX_BYTES : inner.end])
-        elif inner.opcode == Opcode.CHANNEL:
-            _take_channel(found, parsed(Channel, content, inner, found.damage))
+    messages = found.messages
+    for opcode, start, end in chunk_records(content):
+        if opcode == _MESSAGE:
+            channel = content[start] | content[start + 1] << 8
+            if channel in messages:
+                messages[channel].append(content[start - _PREFIX_BYTES : end])
+        elif opcode == Opcode.CHANNEL:
+            _take_channel(found, parsed(Channel, content, Record(opcode, start, end), found.damage))
 
 
 def _take_channel(found: Contents, channel: Channel | None) -> None:

@@ -147,20 +147,22 @@ def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
         return b""
 
 
-def chunk_records(content: bytes) -> Iterator[Record]:
-    """Yield the records in a chunk's content, without reading theirs.
+def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of the records in a chunk's content, without reading theirs.
+
+    These are what `Record` holds, but as plain tuples: there is one for each message of a log.
 
     Raises:
         ValueError: When they do not fill it.
     """
-    position = 0
-    while position < len(content):
+    position, size, unpack = 0, len(content), _PREFIX.unpack_from
+    while position < size:
         start = position + _PREFIX.size
-        opcode, length = _PREFIX.unpack_from(content, position) if start <= len(content) else (0, len(content))
-        if start + length > len(content):
-            raise ValueError("the records in a chunk do not fill it")
-        yield Record(opcode, start, start + length)
+        opcode, length = unpack(content, position) if start <= size else (0, size)
         position = start + length
+        if position > size:
+            raise ValueError("the records in a chunk do not fill it")
+        yield opcode, start, position
 
 
 def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Damage) -> Any | None:

@@ -104,7 +104,7 @@ def _definitions(data: mmap.mmap) -> _Definitions:
 def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
     """Return the records in a chunk's content; none where they do not fill it."""
     try:
-        return list(chunk_records(content))
+        return [Record(*found) for found in chunk_records(content)]
     except ValueError as error:
         if damage is not None:
             damage.skipped.append(str(error))

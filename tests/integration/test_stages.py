@@ -73,7 +73,7 @@ def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):
     # Named, the older run is used, and gets the new attempt.
     flags = ["--run", completed.name, "--runs", str(tmp_path), "--generations", "10", "--population", "8"]
     assert cli.main(["identify", "pendulum", *flags]) == 0
-    assert (tmp_path / "pendulum" / completed.name / "identify.1").is_dir()
+    assert (tmp_path / "pendulum" / completed.name / "identify.2").is_dir()
 
 
 def test_an_interrupted_stage_is_run_again(completed, tmp_path, capsys):
@@ -84,8 +84,8 @@ def test_an_interrupted_stage_is_run_again(completed, tmp_path, capsys):
     flags = ["--resume", "copy", "--runs", str(tmp_path), "--deploy.episodes", "1", "--deploy.duration-s", "1"]
     assert cli.main(["run", "pendulum", *flags]) == 0
     assert capsys.readouterr().err.count("finished before, skipped") == 3
-    assert manifest_of(run_dir / "deploy")["status"] == "finished"
-    assert manifest_of(run_dir / "deploy.1")["status"] == "running"
+    assert manifest_of(run_dir / "deploy.2")["status"] == "finished"
+    assert manifest_of(run_dir / "deploy")["status"] == "running"
 
 
 @pytest.mark.parametrize("command", ["info", "report"])
