@@ -21,7 +21,7 @@ SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"
 """Suffix -> format, where none is named."""
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
 # What libraries raise at bytes that make no sense, once the file itself is open.
-_DAMAGED = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _WHOLE = "check that the file is complete, and of the format that its name or --format says"
 
 
@@ -144,6 +144,7 @@ def _read_npz(path: Path) -> ForeignFile:
 def _read_json(path: Path) -> ForeignFile:
     try:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
+        keys = _paths(document)
     except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
         raise UsageError(f"{path} is no JSON, or is cut off: {error}", hint=_WHOLE) from None
     if not isinstance(document, dict | list):
@@ -154,7 +155,7 @@ def _read_json(path: Path) -> ForeignFile:
             return document[name]
         return _walk(document, [p for p in re.split(r"\.|(?=\[\])", name) if p], path)
 
-    return ForeignFile(path, "json", _paths(document), load)
+    return ForeignFile(path, "json", keys, load)
 
 
 def _read_csv(path: Path) -> ForeignFile:

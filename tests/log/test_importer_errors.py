@@ -1,7 +1,9 @@
 """What is wrong with a file or a mapping is a usage error that says what, where, and what to do."""
 
+import io
 import json
 import pickle
+import zipfile
 
 import foreign_files
 import numpy as np
@@ -10,6 +12,7 @@ from foreign_files import COUNT, MAPPING, STAMPS_US, TOML, Q, U
 
 from sim2real.errors import UsageError
 from sim2real.log import ImportMapping, import_file, load_mapping
+from sim2real.log.foreign import open_foreign
 
 RIG = ImportMapping.from_dict(MAPPING)
 
@@ -232,3 +235,21 @@ def test_mapping_files_that_are_none(tmp_path):
     (tmp_path / "map.toml").write_text(TOML)
     with pytest.raises(UsageError, match="for pipeline 'rig', not for 'arm'"):
         load_mapping(tmp_path / "map.toml", "arm")
+
+
+def test_an_array_that_claims_more_than_memory_holds(tmp_path):
+    path = tmp_path / "x.npz"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", header.getvalue())
+    with pytest.raises(UsageError, match=r"(?s)'a' in .* is damaged.*hint: "):
+        open_foreign(path).signal("a")
+
+
+def test_a_document_that_is_nested_too_deep(tmp_path):
+    path = tmp_path / "x.json"
+    for depth in (990, 5000):
+        path.write_text('{"a":' * depth + "1" + "}" * depth)
+        with pytest.raises(UsageError, match=r"(?s)is no JSON.*hint: "):
+            open_foreign(path)
