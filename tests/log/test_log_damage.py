@@ -29,6 +29,7 @@ def quietly(call, *arguments):
         warnings.simplefilter("ignore", TruncatedLogWarning)
         return call(*arguments)
 
+
 pytestmark = pytest.mark.realtime
 
 
