@@ -49,8 +49,8 @@ class SwingUp:
 
     def params(self, key: jax.Array) -> dict[str, Any]:
         """Draw dynamics, delays and the state in which an episode starts: half of them hanging, half anywhere."""
-        drawn = draw_values(key, self.values, self.draws, self.delay_spread_s)
-        k_state, k_where = jax.random.split(jax.random.fold_in(key, 1))
+        k_values, k_state, k_where = jax.random.split(key, 3)
+        drawn = draw_values(k_values, self.values, self.draws, self.delay_spread_s)
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)

@@ -21,8 +21,9 @@ from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of what the bounds admit."""
-Told = Callable[[str, float, float], None]
-"""Called with what is done (``search`` or ``refine``), the share of it since the last call, and the best loss."""
+Told = Callable[[str, float, float, np.ndarray], None]
+"""Called with what is done (``search`` or ``refine``), the share of it since the last call, and loss and place of the
+best so far."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +114,9 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
     # At a bound the bijection is flat, and a search that begins there does not get away.
     start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
 
-    def advance(generations: int, best: float) -> None:
+    def advance(generations: int, best: float, z: np.ndarray) -> None:
         if told:
-            told("search", generations / total, best)
+            told("search", generations / total, best, z)
 
     return search(problem.losses, start, problem.config, problem.train, advance, problem.programs)
 
@@ -124,8 +125,8 @@ def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
     rounds = 3
     total = rounds * len(starts)
 
-    def advance(best: float) -> None:
+    def advance(best: float, z: np.ndarray) -> None:
         if told:
-            told("refine", 1 / total, best)
+            told("refine", 1 / total, best, z)
 
     return refine(problem, starts, problem.config.refine_steps, rounds, advance)

@@ -42,7 +42,7 @@ def refine(
     starts: np.ndarray,
     steps: int = 25,
     rounds: int = 3,
-    on_round: Callable[[float], None] | None = None,
+    on_round: Callable[[float, np.ndarray], None] | None = None,
 ) -> Refined:
     """Improve each start, and return the best of all; a point is accepted only if its full loss is smaller.
 
@@ -53,7 +53,7 @@ def refine(
         starts: Shape ``(K, P)``.
         steps: Steps a round at most.
         rounds: Rounds a start at most; the first that gains less than 0.01 % is the last.
-        on_round: Called after each with the best loss so far.
+        on_round: Called after each with loss and place of the best so far.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
@@ -80,7 +80,7 @@ def refine(
                 if new < best_loss:
                     best, best_loss = np.asarray(z), new
             if on_round:
-                on_round(best_loss)
+                on_round(best_loss, best)
             if not better or gain < 1e-4 * abs(loss):
                 break
     return Refined(best, best_loss, float(np.nanmin(first)), taken)

@@ -52,7 +52,7 @@ def search(
     start: np.ndarray,
     config: FitConfig,
     segments: np.ndarray | None = None,
-    on_generations: Callable[[int, float], None] | None = None,
+    on_generations: Callable[[int, float, np.ndarray], None] | None = None,
     programs: dict[Any, Any] | None = None,
 ) -> SearchResult:
     """Minimise; every candidate of a generation sees the same data (common random numbers).
@@ -65,7 +65,8 @@ def search(
         start: Shape ``(P,)``: middle of the first generation.
         config: How to search.
         segments: Shape ``(S,)``: what batches are drawn from; needed for batches alone.
-        on_generations: Called with the number of generations done since the last call and the best loss.
+        on_generations: Called with the number of generations done since the last call, and loss and place of the best
+            candidate of this run so far.
         programs: What an earlier call with the same losses compiled; this one adds what it compiles.
 
     Raises:
@@ -77,19 +78,19 @@ def search(
     programs = {} if programs is None else programs
     runs, histories, evaluations, large = [], [], 0, config.population
     for index in range(config.restarts + 1):
-        own = jax.random.fold_in(key, index)
+        k_run, k_step, k_middle = jax.random.split(jax.random.fold_in(key, index), 3)
         middle, std, population = start, config.std, config.population
         if index % 2:
             large = population = 2 * large
         elif index:
             # Hansen's small runs draw their population, too; at 5 s of compilation a size, ours keep the first one.
-            u = float(jax.random.uniform(own))
-            middle = np.asarray(jax.random.normal(jax.random.fold_in(own, 1), start.shape)) * 1.5
+            u = float(jax.random.uniform(k_step))
+            middle = np.asarray(jax.random.normal(k_middle, start.shape)) * 1.5
             std = config.std * 10.0 ** (-2.0 * u)
         kind = (config.strategy, population, config.batch, config.generations, config.std)
         if kind not in programs:
             programs[kind] = _Run(losses, config, population, len(start), batch, segments)
-        z, history, count = programs[kind](own, middle, std, config.generations, on_generations)
+        z, history, count = programs[kind](k_run, middle, std, config.generations, on_generations)
         runs.append(z)
         histories.append(history)
         evaluations += count
@@ -127,17 +128,23 @@ class _Run:
         self.advance = jax.jit(self._advance)
 
     def __call__(
-        self, key: Any, middle: np.ndarray, std: float, generations: int, told: Callable[[int, float], None] | None
+        self,
+        key: Any,
+        middle: np.ndarray,
+        std: float,
+        generations: int,
+        told: Callable[[int, float, np.ndarray], None] | None,
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Run; return the best candidate ``(P,)``, the best loss up to each generation, and how many were simulated."""
         params = self.strategy.default_params
         if hasattr(params, "std_init"):
             params = params.replace(std_init=std)
         params = strong(params)
-        state = strong(self._first(key, jnp.asarray(middle, jnp.float32), std, params))  # else it compiles twice
+        k_first, *keys = jax.random.split(key, 1 + -(-generations // self.count))
+        state = strong(self._first(k_first, jnp.asarray(middle, jnp.float32), std, params))  # else it compiles twice
         history: list[np.ndarray] = []
-        for index in range(-(-generations // self.count)):
-            state, best = self.advance(state, params, jax.random.fold_in(key, index + 1))
+        for k_generations in keys:
+            state, best = self.advance(state, params, k_generations)
             history.append(np.asarray(best))
             if not self.by_population and not np.isfinite(np.asarray(self._middle(state))).all():
                 raise UsageError(
@@ -147,21 +154,24 @@ class _Run:
                 )
             reached = float(np.min(history[-1]))
             if told:
-                told(self.count, reached)
+                told(self.count, reached, np.asarray(self._best(state)))
             before = float(np.min(np.concatenate(history[:-1]))) if len(history) > 1 else np.inf
             # Batches differ from generation to generation: their best losses say nothing about being stuck.
             if not self.batched and np.isfinite(before) and before - reached < _STUCK * abs(reached):
                 break
         losses = np.minimum.accumulate(np.concatenate(history))
-        z = self._middle(state) if self.batched else state.best_solution
-        return np.asarray(z), losses, self.population * losses.size
+        return np.asarray(self._best(state)), losses, self.population * losses.size
 
     def _first(self, key: Any, middle: Any, std: float, params: Any) -> Any:
         if not self.by_population:
             return self.strategy.init(key, middle, params)
-        spread = std * jax.random.normal(key, (self.population, middle.size))
+        k_spread, k_pick, k_init = jax.random.split(key, 3)
+        spread = std * jax.random.normal(k_spread, (self.population, middle.size))
         candidates = middle + spread.at[0].set(0.0)
-        return self.strategy.init(key, candidates, self._fitness(candidates, middle, key), params)
+        return self.strategy.init(k_init, candidates, self._fitness(candidates, middle, k_pick), params)
+
+    def _best(self, state: Any) -> Any:
+        return self._middle(state) if self.batched else state.best_solution
 
     def _middle(self, state: Any) -> Any:
         return state.best_solution if self.by_population else self.strategy.get_mean(state)

@@ -136,9 +136,10 @@ def draw_values(
         draws: Dynamics that episodes take instead, ``(K,)`` each; one row is drawn for all of them.
         spread_s: Delays vary by this much either way [s].
     """
-    keys = dict(zip(values, jax.random.split(key, len(values)), strict=True))
+    row_key, *own = jax.random.split(key, 1 + len(values))
+    keys = dict(zip(values, own, strict=True))
     count = min((len(d) for d in draws.values()), default=1)
-    row = jax.random.randint(jax.random.fold_in(key, 2), (), 0, count)
+    row = jax.random.randint(row_key, (), 0, count)
     drawn: dict[str, Any] = {}
     for name, value in values.items():
         if name.endswith("_delay"):

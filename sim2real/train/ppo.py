@@ -21,7 +21,7 @@ from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.networks import Policy, init_mlp
 from sim2real.train.protocol import Environment, check_environment
 from sim2real.train.rollout import Copies, evaluate
-from sim2real.train.update import Normaliser, TrainState, make_optimiser, make_policy, update
+from sim2real.train.update import Normaliser, TrainState, keys, make_optimiser, make_policy, update
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,8 +127,7 @@ def _epoch(env: Environment, config: PPOConfig, state: TrainState) -> tuple[Trai
     policy = make_policy(env, state.params, state.normaliser)
     finite = stats.pop("finite_observation").all(0)
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | {"finite_observation": finite}
-    # The key that the next update splits stays what it is: how often one evaluates does not change the training.
-    return state, policy, values | evaluate(env, config, policy, jax.random.fold_in(state.key, state.update))
+    return state, policy, values | evaluate(env, config, policy, keys(state)[2])
 
 
 def _init(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:

@@ -32,7 +32,7 @@ class TrainState(NamedTuple):
         normaliser: Statistics of the observations so far.
         copies: The environments.
         update: Shape ``()``, int32: updates so far.
-        key: The seed's key.
+        key: The seed's key; it never changes, ``keys`` makes those of an update.
     """
 
     params: dict[str, Any]
@@ -182,6 +182,14 @@ def prepare(params: dict[str, Any], policy: Policy, rows: Rows, config: PPOConfi
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
 
 
+def keys(state: TrainState) -> jax.Array:
+    """Return the keys ``(3,)`` of the update that comes next: to play, to shuffle, and to evaluate just before it.
+
+    They depend on the seed and the number of the update alone: how often one evaluates does not change the training.
+    """
+    return jax.random.split(jax.random.fold_in(state.key, state.update), 3)
+
+
 def update(env: Environment, config: PPOConfig, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
     """Play one rollout and learn from it.
 
@@ -192,7 +200,7 @@ def update(env: Environment, config: PPOConfig, state: TrainState) -> tuple[Trai
         The next state, and figures of the update: the parts of the loss, mean ``reward`` and ``value`` (unscaled) per
         row, each of shape ``()``, and ``finite_observation``, shape ``(O,)``.
     """
-    key, key_play, key_shuffle = jax.random.split(state.key, 3)
+    key_play, key_shuffle, _ = keys(state)
     policy = make_policy(env, state.params, state.normaliser)
     copies, rows = collect(env, config, policy, state.copies, state.update, key_play)
     batch = prepare(state.params, policy, rows, config)
@@ -216,4 +224,4 @@ def update(env: Environment, config: PPOConfig, state: TrainState) -> tuple[Trai
         "finite_observation": jnp.isfinite(rows.following).all((0, 1)),
     }
     normaliser = update_normaliser(state.normaliser, rows)
-    return TrainState(params, optimiser_state, normaliser, copies, state.update + 1, key), stats
+    return TrainState(params, optimiser_state, normaliser, copies, state.update + 1, state.key), stats

@@ -176,11 +176,12 @@ def test_a_world_without_derivative_is_identified(found):
 
 def test_progress_adds_up_to_at_most_one(found):
     for stage in ("search", "refine"):
-        shares = [share for name, share, _ in found.told if name == stage]
+        shares = [share for name, share, *_ in found.told if name == stage]
         assert shares
         assert sum(shares) <= 1.0 + 1e-6
-    losses = [loss for *_, loss in found.told]
-    assert losses[-1] == pytest.approx(found.fit.loss)
+    *_, loss, z = found.told[-1]
+    assert loss == pytest.approx(found.fit.loss)
+    np.testing.assert_allclose(z, found.fit.z)  # what an interrupted search leaves behind
 
 
 def test_its_uncertainty_covers_the_truth(found):

@@ -41,8 +41,10 @@ def minimum():
 
 
 def test_the_best_of_all_starts_ends_where_scipy_does(minimum):
-    told = []
-    found = refine(stub(valley), np.array([[-1.2, 1.0], [3.0, -2.0]]), steps=50, on_round=told.append)
+    rounds = []
+    starts = np.array([[-1.2, 1.0], [3.0, -2.0]])
+    found = refine(stub(valley), starts, steps=50, on_round=lambda loss, z: rounds.append((loss, z)))
+    told = [loss for loss, _ in rounds]
     np.testing.assert_allclose(found.z, minimum.x, atol=2e-3)
     assert found.loss == pytest.approx(minimum.cost / 3, rel=1e-3)
     assert found.accepted
@@ -50,6 +52,7 @@ def test_the_best_of_all_starts_ends_where_scipy_does(minimum):
     assert found.steps > 3
     assert told == sorted(told, reverse=True)
     assert told[-1] == found.loss
+    np.testing.assert_array_equal(rounds[-1][1], found.z)
 
 
 def test_a_start_at_the_optimum_stays(minimum):

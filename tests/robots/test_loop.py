@@ -74,6 +74,15 @@ def test_a_row_of_draws_is_drawn_together_and_the_rest_is_fixed(drawn):
     assert set(drawn["friction"].tolist()) == {np.float32(0.1)}
 
 
+@pytest.mark.parametrize("order", [list(VALUES), [*DELAYS, "gain", "damping", "friction"], ["gain", *DELAYS]])
+def test_the_row_that_is_drawn_says_nothing_about_the_delays(order):
+    values, draws = {n: VALUES[n] for n in order}, {"gain": jnp.arange(1000.0)}
+    draw = jax.jit(jax.vmap(lambda key: draw_values(key, values, draws, SPREAD_S)))
+    found = draw(jax.random.split(jax.random.key(1), 4000))
+    for name in DELAYS:
+        assert abs(np.corrcoef(found["gain"], found[name])[0, 1]) < 0.08  # five deviations of what chance makes
+
+
 def test_drawn_delays_spread_around_their_values_independently_and_never_below_zero(drawn):
     off = drawn["sensor_delay"] - VALUES["sensor_delay"]
     assert np.abs(off).max() <= SPREAD_S * (1 + 1e-5)

@@ -1,8 +1,10 @@
 """Training on problems whose answer is known."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from environments import Bandit, Constant, Pendulum
@@ -11,6 +13,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.train.ppo import train
 from sim2real.train.protocol import Step, check_environment
+from sim2real.train.update import keys
 
 SMALL = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=80_000, hidden=(32,), evaluations=4, eval_steps=20,
@@ -61,6 +64,13 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     for name in ("return", "value_loss", "entropy"):
         np.testing.assert_allclose(alone.history[name][:, 0], result.history[name][:, 0], rtol=2e-2, atol=1e-3)
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
+
+
+def test_no_key_is_used_twice():
+    """To play, to shuffle and to evaluate, in every update: however often one evaluates."""
+    made = [keys(SimpleNamespace(key=jax.random.key(3), update=jnp.int32(i))) for i in range(5)]
+    data = np.asarray(jax.random.key_data(jnp.concatenate(made)))
+    assert len(np.unique(data, axis=0)) == 15
 
 
 def blind_value(length, window, gamma):
