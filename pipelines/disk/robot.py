@@ -58,6 +58,7 @@ class IdentifiableDisk:
     """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
 
     sensor = "sensor"
+    ahead_s = 0.0
     # Position: what a local fit leaves is 1.4 mrad; velocity: of a cubic through eight samples.
     channels = (Channel("th", None, position_sigma=0.002, velocity_sigma=0.2),)
 

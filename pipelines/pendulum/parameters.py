@@ -45,12 +45,11 @@ def from_groups(values: Mapping[str, Any], start: Any) -> PendulumParams:
     )
 
 
-def table(max_delay_s: float, tick_s: float) -> ParameterTable:
+def table(max_delay_s: float) -> ParameterTable:
     """Return the parameters to identify: dynamics within a factor of 4 of nominal, and delays.
 
     Args:
         max_delay_s: Upper bound of each delay [s].
-        tick_s: The world's period [s].
     """
     about = {
         "gain": ("rad/s^2/V", "acceleration per volt, K / (R J)"),
@@ -62,7 +61,7 @@ def table(max_delay_s: float, tick_s: float) -> ParameterTable:
         Parameter(name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1])
         for name, value in groups(nominal_params()).items()
     ]
-    return ParameterTable([*dynamics, *delay_parameters(max_delay_s, tick_s)])
+    return ParameterTable([*dynamics, *delay_parameters(max_delay_s)])
 
 
 def node_params(values: Mapping[str, Any], start: Any) -> dict[str, Any]:

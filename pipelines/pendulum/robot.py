@@ -15,7 +15,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.devices import SimSensor
-from sim2real.robots.loop import control_nodes, delay_bounds, recorded_loop, simulated_loop
+from sim2real.robots.loop import DelayParams, control_nodes, delay_bounds, in_a_loop, recorded_loop, simulated_loop
 from sim2real.stages.config import GateLimits
 
 from . import hardware, parameters
@@ -48,21 +48,23 @@ class IdentifiablePendulum:
     """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
 
     sensor = "sensor"
+    ahead_s = 1 / WORLD_HZ
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
 
     def __init__(self, max_delay_s: float = 0.06) -> None:
-        self.parameters: ParameterTable = parameters.table(max_delay_s, 1 / WORLD_HZ)
+        self.parameters: ParameterTable = parameters.table(max_delay_s)
         self.given: Mapping[str, Any] = {"actuator": Command(action="action")}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, with delays of up to ``max_delay_s`` [s] between them."""
         world = DelayedWorld("world", WORLD_HZ)
         sensor, actuator = SimSensor("sensor", RATE_HZ, world), SimActuator("actuator", RATE_HZ)
-        return recorded_loop(sensor, actuator, world, max_delay_s)
+        return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s)
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and an initial state ``(th, thdot)``."""
-        return parameters.node_params(values, start)
+        late = DelayParams(values["sensor_delay"] + self.ahead_s)
+        return {**parameters.node_params(values, start), "sensor": late}
 
 
 def connect(port: str, limits: GateLimits, truth_path: Path, seed: int) -> hardware.Session:
@@ -132,6 +134,7 @@ def training(
     def options(name: str) -> dict[str, Any]:
         return {"delay": EXPECTED_DELAY_S[name] if delays else 0.0, "delay_dist": computation.get(name)}
 
+    values = in_a_loop(values, 1 / WORLD_HZ, DELAY_SPREAD_S)
     world = DelayedWorld("world", WORLD_HZ)
     sensor = SimSensor("sensor", RATE_HZ, world, **options("sensor"))
     agent = Agent("agent", RATE_HZ, **options("agent"))
@@ -144,12 +147,13 @@ def training(
 def simulation_params(values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
     """Return node parameters of the loop in simulation, hanging at rest, with a policy; every trial is the same."""
     del trial
+    values = in_a_loop(values, 1 / WORLD_HZ, DELAY_SPREAD_S)
     return {**parameters.node_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
 
 
 def nominal() -> dict[str, float]:
     """Return the data sheet's values, without delays."""
-    return {p.name: p.nominal for p in parameters.table(0.06, 1 / WORLD_HZ) if p.kind == "dynamics"}
+    return {p.name: p.nominal for p in parameters.table(0.06) if p.kind == "dynamics"}
 
 
 def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -67,7 +67,8 @@ class IdentifiableArm:
     """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
 
     sensor = "sensor"
-    channels = tuple(Channel("position", None, 0.002, 0.1, i, joint) for i, joint in enumerate(JOINTS))
+    ahead_s = 0.0
+    channels = tuple(Channel("position", None, 0.002, 0.1, i, joint, "goal") for i, joint in enumerate(JOINTS))
 
     def __init__(self, max_delay_s: float = 0.04) -> None:
         self.parameters = table(max_delay_s)

@@ -54,7 +54,8 @@ class IdentifiableServo:
     """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
 
     sensor = "sensor"
-    channels = (Channel("position", None, position_sigma=0.002, velocity_sigma=0.1),)
+    ahead_s = 0.0
+    channels = (Channel("position", None, position_sigma=0.002, velocity_sigma=0.1, goal="goal"),)
 
     def __init__(self, max_delay_s: float = 0.01) -> None:
         self.parameters = table(max_delay_s)

@@ -91,7 +91,9 @@ def fit(
     refined = []
     z, loss = starts[0], found.loss if found else float("nan")
     if config.refine:
-        refined.append(_refine(problem, starts[: config.refine], told))
+        # And from where the search began: a short search may end in another valley, with a delay for an inertia, say.
+        begin = [] if found is None else [problem.table.start()]
+        refined.append(_refine(problem, np.stack([*starts[: config.refine], *begin]), told))
         z, loss = refined[-1].z, refined[-1].loss
     if config.refine and config.long_s and long_spans:
         problem = Problem(model, recordings, long_spans, config.long_s, config, table)

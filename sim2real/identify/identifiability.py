@@ -59,7 +59,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Check:
     """Judge a linearised point."""
     table = problem.table
     J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
-    shift = time_shift(problem) / table.span
+    shift = time_shift(table) / table.span
     if shift.any():  # see ``uncertainty``: what the ticks seem to say of it is no information
         unit = shift / np.linalg.norm(shift)
         J = J - np.outer(J @ unit, unit)

@@ -21,6 +21,8 @@ class Channel:
         velocity_sigma: Deviation of a measured velocity; without one, of a velocity estimated from a few positions.
         index: Entry of the fields, where they are vectors.
         label: Name for tables; default: the position's field.
+        goal: Field of a given node's message that says where the joint is told to be, in the position's unit, under the
+            same index; None where commands are no positions.
     """
 
     position: str
@@ -29,6 +31,7 @@ class Channel:
     velocity_sigma: float
     index: int | None = None
     label: str = ""
+    goal: str | None = None
 
     @property
     def name(self) -> str:
@@ -54,12 +57,16 @@ class IdentifiableModel(Protocol):
         sensor: Node whose outputs are predicted.
         given: Nodes whose recorded outputs drive the model: node -> its message, with field names as leaves.
         channels: What is measured; initial states have a position and a velocity for each.
+        ahead_s: How much later than recorded the sensor's steps are simulated [s]; ``params`` adds it to its delay. A
+            sensor that interpolates between the world's ticks needs one tick of it: otherwise a delay below a tick
+            would show what is not simulated yet. 0 where samples fall on ticks.
     """
 
     parameters: ParameterTable
     sensor: str
     given: Mapping[str, Any]
     channels: tuple[Channel, ...]
+    ahead_s: float
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, given nodes and world, connected with trainable delays up to ``max_delay_s``."""

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.graph.node import TICKS_PER_S
+from sim2real.identify.model import Channel
 from sim2real.identify.problem import Problem
 
 Values = Mapping[str, Any]
@@ -24,7 +26,8 @@ def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> 
 
     Returns:
         Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each channel's field
-        what was ``measured`` and what each model says, as ``FIELD_measured``, ``FIELD_MODEL``.
+        what was ``measured`` and what each model says, as ``FIELD_measured``, ``FIELD_MODEL``. ``FIELD_told`` is where
+        a joint was told to be at that time, where commands are positions.
     """
     held_out = ~np.isin(np.arange(problem.segments), problem.train)
     fit_s = jnp.asarray(np.where(held_out, settle_s, problem.segment_s), jnp.float32)
@@ -44,9 +47,37 @@ def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> 
             }
             for i, label in enumerate(labels(problem)):
                 columns[f"{label}_measured"] = problem.measured(i)[at]
+            columns |= _told(problem, segment, into)
         for i, (label, (_, sigma, _)) in enumerate(zip(labels(problem), problem.fields, strict=True)):
             columns[f"{label}_{name}"] = columns[f"{label}_measured"] + residuals[..., i][at] * sigma
     return columns
+
+
+def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the newest goal sent before each sample, ``LABEL_told`` for each channel that is told where to be."""
+    columns = {}
+    for c in problem.channels:
+        if c.goal is None:
+            continue
+        node, place = next(
+            (n, fields.index(c.goal))
+            for n, tree in problem.model.given.items()
+            if c.goal in (fields := jax.tree_util.tree_leaves(tree))
+        )
+        rows = np.asarray(jax.tree_util.tree_leaves(problem.given[node])[place])
+        sent_s = problem.graph.timeline.vertices[node].end / TICKS_PER_S
+        told = np.empty(len(into))
+        for s in np.unique(segment):
+            own = segment == s
+            newest = np.searchsorted(sent_s[s], into[own], side="right") - 1
+            told[own] = c.of(rows[s])[np.maximum(newest, 0)]
+        columns[f"{position_of(c)}_told"] = told
+    return columns
+
+
+def position_of(channel: Channel) -> str:
+    """Return the name of a channel's position among the columns."""
+    return channel.position if channel.index is None else f"{channel.position}[{channel.index}]"
 
 
 def labels(problem: Problem) -> list[str]:
@@ -61,33 +92,35 @@ def errors(
     settle_s: float,
     horizons: Sequence[float],
 ) -> list[dict[str, Any]]:
-    """Return each model's error over each horizon, on fitted and on held-out segments, and that of holding still.
+    """Return each model's error over each horizon, on fitted and on held-out segments.
+
+    Beside the models stand ``hold``, that nothing changes, and, where commands are positions, ``told``: every
+    joint is where it was told to be.
 
     Returns:
-        Rows with ``model``, ``horizon_s``, ``held_out``, ``rmse`` and ``mae`` of the first channel's position, and
-        ``FIELD_rmse`` of each field; None where there are no samples.
+        Rows with ``model``, ``horizon_s``, ``held_out``, and ``FIELD_rmse`` and ``FIELD_mae`` of each field that the
+        model predicts; None where there are no samples.
     """
     ahead = columns["into"] - settle_s
     names = labels(problem)
     rows = []
-    for model in (*models, "hold"):
+    for model in (*models, *_baselines(columns)):
+        predicted = {n: p for n in names if (p := _predicted(columns, n, model, ahead)) is not None}
         for horizon_s in horizons:
             for held_out in (False, True):
                 pick = (columns["held_out"] == held_out) & (ahead > 0) & (ahead <= horizon_s)
-                off = {n: (_predicted(columns, n, model, ahead) - columns[f"{n}_measured"])[pick] for n in names}
-                rmse = {n: float(np.sqrt(np.mean(e**2))) if e.size else None for n, e in off.items()}
-                first = off[names[0]]
-                rows.append(
-                    {
-                        "model": model,
-                        "horizon_s": horizon_s,
-                        "held_out": held_out,
-                        "rmse": rmse[names[0]],
-                        "mae": float(np.mean(np.abs(first))) if first.size else None,
-                        **{f"{n}_rmse": v for n, v in rmse.items()},
-                    }
-                )
+                row: dict[str, Any] = {"model": model, "horizon_s": horizon_s, "held_out": held_out}
+                for n, p in predicted.items():
+                    off = (p - columns[f"{n}_measured"])[pick]
+                    row[f"{n}_rmse"] = float(np.sqrt(np.mean(off**2))) if off.size else None
+                    row[f"{n}_mae"] = float(np.mean(np.abs(off))) if off.size else None
+                rows.append(row)
     return rows
+
+
+def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Return what takes no model: ``hold``, and ``told`` where commands are positions."""
+    return ["hold", *(["told"] if any(n.endswith("_told") for n in columns) else [])]
 
 
 def free_runs(
@@ -111,9 +144,12 @@ def free_runs(
             "seconds": float(t[-1] - t[0]),
             "held_out": bool(columns["held_out"][pick][0]),
         }
-        for model in (*models, "hold"):
+        for model in (*models, *_baselines(columns)):
             for name in names:
-                off = (_predicted(columns, name, model, ahead) - columns[f"{name}_measured"])[pick]
+                predicted = _predicted(columns, name, model, ahead)
+                if predicted is None:
+                    continue
+                off = (predicted - columns[f"{name}_measured"])[pick]
                 rows.append(
                     {
                         "model": model,
@@ -126,10 +162,13 @@ def free_runs(
     return rows
 
 
-def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray:
-    """Return a model's prediction; ``hold`` says that nothing changes after the last measurement before the horizon."""
+def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray | None:
+    """Return a model's prediction ``(N,)``, None where it has none of this field.
+
+    ``hold`` says that nothing changes after the last measurement before the horizon.
+    """
     if model != "hold":
-        return columns[f"{field}_{model}"]
+        return columns.get(f"{field}_{model}")
     predicted = np.zeros_like(ahead)
     for segment in np.unique(columns["segment"]):
         rows = np.flatnonzero(columns["segment"] == segment)

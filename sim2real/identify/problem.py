@@ -72,13 +72,14 @@ class Problem:
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s = cuts.spans, length_s
-        timeline = draw(nodes, length_s, recorded=cuts.timeline)
+        timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
         make_room(nodes, timeline)  # after a hiccup commands leave in a burst
         self.graph = CompiledGraph(nodes, model.sensor, timeline, cuts.given)
         self.segments = self.graph.episodes
         self.begins_s = np.array([s.begin_s for s in self.spans])
         self.recording = np.array([s.recording for s in self.spans])
         self.train = np.flatnonzero([s.fitted for s in self.spans])
+        self.given = cuts.given
         self.data = _data(cuts)
         self._recording = jnp.asarray(self.recording)
         self._ts = jnp.asarray(cuts.ts, jnp.float32)
@@ -109,8 +110,17 @@ class Problem:
     def measured(self, column: int) -> np.ndarray:
         """Return what a column's residuals compare with, in their places, ``(E, C)``."""
         field, _, entry = self.fields[column]
-        table = self.graph.wiring.tables[-1].seq
-        return np.take_along_axis(np.asarray(entry(self.data.measured[field])), np.maximum(table, 0), axis=1)
+        return np.take_along_axis(np.asarray(entry(self.data.measured[field])), np.maximum(self.places, 0), axis=1)
+
+    @property
+    def places(self) -> np.ndarray:
+        """Which measurement stands in each place of the predictions, ``(E, C)``; -1 where there is none.
+
+        A sensor that ran faster than its node's rate has several slots in a row of the compiled graph.
+        """
+        wiring = self.graph.wiring
+        own = [t.seq for n, t in zip(wiring.slots, wiring.tables, strict=True) if n == self.model.sensor]
+        return np.stack(own, axis=-1).reshape(self.segments, -1)
 
     def simulate(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> tuple[Any, Any]:
         """Simulate a segment from its estimated initial state plus ``shift``.
@@ -213,7 +223,7 @@ class Problem:
         def candidate(z: Any) -> Any:
             values = self.table.decode(z)
             r, ts = jax.vmap(lambda e, c: self.projected(values, e, c))(pick, columns)
-            r = tamed(r, self.config.loss, self.config.reach)
+            r = self._tamed(r)
             prior = jnp.sum(self.table.prior_residuals(z) ** 2) / self.measurements
             return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(ts >= 0) * r.shape[-1], 1) + prior)
 
@@ -232,14 +242,24 @@ class Problem:
 
     def stacked(self, z: Any, columns: Any, data: Data | None = None) -> Any:
         """Return all projected, tamed residuals at ``z``, ``(segments, C, fields)``, for given sensitivities."""
-        values = self.table.decode(z)
-        r = jax.vmap(lambda e, c: self.projected(values, e, c, data)[0])(jnp.asarray(self.train), columns)
-        return tamed(r, self.config.loss, self.config.reach)
+        return self._tamed(self._untamed(z, columns, data))
 
-    def linearised(self, z: Any, columns: Any, data: Data | None = None) -> tuple[Any, Any]:
-        """Return ``stacked`` and its Jacobian ``(segments, C, fields, P)``, forward or by finite differences."""
-        f = self.differentiable(lambda y: self.stacked(y, columns, data))
-        return jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
+    def linearised(self, z: Any, columns: Any, data: Data | None = None) -> tuple[Any, Any, Any]:
+        """Return ``stacked``, its Jacobian ``(segments, C, fields, P)``, and the residuals before they were tamed.
+
+        Derivatives are forward or finite differences, as the problem is configured.
+        """
+        f = self.differentiable(lambda y: self._untamed(y, columns, data))
+        raw, J = jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
+        r, slope = jax.jvp(self._tamed, (raw,), (jnp.ones_like(raw),))
+        return r, slope[..., None] * J, raw
+
+    def _untamed(self, z: Any, columns: Any, data: Data | None) -> Any:
+        values = self.table.decode(z)
+        return jax.vmap(lambda e, c: self.projected(values, e, c, data)[0])(jnp.asarray(self.train), columns)
+
+    def _tamed(self, residuals: Any) -> Any:
+        return tamed(residuals, self.config.loss, self.config.reach)
 
     @property
     def measurements(self) -> int:

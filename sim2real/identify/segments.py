@@ -12,7 +12,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
-from sim2real.graph.timeline import Timeline
+from sim2real.graph.timeline import Timeline, Vertex
 from sim2real.identify.model import IdentifiableModel
 
 
@@ -38,7 +38,7 @@ class Segments:
     Attributes:
         spans: E of them.
         length_s: Their length [s].
-        timeline: The recorded timing of sensor and given nodes, E episodes.
+        timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's is ``ahead_s`` later.
         given: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, N, ...)``.
         ts: Shape ``(E, N)``: when each measurement was made [s from the segment's start]; 0 behind the last.
@@ -91,22 +91,29 @@ def cut(
         firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(own))]
         ordered += own
     timeline = Timeline.stack(timelines)
+    start = timeline.vertices[model.sensor].start / TICKS_PER_S
 
     def rows(node: str, field: str) -> np.ndarray:
         width = timeline.vertices[node].start.shape[1]
         return np.stack([_rows(recordings[r].outputs[node][field], f[node], width) for r, f in firsts])
 
     fields = {f for c in model.channels for f, _ in c.fields}
-    start = timeline.vertices[model.sensor].start / TICKS_PER_S
     return Segments(
         spans=tuple(ordered),
         length_s=length_s,
-        timeline=timeline,
+        timeline=_later(timeline, model.sensor, to_ticks(model.ahead_s)),
         given={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
         measured={f: rows(model.sensor, f) for f in sorted(fields)},
         ts=np.where(start < length_s, start, 0.0),
         starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
     )
+
+
+def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
+    """Return the timeline with one node's steps later."""
+    v = timeline.vertices[node]
+    moved = Vertex(v.start + ticks, v.end + ticks, v.count)
+    return Timeline({**timeline.vertices, node: moved}, timeline.edges)
 
 
 def check_log(episode: Episode, model: IdentifiableModel) -> None:

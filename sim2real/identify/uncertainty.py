@@ -15,7 +15,7 @@ from sim2real.identify.problem import Problem
 
 VAGUE = 0.15
 """A standard error above this share of the bounds says little more than they do (a uniform value has 0.29)."""
-_AT_BOUND = 0.005
+AT_BOUND = 0.005
 """An estimate within this share of the bounds' width of a bound counts as at the bound."""
 _BLOCK_S = 1.0
 """Residuals further apart than this count as independent in the bootstrap [s]."""
@@ -32,12 +32,14 @@ class Linearised:
         jacobian: Shape ``(S, C, F, P)``: d residual / d scale.
         prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
         x: Shape ``(P,)``: the point.
+        raw: Shape ``(S, C, F)``: the residuals before a robust loss tamed them.
     """
 
     residuals: np.ndarray
     jacobian: np.ndarray
     prior: np.ndarray
     x: np.ndarray
+    raw: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ class Uncertainty:
         verdict: One a parameter: ``accepted``, ``not identifiable`` or ``at a bound``.
         correlation: Shape ``(P, P)``.
         inflation: Factor on the variance for residuals that are correlated in time.
-        misfit: Root mean square of the scaled residuals: 1 where the model explains everything but the noise.
+        misfit: Root mean square of the scaled residuals, none of them tamed: 1 where the model explains everything but
+            the noise.
         bootstrap: Shape ``(P,)``: factor by which the block bootstrap widens the linearised standard error; at least 1.
     """
 
@@ -76,7 +79,7 @@ def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
     """
     table = problem.table
     x, _ = table.scale(z)
-    shift = time_shift(problem)
+    shift = time_shift(table)
     down, up = _shift_range(table, x, shift)
     moved = table.unscale(x + shift * (down + up) / 2)
     scaled = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, moved, strict=True)])
@@ -88,11 +91,11 @@ def linearise(problem: Problem, z: np.ndarray) -> Linearised:
     """Compute residuals and Jacobian at ``z (P,)``."""
     point = jnp.asarray(z, jnp.float32)
     columns = jax.jit(problem.sensitivities)(point)
-    r, J = (np.asarray(a, np.float64) for a in jax.jit(problem.linearised)(point, columns))
+    r, J, raw = (np.asarray(a, np.float64) for a in jax.jit(problem.linearised)(point, columns))
     x, stretch = problem.table.scale(z)
     priors = np.asarray(jax.jacfwd(problem.table.prior_residuals)(point), np.float64) / stretch
     prior = priors.T @ priors + np.diag(12.0 / problem.table.span**2)
-    return Linearised(r, J / stretch, prior, x)
+    return Linearised(r, J / stretch, prior, x, raw)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
@@ -109,9 +112,11 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     Where the model is wrong even that says too little: blocks of residuals are then drawn again and again, each time
     the estimate moves by one Gauss-Newton step, and standard errors grow to the spread of that.
 
-    A shift of time between the sensor's delay and the others changes nothing in a continuous model, as initial states
-    are free. What the residuals seem to say about it is how well the world's ticks happen to meet the measurements, so
-    the shift counts as unknown within the bounds, and the rest is computed at the shift that was found.
+    A shift of time between the sensor's delay and the others changes nothing that a log shows: the initial state is
+    then that of a moment earlier or later. What the residuals seem to say about it is how well the world's ticks, or an
+    initial state that was read from noise, happen to meet the measurements. So the shift counts as unknown within the
+    bounds, and neither delay is ever accepted by itself. Where initial states are free nothing else depends on it, and
+    the rest is computed at the shift that was found; where they are given, other estimates move with it.
     """
     table, size = problem.table, len(at.x)
     r, J, inside = at.residuals, at.jacobian.reshape(-1, size), at.residuals.reshape(-1) != 0.0
@@ -120,8 +125,9 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     rho = _correlation_in_time(r)
     inflation = (1 + rho) / (1 - rho)
     variance = float(np.sum(r**2)) / max(count - free, 1) * inflation
-    shift = time_shift(problem)
-    fixed = np.flatnonzero(shift > 0)[:1]  # the sensor's delay carries the shift
+    shift = time_shift(table)
+    # The sensor's delay carries the shift.
+    fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
     rest = np.setdiff1d(np.arange(size), fixed)
     precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
     cov = np.zeros((size, size))
@@ -149,10 +155,10 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
         standard_error=error * np.abs(slope),
         low=low,
         high=high,
-        verdict=tuple(_verdict(e, m) for e, m in zip(error / table.span, margin, strict=True)),
+        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shift, strict=True)),
         correlation=cov / np.outer(error, error),
         inflation=inflation,
-        misfit=float(np.sqrt(np.sum(r**2) / max(count, 1))),
+        misfit=float(np.sqrt(np.sum(at.raw**2) / max(count, 1))),
         bootstrap=wider,
     )
 
@@ -162,24 +168,24 @@ def sum_of(spread: Uncertainty, columns: list[int]) -> float:
     return float(np.sqrt(max(spread.covariance[np.ix_(columns, columns)].sum(), 0.0)))
 
 
-def time_shift(problem: Problem) -> np.ndarray:
-    """Return the direction ``(P,)`` in which only time moves, zeros if there is none: measurement up, commands down."""
-    side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in problem.table.columns]
+def time_shift(table: ParameterTable) -> np.ndarray:
+    """Return the direction ``(P,)`` in which only time moves, zeros if there is none: measurement up, commands down.
+
+    How initial states are found does not matter: at the robot nothing else tells these delays apart.
+    """
+    side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in table.columns]
     direction = np.array([{"measurement": 1.0, "command": -1.0}.get(s, 0.0) for s in side])
-    free = problem.config.initial_state == "free" and {-1.0, 1.0} <= set(direction)
-    return direction if free else np.zeros_like(direction)
+    return direction if {-1.0, 1.0} <= set(direction) else np.zeros_like(direction)
 
 
-def shifted_delays(problem: Problem) -> set[str]:
-    """Return the delays between which time can be shifted; none where there is no such direction."""
-    return {name for name, share in zip(problem.table.names, time_shift(problem), strict=True) if share}
+def _verdict(error: float, margin: float, shifts: bool) -> str:
+    """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width.
 
-
-def _verdict(error: float, margin: float) -> str:
-    """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width."""
-    if error > VAGUE:
+    What time can be shifted from or to is not identifiable, however little room its bounds leave for that.
+    """
+    if error > VAGUE or shifts:
         return "not identifiable"
-    return "at a bound" if margin < _AT_BOUND else "accepted"
+    return "at a bound" if margin < AT_BOUND else "accepted"
 
 
 def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:

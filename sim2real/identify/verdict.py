@@ -1,20 +1,99 @@
-"""Whether an identification is worth anything: judged on data that it has not seen."""
+"""Whether an identification is worth anything: judged on data that it has not seen, position by position."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
+from sim2real.identify.bounds import way_out, way_out_of
 from sim2real.identify.identifiability import Check
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.round_trip import RoundTrip
 from sim2real.identify.uncertainty import Uncertainty
 
 Status = Literal["accepted", "no improvement on held-out data", "not identifiable", "hit a bound"]
 _BETTER = 0.95
 """The error on held-out data must be below this share of every baseline's."""
+_ALIKE = 1.05
+"""Up to this factor two errors count as the same."""
+_NOISE = 2.0
+"""An error of so many deviations of the measurement is as small as can be seen."""
+_MOST = 3
+"""So many positions are told one by one, the worst first."""
 NO_DELAY = "no delay"
 """The same model fitted without delays. Where it is as good, the delays are not needed; that is no failure."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """A measured position that is judged.
+
+    Attributes:
+        column: Its name in tables of errors, ``position[1]``.
+        name: What people call it.
+        unit: Its unit.
+        sigma: Deviation of a measurement.
+    """
+
+    column: str
+    name: str
+    unit: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """How far one position is off on held-out data, at the longest horizon.
+
+    Attributes:
+        position: Which one.
+        horizon_s: The horizon [s].
+        own: Root mean square error of what was identified; infinite where it diverged.
+        others: The same of each baseline.
+    """
+
+    position: Position
+    horizon_s: float
+    own: float
+    others: Mapping[str, float]
+
+    @property
+    def closest(self) -> str | None:
+        """The best baseline; None without any."""
+        return min(self.others, key=lambda m: self.others[m], default=None)
+
+    @property
+    def excess(self) -> float:
+        """The error over that of the best baseline; what is within the noise of the measurement counts as that."""
+        noise = _NOISE * self.position.sigma
+        best = min(self.others.values(), default=math.inf)
+        return max(self.own, noise) / max(best, noise) if math.isfinite(best) else 0.0
+
+    @property
+    def beaten_by(self) -> list[str]:
+        """The baselines that are as good; ``no delay`` only where it is better."""
+        if self.own <= _NOISE * self.position.sigma:
+            return []
+        return [m for m, e in self.others.items() if self.own > (_ALIKE if m == NO_DELAY else _BETTER) * e]
+
+    @property
+    def needs_delay(self) -> bool:
+        """Whether the same model without delays is worse."""
+        return NO_DELAY not in self.others or self.own < _BETTER * self.others[NO_DELAY]
+
+    def __str__(self) -> str:
+        """Return how far it is off, and what that is beside the best baseline."""
+        p = self.position
+        said = f"{p.name} is off by {self.own:.2g} {p.unit}".rstrip()
+        closest = self.closest
+        if closest is None or not math.isfinite(self.others[closest]):
+            return said
+        best = self.others[closest]
+        return f"{said}, {self.own / best:.2g} times {closest}" if best else f"{said}, {closest} by nothing"
 
 
 @dataclass(frozen=True)
@@ -22,39 +101,72 @@ class Verdict:
     """The judgement.
 
     Attributes:
-        status: One of four; the first that applies of: no improvement, hit a bound, not identifiable, accepted.
+        status: The first that applies of: no improvement, hit a bound, not identifiable, accepted.
         reasons: Sentences.
+        flags: Flags with which to identify again, where that is the way out.
     """
 
     status: Status
     reasons: tuple[str, ...]
+    flags: str = ""
+
+
+def scores(prediction: Sequence[Mapping[str, Any]], positions: Sequence[Position]) -> list[Score]:
+    """Return how far each position is off on held-out data at the longest horizon, the worst first.
+
+    Args:
+        prediction: Rows of ``prediction.errors``.
+        positions: What is judged.
+    """
+    keys = {p.column: f"{p.column}_rmse" for p in positions}
+    held_out = [row for row in prediction if row["held_out"] and any(row.get(k) is not None for k in keys.values())]
+    horizon_s = max((row["horizon_s"] for row in held_out), default=None)
+    last = {row["model"]: row for row in held_out if row["horizon_s"] == horizon_s}
+    if horizon_s is None or "identified" not in last:
+        return []
+    found = []
+    for p in positions:
+        errors = {m: row[keys[p.column]] for m, row in last.items() if row.get(keys[p.column]) is not None}
+        # What diverged to no number is infinitely wrong.
+        errors = {m: e if math.isfinite(e) else math.inf for m, e in errors.items()}
+        if "identified" in errors:
+            found.append(Score(p, horizon_s, errors.pop("identified"), errors))
+    return sorted(found, key=lambda s: (not s.beaten_by, -s.excess))
 
 
 def judge(
-    prediction: Sequence[Mapping[str, Any]],
+    found: Sequence[Score],
+    table: ParameterTable,
+    x: np.ndarray,
     spread: Uncertainty,
-    names: Sequence[str],
     check: Check,
-    shifted: Collection[str] = (),
+    *,
+    trip: RoundTrip | None = None,
+    max_delay_s: float = 1.0,
     beyond: Sequence[str] = (),
 ) -> Verdict:
     """Judge an identification.
 
     Args:
-        prediction: Rows of ``prediction.errors``.
+        found: How far each position is off, the worst first.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
         spread: Its uncertainty.
-        names: Names of the parameters, in the order of ``spread``.
         check: What the data determines at the estimate.
-        shifted: Delays between which time can be shifted: only their sum counts, and that is as it should be.
+        trip: The sum of the delays.
+        max_delay_s: For which delays the model is made [s].
         beyond: Where held-out data goes beyond what was fitted: sentences.
     """
-    improves, reasons = _on_held_out(prediction)
-    bounds = [n for n, v in zip(names, spread.verdict, strict=True) if v == "at a bound"]
-    groups = zip(check.undetermined, check.messages, strict=True)
-    loose = [message for group, message in groups if not set(group) <= set(shifted)]
+    improves, reasons = _on_held_out(found)
     reasons += beyond
-    if bounds:
-        reasons.append(f"at a bound: {', '.join(bounds)}; widen it with --bounds NAME LOW HIGH, or doubt the model")
+    bounded, flags = _at_bounds(table, x, spread, trip, max_delay_s)
+    reasons += bounded
+    together = trip.parts if trip and not trip.apart else ()
+    groups = zip(check.undetermined, check.messages, strict=True)
+    loose = [message for group, message in groups if not set(group) <= set(together)]
+    if trip and together:
+        loose += [f"not even their sum is known: {trip}"] * (trip.verdict == "not identifiable")
+        reasons.append(f"{' and '.join(together)} cannot be told apart from a log; what is known is their sum, {trip}")
     reasons += loose
     if spread.misfit > 3.0:
         reasons.append(
@@ -64,35 +176,57 @@ def judge(
     status: Status = "accepted"
     if not improves:
         status = "no improvement on held-out data"
-    elif bounds:
+    elif bounded:
         status = "hit a bound"
     elif loose:
         status = "not identifiable"
-    return Verdict(status, tuple(reasons))
+    return Verdict(status, tuple(reasons), flags)
 
 
-def _on_held_out(prediction: Sequence[Mapping[str, Any]]) -> tuple[bool, list[str]]:
-    """Return whether it beats every baseline on held-out data at the longest horizon, and what to say of it."""
-    held_out = [row for row in prediction if row["held_out"] and row["rmse"] is not None]
-    horizon_s = max((row["horizon_s"] for row in held_out), default=None)
-    # What diverged to no number is infinitely wrong.
-    last = {
-        row["model"]: row["rmse"] if math.isfinite(row["rmse"]) else math.inf
-        for row in held_out
-        if row["horizon_s"] == horizon_s
-    }
-    own = last.pop("identified", None)
-    if own is None:
+def _on_held_out(found: Sequence[Score]) -> tuple[bool, list[str]]:
+    """Return whether every position beats every baseline on held-out data, and what to say of it."""
+    if not found:
         return True, ["nothing was held out: how well it predicts is not known"]
-    alike = [m for m, e in last.items() if own >= _BETTER * e]
-    better = [m for m in alike if m != NO_DELAY]
-    ahead = f"{horizon_s:g} s ahead on held-out data"
-    if better:
-        return False, [f"{ahead} it is no better than: {', '.join(better)}"]
-    reasons = []
-    if last:
-        closest = min(last, key=lambda m: last[m])
-        reasons.append(f"{ahead} its error is {own / last[closest]:.2g} times that of {closest}")
-    if alike:
+    ahead = f"{found[0].horizon_s:g} s ahead on held-out data"
+    worse = [s for s in found if s.beaten_by]
+    if worse:
+        reasons = [f"{ahead} {s.position.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
+        return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
+    reasons = [f"{ahead} {s}" for s in found[:_MOST]]
+    if len(found) > _MOST:
+        reasons.append(f"{len(found) - _MOST} more positions improve further")
+    if not any(s.needs_delay for s in found):
         reasons.append("without any delay it predicts as well: this data does not need one")
     return True, reasons
+
+
+def _errors(s: Score) -> str:
+    """Return what beats a position, with the errors."""
+    unit = f" {s.position.unit}".rstrip()
+    better = ", ".join(f"{m} ({s.others[m]:.2g}{unit})" for m in s.beaten_by)
+    return f"{better}; its own error is {s.own:.2g}{unit}"
+
+
+def _at_bounds(
+    table: ParameterTable, x: np.ndarray, spread: Uncertainty, trip: RoundTrip | None, max_delay_s: float
+) -> tuple[list[str], str]:
+    """Return a sentence about each estimate at a bound, and the flags to identify again with."""
+    said, flags = [], []
+    for c, at, verdict, low, high in zip(table.columns, x, spread.verdict, table.low, table.high, strict=True):
+        if verdict == "at a bound":
+            upper = bool(high - at < at - low)
+            out = way_out(c.parameter, upper, max_delay_s)
+            bound = c.parameter.high if upper else c.parameter.low
+            said.append(_bound(c.label, "upper" if upper else "lower", f"{bound:.4g} {c.parameter.unit}", out))
+            flags.append(out)
+    if trip and not trip.apart and trip.verdict == "at a bound":
+        out = way_out_of(trip, {c.label: c.parameter for c in table.columns}, max_delay_s)
+        bound = trip.lower if trip.at_bound == "lower" else trip.upper
+        said.append(_bound("the sum of the delays", trip.at_bound, f"{1e3 * bound:.4g} ms", out))
+        flags.append(out)
+    return said, " ".join(dict.fromkeys(f for f in flags if f))
+
+
+def _bound(name: str, side: str, bound: str, flags: str) -> str:
+    what = f"identify again with {flags}" if flags else "it can be allowed no more"
+    return f"at a bound: {name} is at its {side} one, {bound.rstrip()}; {what}, or doubt the model"

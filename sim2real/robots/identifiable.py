@@ -11,7 +11,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.devices import SimActuator, SimSensor
-from sim2real.robots.loop import delay_parameters, recorded_loop
+from sim2real.robots.loop import DelayParams, delay_parameters, recorded_loop
 from sim2real.robots.messages import Goals
 
 if TYPE_CHECKING:
@@ -30,11 +30,12 @@ class IdentifiableServos:
 
     def __init__(self, robot: ServoRobot, max_delay_s: float) -> None:
         self._robot = robot
-        self.parameters = ParameterTable([*robot.dynamics(), *delay_parameters(max_delay_s, robot.tick_s)])
+        self.parameters = ParameterTable([*robot.dynamics(), *delay_parameters(max_delay_s)])
+        self.ahead_s = robot.tick_s
         self.given: Mapping[str, Any] = {"actuator": Goals(goal="goal")}
         sigmas = robot.position_sigma_rad, robot.velocity_sigma_rad_s
         self.channels = tuple(
-            Channel("position", "velocity", *sigmas, index=i, label=joint)
+            Channel("position", "velocity", *sigmas, index=i, label=joint, goal="goal")
             for i, joint in enumerate(robot.servos.joints)
         )
 
@@ -43,7 +44,7 @@ class IdentifiableServos:
         robot, world = self._robot, self._robot.make_world(resumed=True)
         sensor = SimSensor("sensor", robot.RATE_HZ, world)
         actuator = SimActuator("actuator", robot.RATE_HZ, len(robot.servos.joints))
-        return recorded_loop(sensor, actuator, world, max_delay_s, world.lead_s)
+        return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and initial positions, then velocities ``(2 * joints,)``."""
@@ -51,4 +52,4 @@ class IdentifiableServos:
         start = jnp.asarray(start)
         params = self._robot.node_params(values, start[:n], start[n:], jnp.zeros(len(self._robot.aim)))
         del params["agent"]
-        return params
+        return {**params, "sensor": DelayParams(values["sensor_delay"] + self.ahead_s)}

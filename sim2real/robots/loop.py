@@ -33,19 +33,16 @@ def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict
     return {} if delay is None else {input_name: delay}
 
 
-def delay_parameters(max_delay_s: float, tick_s: float) -> list[Parameter]:
+def delay_parameters(max_delay_s: float) -> list[Parameter]:
     """Return the delays to identify: from the world to the sensor, and from the actuator to the world.
 
     Args:
         max_delay_s: Upper bound of each [s].
-        tick_s: The world's period [s].
     """
-    # The sensor interpolates between ticks of the world: at less than a tick it would have to see the future. As only
-    # the sum of both delays can be told from a log, nothing is lost.
     delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     about = "from motion to measurement's time stamp", "from command's departure to the motor"
     return [
-        replace(delay, name=DELAYS[0], low=tick_s, about=about[0], leaf="sensor.delay", side="measurement"),
+        replace(delay, name=DELAYS[0], about=about[0], leaf="sensor.delay", side="measurement"),
         replace(delay, name=DELAYS[1], about=about[1], leaf="actuator.delay", side="command"),
     ]
 
@@ -64,6 +61,24 @@ def delay_bounds(
     room = tick_s + spread_s
     added = dict(zip(DELAYS, (0.0, lead_s), strict=True))
     return {n: (values[n] + lead, max(0.0, values[n] - room), values[n] + spread_s + lead) for n, lead in added.items()}
+
+
+def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> dict[str, float]:
+    """Return parameters whose delays a closed loop can simulate: as much as it needs of them moves to the sensor.
+
+    The sensor interpolates between ticks of the world, and what comes within the next tick is not simulated yet. Where
+    in the loop a delay is makes no difference to what a policy sees of its commands.
+
+    Args:
+        values: Parameters by name, both delays among them or none [s].
+        tick_s: The world's period [s].
+        spread_s: By how much delays vary between episodes, either way [s].
+    """
+    if not set(DELAYS) <= set(values):
+        return dict(values)
+    total = values[DELAYS[0]] + values[DELAYS[1]]
+    sensor = min(max(values[DELAYS[0]], tick_s + spread_s), total)
+    return {**values, DELAYS[0]: sensor, DELAYS[1]: total - sensor}
 
 
 def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
@@ -107,7 +122,7 @@ def simulated_loop(
 
 
 def recorded_loop(
-    sensor: BaseNode, actuator: BaseNode, world: BaseNode, max_delay_s: float, lead_s: float = 0.0
+    sensor: BaseNode, actuator: BaseNode, world: BaseNode, max_delay_s: float, ahead_s: float, lead_s: float = 0.0
 ) -> dict[str, BaseNode]:
     """Connect what identification simulates: recorded commands in, measurements out.
 
@@ -116,12 +131,13 @@ def recorded_loop(
         actuator: What it sent was recorded.
         world: The robot and what surrounds it.
         max_delay_s: Upper bound of the delays [s].
+        ahead_s: By how much later than recorded the sensor's steps are simulated [s].
         lead_s: By how much the world adds to the actuator's delay [s].
     """
     start = max_delay_s / 4
     to_world = TrainableDist.create(start, 0.0, max_delay_s + lead_s, "zoh_mean", burst=BURST)
     world.connect(actuator, skip=True, delay_dist=to_world)
-    sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s, "linear"))
+    sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s + ahead_s, "linear"))
     return {n.name: n for n in (sensor, actuator, world)}
 
 

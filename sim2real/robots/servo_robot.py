@@ -28,7 +28,7 @@ from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableServos
-from sim2real.robots.loop import DelayParams, control_nodes, delay_bounds, simulated_loop
+from sim2real.robots.loop import DelayParams, control_nodes, delay_bounds, in_a_loop, simulated_loop
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import GoalTask
 from sim2real.robots.simulated import ServoWorld
@@ -318,6 +318,7 @@ class ServoRobot(ABC):
     ) -> tuple[dict[str, BaseNode], ServoTask]:
         """Return the loop in simulation and the task; see ``sim2real.stages.robot.Robot``."""
         world = self.make_world()
+        values = in_a_loop(values, self.tick_s, self.delay_spread_s)
         bounds = delay_bounds(values, self.tick_s, self.delay_spread_s, world.lead_s) if delays else None
 
         def options(name: str) -> dict[str, Any]:
@@ -332,6 +333,7 @@ class ServoRobot(ABC):
     def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
         """Return node parameters of the loop in simulation, from rest, with a policy and a trial's aim."""
         rest = self.servos.at_rest
+        values = in_a_loop(values, self.tick_s, self.delay_spread_s)
         return self.node_params(values, rest, np.zeros_like(rest), self.draw_aim(jax.random.key(trial)), policy)
 
     def identified_mjcf(self, values: Mapping[str, Any]) -> str:

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
+
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.pipeline import Pipeline
 
 _GOAL = 0.01
 """The standard error to aim at, as a share of the nominal value."""
@@ -31,6 +38,36 @@ def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
     if found["determined"]:
         said.append(f"next: sim2real {'record' if planned else 'identify'} {pipeline}")
     return said
+
+
+def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) -> str:
+    """Return the command that identifies again as before, with further flags; empty without any.
+
+    Args:
+        pipeline: The robot; what ``config`` has in common with its defaults needs no flag.
+        config: What it was identified with.
+        root: Folder of all runs.
+        flags: What is new; of the same flag, or bounds and fixed value of the same parameter, it replaces the old.
+    """
+    if not flags:
+        return ""
+    new = flags.split()
+    named = {name for flag, name in pairwise(new) if flag in ("--bounds", "--fix")}
+    words = ["sim2real", "identify", pipeline.name]
+    for f in fields(config):
+        flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)
+        if isinstance(value, Mapping):
+            for name, numbers in value.items():
+                own = numbers if isinstance(numbers, tuple) else (numbers,)
+                words += [] if name in named else [flag, name, *(f"{v:g}" for v in own)]
+        elif isinstance(value, tuple):
+            words += [word for file in value for word in (flag, str(file))]
+        elif value != getattr(pipeline.identify, f.name) and flag not in new:
+            words += (
+                [flag if value else flag.replace("--", "--no-", 1)] if isinstance(value, bool) else [flag, str(value)]
+            )
+    words += ["--runs", str(root)] if Path(root) != Path("runs") else []
+    return shlex.join([*words, *new])
 
 
 def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:

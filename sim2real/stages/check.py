@@ -14,19 +14,21 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps, named_leaves
+from sim2real.graph.node import to_ticks
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Vertex
 from sim2real.identify import excitation, identifiability, uncertainty
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
+from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log, measured_times
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
 from sim2real.stages.console import note, pairs, shown, table
 from sim2real.stages.excitation import excitation as command_signal
-from sim2real.stages.identified import ROUND_TRIP, SURE_S
+from sim2real.stages.identified import ROUND_TRIP
 from sim2real.stages.identify import load_log, reach
 from sim2real.stages.manifest import plain
 from sim2real.stages.pipeline import Pipeline
@@ -244,7 +246,8 @@ def simulate(
     seq = np.asarray(found.seq)
     made = np.flatnonzero(seq >= 0)[np.argsort(seq[seq >= 0], kind="stable")]
     outputs[model.sensor] = {n: np.asarray(v)[made] for n, v in named_leaves(found.output).items()}
-    steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values())))) for n in outputs}
+    early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
+    steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
     return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
 
 
@@ -309,7 +312,7 @@ def _parameters(problem: Problem, at: uncertainty.Linearised, check: identifiabi
 
 def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiability.Check) -> dict[str, Any] | None:
     """Return the error to expect of the sum of the delays, where only that can be told."""
-    shift = uncertainty.time_shift(problem)
+    shift = uncertainty.time_shift(problem.table)
     if not shift.any():
         return None
     # With the sensor's delay held, the others move as their sum does.
@@ -358,9 +361,9 @@ def _as_json(found: excitation.Spread) -> dict[str, Any]:
     return {**asdict(found), "covered": found.covered}
 
 
-def _steps(vertex: Vertex, count: int) -> Steps:
-    """Return the steps of one drawn node, as a log has them."""
-    start, end = vertex.start[0, :count], vertex.end[0, :count]
+def _steps(vertex: Vertex, count: int, early: int) -> Steps:
+    """Return the steps of one drawn node as a log has them, ``early`` ticks before."""
+    start, end = (np.maximum(times[0, :count] - early, 0) for times in (vertex.start, vertex.end))
     return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))
 
 

@@ -61,12 +61,12 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         print(table(*timing_rows(timing[-1])))
         for summary in timing:
             warn(summary)
-        episodes = [read_log(log) for log in logs]
-        real = [
-            _true_states(stage.folder / TRUTH, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)
-        ]
+        episodes, truth = [read_log(log) for log in logs], stage.folder / TRUTH
+        real = [_states(truth, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)]
+        # What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
+        seen = "world" if truth.is_file() else "sensor"
         with progress(None, "simulate the same"):
-            simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs))
+            simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs), seen)
         result = _compare(robot, real, simulated)
         result["gap"] += _age_rows(robot, episodes, timeline)
         stage.output("result", "result.json").write_text(
@@ -140,7 +140,7 @@ def _load_policy(robot: Robot, bundle: Path) -> Policy:
     return Policy.from_weights(read_weights(bundle))
 
 
-def _true_states(
+def _states(
     truth: Path, summary: Mapping[str, Any], episode: Episode, robot: Robot
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
@@ -186,9 +186,11 @@ def _simulate(
     episode: Episode,
     duration_s: float,
     episodes: int,
+    seen: str,
 ) -> tuple[list[tuple[np.ndarray, dict[str, np.ndarray]]] | None, Timeline | None]:
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
 
+    ``seen`` says which states: those of the ``world``, or as the ``sensor`` measures them, as late as on the robot.
     Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
     once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
     None and None where there is nothing to simulate with.
@@ -210,13 +212,13 @@ def _simulate(
     # Each deployment's own trial in turn: its simulation has the same to do.
     trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
-    recorded = ("world", robot.SUPERVISOR, robot.COMMAND[0])
+    recorded = (seen, robot.SUPERVISOR, robot.COMMAND[0])
 
     def one(eps: jax.Array, params: Any) -> Any:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
     records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
-    return [_run(graph, nodes["world"].rate, records, robot, e) for e in range(_SIMULATIONS)], timeline
+    return [_run(graph, records, robot, e, seen) for e in range(_SIMULATIONS)], timeline
 
 
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[dict[str, Any]]:
@@ -248,7 +250,7 @@ def _drawn_ages(timeline: Timeline, reader: str, name: str) -> np.ndarray:
 
 
 def _run(
-    graph: CompiledGraph, rate_hz: float, records: Mapping[str, Any], robot: Robot, e: int
+    graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: int, seen: str
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return times [s] and states of one simulation."""
 
@@ -256,12 +258,17 @@ def _run(
         ran = records[node].seq[e] >= 0
         return {n: np.asarray(leaf)[e][ran] for n, leaf in named_leaves(records[node].output).items()}
 
-    name = robot.COMMAND[0]
-    seq = records[name].seq[e]
-    when = graph.timeline.vertices[name].end[e][seq[seq >= 0]] / TICKS_PER_S
-    states = {n: np.asarray(leaf)[e] for n, leaf in named_leaves(records["world"].output).items()}
-    columns = {**_sent(robot, sent(robot.SUPERVISOR), sent(name)), **_columns(states)}
-    return (records["world"].seq[e] + 1) / rate_hz, {**columns, "t_command": when}
+    def steps(node: str) -> np.ndarray:
+        return records[node].seq[e][records[node].seq[e] >= 0]
+
+    name, vertices = robot.COMMAND[0], graph.timeline.vertices
+    when = vertices[name].end[e][steps(name)] / TICKS_PER_S
+    columns = {**_sent(robot, sent(robot.SUPERVISOR), sent(name)), **_columns(sent(seen))}
+    if seen == "world":  # a tick's message is its state at the end
+        t_s = (steps(seen) + 1) / graph.nodes[seen].rate
+    else:
+        t_s = vertices[seen].start[e][steps(seen)] / TICKS_PER_S
+    return t_s, {**columns, "t_command": when}
 
 
 def _compare(robot: Robot, real: list[Any], simulated: list[Any] | None) -> dict[str, Any]:

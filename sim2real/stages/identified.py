@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,16 @@ import numpy as np
 from sim2real.identify.fit import Fit
 from sim2real.identify.identifiability import Check
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.prediction import position_of
+from sim2real.identify.problem import Problem
+from sim2real.identify.round_trip import RoundTrip
 from sim2real.identify.uncertainty import Uncertainty, sum_of
-from sim2real.identify.verdict import Verdict
+from sim2real.identify.verdict import Position, Score, Verdict
 from sim2real.stages.console import note, table
 from sim2real.stages.manifest import sha256
 from sim2real.stages.runs import portable
 
 ROUND_TRIP = "round_trip_delay"
-SURE_S = 0.005
-"""A round trip with a larger standard error is not identified [s]."""
 
 
 def document(
@@ -30,18 +32,17 @@ def document(
     spread: Uncertainty,
     check: Check,
     verdict: Verdict,
+    trip: RoundTrip | None,
     truth: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return what an identification found, as JSON takes it; logs in the run folder are named relative to it."""
     names = list(found.problem.table.names)
-    hashes = [{"path": portable(p, run_dir), "sha256": sha256(p)} for p in logs]
     return {
         "format": 2,
         "pipeline": pipeline,
-        "log": hashes[0],
-        "logs": hashes,
-        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons)},
-        "parameters": _rows(found, spread, truth),
+        **hashed(logs, run_dir),
+        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons), "flags": verdict.flags},
+        "parameters": _rows(found, spread, trip, truth),
         "covariance": {"names": names, "matrix": spread.covariance.tolist()},
         "correlation": {"names": names, "matrix": spread.correlation.tolist()},
         "residual_inflation": spread.inflation,
@@ -59,6 +60,34 @@ def document(
             "refined": [{"before": r.before, "after": r.loss, "steps": r.steps} for r in found.refined],
         },
     }
+
+
+def hashed(logs: Sequence[Path], run_dir: Path) -> dict[str, Any]:
+    """Return which logs were used, as JSON takes it; those in the run folder by their place in it."""
+    hashes = [{"path": portable(p, run_dir), "sha256": sha256(p)} for p in logs]
+    return {"log": hashes[0], "logs": hashes}
+
+
+def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
+    """Return the measured positions, which the verdict judges one by one."""
+    return [
+        Position(position_of(c), c.name, units.get(c.position, ""), c.position_sigma) for c in problem.model.channels
+    ]
+
+
+def scored(scores: Sequence[Score]) -> list[dict[str, Any]]:
+    """Return how far each position is off on held-out data, the worst first, as JSON takes it."""
+    return [
+        {
+            "name": s.position.name,
+            "column": s.position.column,
+            "unit": s.position.unit,
+            "horizon_s": s.horizon_s,
+            "rmse": {m: e if math.isfinite(e) else None for m, e in {"identified": s.own, **s.others}.items()},
+            "beaten_by": s.beaten_by,
+        }
+        for s in scores
+    ]
 
 
 def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
@@ -88,30 +117,44 @@ def show(found: Mapping[str, Any]) -> None:
             for a in found["aggregate"]
         ]
         print(table(each, ["over recordings", "mean", "95 % of the next", "unit", "spread", "agree"]))
+    if judged := found["held_out"]:
+        models = list(dict.fromkeys(m for row in judged for m in row["rmse"]))
+        errors = [[row["name"], *(row["rmse"].get(m) for m in models), row["unit"]] for row in judged]
+        print(table(errors, [f"off {judged[0]['horizon_s']:g} s ahead, held out", *models, "unit"]))
     note(f"verdict: {found['verdict']['status']}")
     for reason in found["verdict"]["reasons"]:
         note(f"  {reason}")
+    if found["verdict"]["next"]:
+        note(f"next: {found['verdict']['next']}")
 
 
-def summary(found: Mapping[str, Any], logs: Sequence[str], horizon_s: float) -> dict[str, Any]:
-    """Return the few lines that the console shows at the end."""
-    last = [e for e in found["prediction"] if e["held_out"] and e["horizon_s"] == round(horizon_s, 3) and e["rmse"]]
+def summary(found: Mapping[str, Any], logs: Sequence[str]) -> dict[str, Any]:
+    """Return the few lines that the console shows at the end; of several positions the worst."""
     total = next((p for p in found["parameters"] if p["name"] == ROUND_TRIP), None)
-    free = {}
+    worst = found["held_out"][0] if found["held_out"] else {"name": "", "column": "", "unit": "", "rmse": {}}
+    name, unit = worst["name"], f" {worst['unit']}".rstrip()
+    if len(found["held_out"]) > 1:
+        name += f", the worst of {len(found['held_out'])}"
+    free: dict[str, list[float]] = {}
     for row in found["free_run"]:
-        if row["field"] == found["free_run"][0]["field"] and row["model"] in ("identified", "hold"):
+        if row["field"] == worst["column"] and row["model"] in ("identified", "hold"):
             free.setdefault(row["model"], []).append(row["rmse"])
     return {
         "log": logs[0] if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0]}",
         **({"round trip delay": f"{1e3 * total['estimate']:.1f} ms"} if total else {}),
-        **{f"{e['model']}, {horizon_s:g} s ahead": f"{e['rmse']:.4f} (held out)" for e in last},
-        **{f"{model}, free run": f"{np.mean(e):.4f} (held out)" for model, e in free.items()},
+        **({"position": f"{name}, on held-out data"} if name else {}),
+        **{
+            f"{model}, {worst['horizon_s']:g} s ahead": f"{e:.4f}{unit}"
+            for model, e in worst["rmse"].items()
+            if e is not None
+        },
+        **{f"{model}, free run": f"{np.mean(e):.4f}{unit}" for model, e in free.items()},
         "verdict": found["verdict"]["status"],
         "search": f"{found['search']['evaluations']} candidates in {found['search']['seconds']:.0f} s",
     }
 
 
-def _rows(found: Fit, spread: Uncertainty, truth: Mapping[str, float]) -> list[dict[str, Any]]:
+def _rows(found: Fit, spread: Uncertainty, trip: RoundTrip | None, truth: Mapping[str, float]) -> list[dict[str, Any]]:
     parameters = found.problem.table
     rows = []
     for i, column in enumerate(parameters.columns):
@@ -143,28 +186,23 @@ def _rows(found: Fit, spread: Uncertainty, truth: Mapping[str, float]) -> list[d
         for p in parameters
         if not p.free
     ]
-    delays = [c.label for c in parameters.columns if c.parameter.kind == "delay"]
-    return rows + ([_round_trip(found, spread, delays, truth)] if delays else [])
+    return rows + ([_round_trip(trip, truth)] if trip else [])
 
 
-def _round_trip(found: Fit, spread: Uncertainty, delays: list[str], truth: Mapping[str, float]) -> dict[str, Any]:
+def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> dict[str, Any]:
     """Return the row of the sum of all delays: what a log tells even where it cannot tell them apart."""
-    parameters = found.problem.table
-    error = error_of(found, spread, delays)
-    fixed = [p for p in parameters if p.kind == "delay" and not p.free]
-    total = sum(float(np.ravel(found.values[n])[0]) for n in delays) + sum(p.nominal for p in fixed)
     return {
         "name": ROUND_TRIP,
         "unit": "s",
         "kind": "derived",
-        "about": " + ".join([*delays, *(p.name for p in fixed)]),
+        "about": " + ".join([*trip.parts, *trip.held]),
         "nominal": 0.0,
-        "estimate": total,
-        "standard_error": error,
-        "low95": total - 1.96 * error,
-        "high95": total + 1.96 * error,
-        "lower": sum(parameters[n].low for n in delays),
-        "upper": sum(parameters[n].high for n in delays),
-        "verdict": "accepted" if error < SURE_S else "not identifiable",
+        "estimate": trip.estimate,
+        "standard_error": trip.standard_error,
+        "low95": trip.low,
+        "high95": trip.high,
+        "lower": trip.lower,
+        "upper": trip.upper,
+        "verdict": trip.verdict,
         "truth": truth.get(ROUND_TRIP),
     }

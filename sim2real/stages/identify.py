@@ -22,13 +22,15 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.posterior import Posterior
 from sim2real.identify.problem import Problem
+from sim2real.identify.round_trip import round_trip
 from sim2real.identify.segments import Span, beyond
-from sim2real.identify.verdict import NO_DELAY, judge
+from sim2real.identify.verdict import NO_DELAY, judge, scores
 from sim2real.log.importer import import_file, load_mapping
 from sim2real.log.reader import TruncatedLogWarning, read_log
-from sim2real.stages import identified
+from sim2real.stages import advice, identified
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, shown
+from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
 from sim2real.stages.robot import Identifiable
@@ -68,35 +70,23 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     logs = Logs(paths, [load_log(p, pipeline) for p in paths], fitted)
     windows = spans(logs, config, config.settle_s + config.horizon_s)
     inputs = {"log" if i == 0 else f"log_{i}": p for i, p in enumerate(paths)}
-    with open_stage(root, pipeline.name, "identify", config, inputs, run_dir) as stage:
+    own = table.for_recordings(len(logs.episodes))
+    with (
+        open_stage(root, pipeline.name, "identify", config, inputs, run_dir) as stage,
+        left_behind(stage, pipeline.name, paths, own) as best,
+    ):
         begin = time.monotonic()
-        with _told("identify") as told:
+        with _told("identify", best) as told:
             found = _fit(model, logs, windows, config, table, told)
         note("identify: errors, predictions and baselines")
-        spread = uncertainty.from_linearised(found.problem, at := uncertainty.linearise(found.problem, found.z))
-        check = identifiability.from_linearised(found.problem, at)
+        at = uncertainty.linearise(found.problem, found.z)
         seconds = time.monotonic() - begin
-        shifted, problem = uncertainty.shifted_delays(found.problem), found.windows
-        models = {"identified": found.values, **_baselines(found), "nominal": _nominal(model)}
-        samples = prediction.samples(problem, models, config.settle_s)
-        horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-        errors = prediction.errors(problem, samples, list(models), config.settle_s, horizons)
-        runs, free = _free_runs(model, logs, config, table, models)
+        samples, free, rows = _predicted(model, logs, config, table, found)
         outside = beyond(model, logs.episodes, windows, config.settle_s + config.horizon_s)
-        verdict = judge(errors, spread, found.problem.table.names, check, shifted, outside)
-        truth = true_values(paths[0].with_name(TRUTH), logs.episodes[0]) if config.reveal else {}
-        document = identified.document(pipeline.name, logs.paths, stage.run_dir, found, spread, check, verdict, truth)
-        document |= {
-            "units": dict(robot.UNITS),
-            "prediction": errors,
-            "free_run": runs,
-            "segments": problem.segments,
-            "held_out_from_s": float(np.delete(problem.begins_s, problem.train).min(initial=np.inf)),
-            "aggregate": _each(model, logs, config, table, found) if config.each else [],
-        }
+        document = _judged(pipeline, logs, stage.run_dir, config, found, at, rows["prediction"], outside)
+        document["verdict"]["next"] = advice.again(pipeline, config, root, document["verdict"].pop("flags"))
+        document |= {**rows, "aggregate": _each(model, logs, config, table, found) if config.each else []}
         document["search"]["seconds"] = seconds
-        document["posterior"] = Posterior.of(found.problem.table, found.z, spread.scale_covariance).to_json()
-        document["sigma"] = dict(zip(prediction.labels(problem), (s for _, s, _ in problem.fields), strict=True))
         stage.output("parameters", "parameters.json").write_text(json.dumps(document, indent=1))
         np.savez_compressed(stage.output("predictions", "predictions.npz"), **cast(Any, samples))
         if free:
@@ -107,8 +97,56 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
 
         stage.output("page", identify_page(stage.folder).name)
         identified.show(document)
-        stage.summary(identified.summary(document, [shown(p) for p in paths], config.horizon_s))
+        stage.summary(identified.summary(document, [shown(p) for p in paths]))
     return stage.result
+
+
+def _predicted(
+    model: IdentifiableModel, logs: Logs, config: IdentifyConfig, table: ParameterTable, found: Fit
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Any]]:
+    """Return the columns of all segments and of the free runs, and the rows of their errors for the document."""
+    problem = found.windows
+    models = {"identified": found.values, **_baselines(found), "nominal": _nominal(model)}
+    samples = prediction.samples(problem, models, config.settle_s)
+    horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
+    errors = prediction.errors(problem, samples, list(models), config.settle_s, horizons)
+    runs, free = _free_runs(model, logs, config, table, models)
+    rows = {
+        "prediction": errors,
+        "free_run": runs,
+        "segments": problem.segments,
+        "held_out_from_s": float(np.delete(problem.begins_s, problem.train).min(initial=np.inf)),
+        "sigma": dict(zip(prediction.labels(problem), (s for _, s, _ in problem.fields), strict=True)),
+    }
+    return samples, free, rows
+
+
+def _judged(
+    pipeline: Pipeline,
+    logs: Logs,
+    run_dir: Path,
+    config: IdentifyConfig,
+    found: Fit,
+    at: uncertainty.Linearised,
+    errors: Sequence[Mapping[str, Any]],
+    outside: Sequence[str],
+) -> dict[str, Any]:
+    """Return the document with estimates, what the recordings leave open, and the verdict."""
+    units = dict(cast(Identifiable, pipeline.load()).UNITS)
+    spread = uncertainty.from_linearised(found.problem, at)
+    check = identifiability.from_linearised(found.problem, at)
+    judged = scores(errors, identified.positions(found.problem, units))
+    table = found.problem.table
+    trip = round_trip(table, at.x, spread)
+    verdict = judge(judged, table, at.x, spread, check, trip=trip, max_delay_s=config.max_delay_s, beyond=outside)
+    path = logs.paths[0].with_name(TRUTH)
+    truth = true_values(path, logs.episodes[0]) if config.reveal else {}
+    return {
+        **identified.document(pipeline.name, logs.paths, run_dir, found, spread, check, verdict, trip, truth),
+        "units": units,
+        "held_out": identified.scored(judged),
+        "posterior": Posterior.of(table, found.z, spread.scale_covariance).to_json(),
+    }
 
 
 def find_logs(
@@ -271,16 +309,16 @@ def _each(
 
 
 @contextmanager
-def _told(what: str) -> Iterator[Told]:
-    """Show a bar for search and refinement."""
+def _told(what: str, best: Best | None = None) -> Iterator[Told]:
+    """Show a bar for search and refinement, and keep the best so far."""
+    best = best or Best()
     with progress(100, what) as bar:
-        done = {"search": 0.0, "refine": 0.0}
 
-        def advance(stage: str, share: float, best: float) -> None:
-            done[stage] = min(1.0, done[stage] + share)
+        def advance(stage: str, share: float, loss: float, z: np.ndarray) -> None:
+            best.advance(stage, share, loss, z)
             bar.set_description_str(f"{what}: {stage}")
-            bar.update(round(70 * done["search"] + 30 * done["refine"]) - bar.n)
-            bar.set_postfix_str(f"loss {best:.4f}")
+            bar.update(round(70 * best.done["search"] + 30 * best.done["refine"]) - bar.n)
+            bar.set_postfix_str(f"loss {loss:.4f}")
 
         yield advance
         bar.update(100 - bar.n)

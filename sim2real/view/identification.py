@@ -56,6 +56,17 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class HeldOut:
+    """How far one position is off on held-out data after the longest horizon: model -> RMSE, and what is as good."""
+
+    name: str
+    unit: str
+    horizon_s: float
+    rmse: Mapping[str, float]
+    beaten_by: Sequence[str]
+
+
+@dataclass(frozen=True)
 class FreeRun:
     """How far one model's free run of one recording is off in one field."""
 
@@ -118,6 +129,7 @@ class Identification:
         settle_s: How much of a held-out segment its initial state was fitted to [s].
         segments: How many segments, if told.
         logs: Names of the recordings, fitted ones first.
+        held_out: How far each position is off on held-out data, the worst first.
     """
 
     status: str
@@ -138,6 +150,7 @@ class Identification:
     settle_s: float = 0.0
     segments: Any = None
     logs: Sequence[str] = ()
+    held_out: Sequence[HeldOut] = ()
 
     @property
     def fields(self) -> list[str]:
@@ -185,6 +198,7 @@ def read_identification(artifact: Artifact) -> Identification:
             "history": read_numbers(search.pop("history", [])),
             "search": search,
             "prediction": [_prediction(row) for row in data.get("prediction", [])],
+            "held_out": [_held_out(row) for row in data.get("held_out", [])],
             "free_runs": [_free_run(row) for row in data.get("free_run", [])],
             "aggregate": [_quantity(row) for row in data.get("aggregate", [])],
             "determined": _determined(data.get("check")),
@@ -241,6 +255,13 @@ def _prediction(row: Mapping[str, Any]) -> Prediction:
     errors = {n.removesuffix("_rmse"): read_number(v, math.nan) for n, v in row.items() if n.endswith("_rmse")}
     check(bool(errors), f"no error of any field in the prediction of {row.get('model')!r}")
     return Prediction(str(row["model"]), float(row["horizon_s"]), bool(row.get("held_out", False)), errors)
+
+
+def _held_out(row: Mapping[str, Any]) -> HeldOut:
+    errors = {str(m): read_number(e, math.inf) for m, e in row["rmse"].items()}
+    check("identified" in errors, f"no error of what was identified in {row.get('name')!r}")
+    named = str(row["name"]), str(row.get("unit") or ""), float(row["horizon_s"])
+    return HeldOut(*named, errors, [str(m) for m in row.get("beaten_by", [])])
 
 
 def _free_run(row: Mapping[str, Any]) -> FreeRun:

@@ -21,6 +21,7 @@ _VOICES = {
     "no delay": "the same, fitted without delays",
     "nominal": "nominal model",
 }
+_SAID = {"hold": "hold: nothing changes", "told": "told: where it was told to be"}
 
 
 def predictions(found: Identification, name: str) -> str:
@@ -109,7 +110,7 @@ def prediction_errors(found: Identification, name: str) -> str:
         entries = []
         for number, model in enumerate(models):
             color, dash, mark = _model_look(model, number)
-            label = {"hold": "hold: nothing changes"}.get(model, model)
+            label = _SAID.get(model, model)
             entries.append(Line2D([], [], color=color, ls=dash, marker=mark, ms=5, label=label))
         style.legend_above(figure, entries)
         return to_svg(figure, name, f"Prediction error of {', '.join(models)} over the horizon")
@@ -191,6 +192,7 @@ def _model_look(model: str, number: int) -> tuple[str, Any, str]:
         "no delay": (INK, style.DASHES[3], "D"),
         "nominal": (ORANGE, style.DASHES[1], "s"),
         "hold": (MUTED, style.DASHES[2], "^"),
+        "told": (GREEN, style.DASHES[1], "v"),
     }
     return known.get(model, ((GREEN, style.PURPLE)[number % 2], style.DASHES[1], "v"))
 

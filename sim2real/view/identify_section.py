@@ -27,7 +27,6 @@ from sim2real.view.blocks import (
 from sim2real.view.identification import (
     Estimate,
     Identification,
-    Prediction,
     Quantity,
     in_readable_unit,
     read_identification,
@@ -180,6 +179,8 @@ def _aggregate(found: Identification) -> list[Block]:
 def _predictions(found: Identification) -> list[Block]:
     """Return curves of errors, free runs, and the segments."""
     blocks: list[Block] = []
+    if len(found.held_out) > 1:
+        blocks.append(_positions_table(found))
     if found.prediction:
         blocks.append(
             FigureBlock(
@@ -249,6 +250,22 @@ def _correlation(found: Identification) -> list[Block]:
     ]
 
 
+def _positions_table(found: Identification) -> TableBlock:
+    models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
+    rows = [
+        [
+            row.name,
+            *(number(row.rmse.get(m)) for m in models),
+            pretty_unit(row.unit),
+            ", ".join(row.beaten_by) or "none",
+        ]
+        for row in found.held_out
+    ]
+    caption = f"Held-out RMSE of every position after {found.held_out[0].horizon_s:g} s, the worst first"
+    heads = ("position", *models, "unit", "no better than")
+    return TableBlock(caption, heads, rows, (len(models) + 1, len(models) + 2))
+
+
 def _prediction_table(found: Identification) -> TableBlock:
     fields = list(dict.fromkeys(f for row in found.prediction for f in row.rmse))
     heads = [f"RMSE of {f}" + (f" [{unit}]" if (unit := unit_of(f, found.units)) else "") for f in fields]
@@ -284,16 +301,11 @@ def _free_run_table(found: Identification) -> TableBlock:
 
 
 def _tiles(found: Identification) -> Iterator[Tile]:
-    best = _farthest(found, "identified")
-    if best and best.rmse:
-        name = next((f for f in found.fields if f in best.rmse), next(iter(best.rmse)))
-        unit = unit_of(name, found.units)
-        others = [(m, o.rmse.get(name)) for m in ("no delay", "hold", "nominal") if (o := _farthest(found, m))]
-        note = ", ".join(f"{m} {number(e, 3)}" for m, e in others)
-        kind = "held-out " if best.held_out else ""
-        yield Tile(
-            f"{kind}RMSE of {name} after {best.horizon_s:g} s", f"{number(best.rmse[name], 3)} {unit}".strip(), note
-        )
+    for row in found.held_out[:1]:
+        which = f"{row.name}, the worst of {len(found.held_out)}," if len(found.held_out) > 1 else row.name
+        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
+        error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
+        yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
     for e in found.estimates:
         if e.kind == "derived" and e.unit == "s":
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
@@ -304,9 +316,3 @@ def _tiles(found: Identification) -> Iterator[Tile]:
     seconds, evaluations = found.search.get("seconds"), found.search.get("evaluations")
     if seconds is not None:
         yield Tile("search", f"{float(seconds):.0f} s", f"{number(evaluations)} evaluations" if evaluations else "")
-
-
-def _farthest(found: Identification, model: str) -> Prediction | None:
-    """Return a model's error at the longest horizon, on held-out data if there are any."""
-    rows = [r for r in found.prediction if r.model == model]
-    return max(rows, key=lambda r: (r.held_out, r.horizon_s), default=None)

@@ -59,7 +59,7 @@ def fitted(request):
 
     def estimate(data):
         def step(z, _):
-            r, J = problem.linearised(z, problem.sensitivities(z, data=data), data)
+            r, J, _ = problem.linearised(z, problem.sensitivities(z, data=data), data)
             r, J = r.reshape(-1), J.reshape(-1, z.size)
             # A little damping: where initial states are free, nothing fixes the shift between the delays.
             return z - jnp.linalg.solve(J.T @ J + 10.0 * jnp.eye(z.size), J.T @ r), None
@@ -67,7 +67,8 @@ def fitted(request):
         z = jax.lax.scan(step, z_true, length=4)[0]
         return z, *problem.linearised(z, problem.sensitivities(z, data=data), data)
 
-    z, r, J = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40))(data)
+    z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40))(data)
+    np.testing.assert_array_equal(r, raw)  # a squared loss tames nothing
     return problem, *(np.asarray(a, np.float64) for a in (z, r, J))
 
 
@@ -127,7 +128,7 @@ def spreads(fitted):
     for own, residuals, jacobian in zip(z, r, J, strict=True):
         x, stretch = problem.table.scale(own)
         prior = np.diag(12.0 / problem.table.span**2)
-        at = Linearised(residuals, jacobian / stretch, prior, x)
+        at = Linearised(residuals, jacobian / stretch, prior, x, residuals)
         yield problem.table.unscale(x), uncertainty.from_linearised(problem, at), at
 
 
@@ -136,29 +137,25 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     names = list(problem.table.names)
     truth = np.array([TRUTH[n] for n in names])
     delays = [names.index("sensor_delay"), names.index("actuator_delay")]
-    known = problem.config.initial_state == "rest"
     covered, total, off = np.zeros(len(names)), 0, []
     for values, spread, _ in spreads(fitted):
         covered += (spread.low <= truth) & (truth <= spread.high)
         error = values[delays].sum() - truth[delays].sum()
         total += abs(error) <= 1.96 * uncertainty.sum_of(spread, delays)
         off.append(error)
-    judged = [*GROUPS, *(("sensor_delay", "actuator_delay") if known else ())]
-    shares = {n: covered[names.index(n)] for n in judged} | {"round trip": total}
-    assert all(368 <= n <= 392 for n in shares.values()), shares
+    shares = {n: covered[names.index(n)] for n in GROUPS} | {"round trip": total}
+    # Released at known places, segments differ much in what they tell, and the bootstrap over them widens standard
+    # errors to 1.17 times what estimates really vary by: 391 of 400 are to be expected, give or take 3.
+    most = 396 if problem.config.initial_state == "rest" else 392
+    assert all(368 <= n <= most for n in shares.values()), {n: int(v) for n, v in shares.items()}
     assert np.max(np.abs(off)) < 1e-3
 
 
 def test_what_cannot_be_told_is_named_in_all(fitted):
     problem = fitted[0]
-    known = problem.config.initial_state == "rest"
     for _, spread, at in spreads(fitted):
         verdict = dict(zip(problem.table.names, spread.verdict, strict=True))
         messages = identifiability.from_linearised(problem, at).messages
-        if known:
-            assert set(verdict.values()) == {"accepted"}
-            assert not messages
-        else:
-            loose = {n for n, v in verdict.items() if v == "not identifiable"}
-            assert loose == {"sensor_delay", "actuator_delay"}
-            assert any("sensor_delay + actuator_delay" in m for m in messages)
+        assert {n for n, v in verdict.items() if v == "not identifiable"} == {"sensor_delay", "actuator_delay"}
+        assert set(verdict.values()) == {"accepted", "not identifiable"}
+        assert any("sensor_delay + actuator_delay" in m for m in messages)

@@ -13,11 +13,16 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.identify import fit as fitting
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.prediction import samples
 from sim2real.identify.problem import Problem
+from sim2real.identify.refine import Refined
+from sim2real.identify.robust import tamed
+from sim2real.identify.search import SearchResult
 from sim2real.identify.segments import Span
 
 TICK_S, PERIOD_S, DURATION_S = 0.01, 0.02, 8.0
@@ -100,6 +105,7 @@ class Model:
     """What a pipeline provides."""
 
     sensor = "sensor"
+    ahead_s = 0.0
     given = {"actuator": Command(u="u")}  # noqa: RUF012
     channels = (Channel("y", None, position_sigma=NOISE, velocity_sigma=0.1),)
 
@@ -184,6 +190,16 @@ def test_progress_adds_up_to_at_most_one(found):
     np.testing.assert_allclose(z, found.fit.z)  # what an interrupted search leaves behind
 
 
+def test_what_the_search_began_with_is_refined_too(episode, monkeypatch):
+    """So that a search that ends in another valley does not decide."""
+    far, seen = np.full(2, 2.5), []
+    lost = SearchResult(far, 9.0, np.ones(1), 1, far[None])
+    monkeypatch.setattr(fitting, "run_search", lambda *_: lost)
+    monkeypatch.setattr(fitting, "_refine", lambda problem, starts, told: seen.append(starts) or Refined(far, 1, 2, 3))
+    fit(Model(), [episode], SPANS, LENGTH_S, CONFIG)
+    np.testing.assert_array_equal(seen[0], [far, Model().parameters.start()])
+
+
 def test_its_uncertainty_covers_the_truth(found):
     spread = found.fit.uncertainty()
     assert spread.verdict == ("accepted", "accepted")
@@ -198,6 +214,24 @@ def test_auto_takes_the_derivative_where_there_is_one(episode):
     assert Problem(Model(outside=False), [episode], SPANS, LENGTH_S, CONFIG).forward
     assert not Problem(Model(outside=False), [episode], SPANS, LENGTH_S, replace(CONFIG, jacobian="finite")).forward
     assert Problem(Model(outside=True), [episode], SPANS, LENGTH_S, replace(CONFIG, jacobian="forward")).forward
+
+
+def test_a_sensor_that_is_faster_than_its_rate_is_compared_with_what_it_measured(episode):
+    """66 Hz into a node of 50: some rows of the compiled graph hold two of its steps."""
+    stamps = np.arange(0, round(DURATION_S * 1e6), 15_000)
+    none = np.zeros_like(stamps)
+    steps = Steps(scheduled=stamps, start=stamps, woken=stamps, ts_overwrite=none - 1, end=stamps + 10, drift=none)
+    fast = replace(
+        episode,
+        steps={**episode.steps, "sensor": steps},
+        outputs={**episode.outputs, "sensor": {"y": stamps * 1e-6}},
+    )
+    problem = Problem(Model(outside=False), [fast], SPANS[:2], LENGTH_S, CONFIG)
+    assert problem.graph.wiring.slots.count("sensor") > 1
+    values = {"gain": GAIN, "tau": TIME_CONSTANT_S, "offset": 0.0}
+    columns = samples(problem, {"true": values}, 0.0)
+    assert len(columns["t"]) > 0.9 * 2 * LENGTH_S / 0.015
+    np.testing.assert_allclose(columns["y_measured"], columns["t"], atol=1e-5)
 
 
 def test_no_span_is_an_error(episode):
@@ -235,9 +269,11 @@ def test_value_and_jacobian_are_those_of_the_residuals(episode, outside):
     assert problem.forward == (not outside)
     z = problem.table.start() + jnp.array([0.3, -0.2])
     columns = jax.jit(problem.sensitivities)(z)
-    value, jacobian = jax.jit(problem.linearised)(z, columns)
+    value, jacobian, raw = jax.jit(problem.linearised)(z, columns)
     smooth = Problem(Model(outside=False), [episode], SPANS[:3], LENGTH_S, CONFIG)
     np.testing.assert_allclose(value, jax.jit(problem.stacked)(z, columns), rtol=1e-5, atol=1e-5)
+    assert np.abs(raw).max() > 10.0  # so that taming shows
+    np.testing.assert_allclose(tamed(raw, "huber", CONFIG.reach), value, rtol=1e-5, atol=1e-5)
     exact = jax.jit(jax.jacfwd(lambda y: smooth.stacked(y, columns)))(z)
     assert jacobian.shape == (*value.shape, 2)
     size = np.abs(exact).max()

@@ -36,7 +36,7 @@ def _quick():
 
 def test_a_bowls_bottom_is_found_and_reported():
     told = []
-    found = search(bowl, np.zeros(2), CONFIG, on_generations=lambda n, best: told.append((n, best)))
+    found = search(bowl, np.zeros(2), CONFIG, on_generations=lambda n, best, z: told.append((n, best)))
     np.testing.assert_allclose(found.z, BOTTOM, atol=0.02)
     assert found.loss == pytest.approx(1.0, abs=1e-3)
     assert found.loss == pytest.approx(float(bowl(found.z[None])[0]))

@@ -1,26 +1,46 @@
-"""The verdict: one of four, and why."""
+"""The verdict: one of four, why, and the way out; it speaks for every position."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sim2real.identify import verdict
 from sim2real.identify.identifiability import Check
-from sim2real.identify.verdict import judge
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.round_trip import RoundTrip
+from sim2real.identify.verdict import Position, scores
 
-NAMES = ("gain", "sensor_delay", "actuator_delay")
-DELAYS = NAMES[1:]
+DELAYS = ("sensor_delay", "actuator_delay")
+TABLE = ParameterTable(
+    [
+        Parameter("gain", "1", 2.0, 1.0, 4.0),
+        Parameter("offset", "rad", 0.0, -1.0, 1.0, "linear"),
+        Parameter("static", "1", 0.1, 0.0, 0.3, "linear"),
+        Parameter("share", "1", 0.5, 0.1, 0.9, "logit"),
+        *(Parameter(n, "s", 0.0, 0.0, 0.06, "linear", "delay", side=s)
+          for n, s in zip(DELAYS, ("measurement", "command"), strict=True)),
+    ]
+)  # fmt: skip
+ONE = (Position("th", "th", "rad", 1e-6),)
+TWO = (Position("position[0]", "pan", "rad", 0.002), Position("position[1]", "tilt", "rad", 0.002))
 
 
-def rows(identified, nominal, horizon_s=1.0, held_out=True, **others):
+def rows(identified, nominal, horizon_s=1.0, held_out=True, column="th", **others):
     errors = {"identified": identified, "nominal": nominal, **others}
     return [
-        {"model": m, "horizon_s": horizon_s, "held_out": held_out, "rmse": e} for m, e in errors.items()
+        {"model": m, "horizon_s": horizon_s, "held_out": held_out, f"{column}_rmse": e} for m, e in errors.items()
     ]  # fmt: skip
 
 
-def spread(*verdicts, misfit=1.0):
-    return SimpleNamespace(verdict=verdicts or ("accepted",) * 3, misfit=misfit)
+def both(first, second):
+    """Return rows of two positions; model -> error of each."""
+    return [{"model": m, "horizon_s": 1.0, "held_out": True, "position[0]_rmse": first[m], "position[1]_rmse": e}
+            for m, e in second.items()]  # fmt: skip
+
+
+def spread(misfit=1.0, **verdicts):
+    return SimpleNamespace(verdict=tuple(verdicts.get(n, "accepted") for n in TABLE.names), misfit=misfit)
 
 
 def check(*groups):
@@ -28,77 +48,163 @@ def check(*groups):
     return Check(1.0, one, one, tuple("" if len(g) == 1 else " + ".join(g) for g in groups), groups, 60.0)
 
 
+def trip(estimate=0.0166, error=0.0003, apart=False):
+    return RoundTrip(DELAYS, (), apart, estimate, error, estimate - 2 * error, estimate + 2 * error, 0.0, 0.12)
+
+
+def judge(prediction, spread=spread(), check=check(), positions=ONE, x=None, **more):  # noqa: B008 - neither changes
+    x = (TABLE.low + TABLE.high) / 2 if x is None else x
+    return verdict.judge(scores(prediction, positions), TABLE, x, spread, check, **{"max_delay_s": 0.06, **more})
+
+
 def test_accepted():
-    found = judge(rows(0.1, 1.0, hold=0.4), spread(), NAMES, check(), shifted=DELAYS)
+    found = judge(rows(0.1, 1.0, hold=0.4))
     assert found.status == "accepted"
-    assert len(found.reasons) == 1
-    assert "1 s ahead on held-out data" in found.reasons[0]
-    assert "0.25 times" in found.reasons[0]
-    assert "hold" in found.reasons[0]
+    assert found.reasons == ("1 s ahead on held-out data th is off by 0.1 rad, 0.25 times hold",)
 
 
 @pytest.mark.parametrize("own", [0.96, 1.0, 3.0, np.nan, np.inf])
 def test_no_improvement(own):
-    found = judge(rows(own, 5.0, hold=1.0) if own < 4 else rows(own, 1.0), spread(), NAMES, check(), shifted=())
+    found = judge(rows(own, 5.0, hold=1.0) if own < 4 else rows(own, 1.0))
     assert found.status == "no improvement on held-out data"
-    assert found.reasons[0].startswith("1 s ahead on held-out data it is no better than: ")
-    assert ("hold" if own < 4 else "nominal") in found.reasons[0]
+    assert found.reasons[0].startswith("1 s ahead on held-out data th is no better than: ")
+    assert ("hold (1 rad)" if own < 4 else "nominal (1 rad)") in found.reasons[0]
 
 
 @pytest.mark.parametrize("diverged", [np.nan, np.inf])
 def test_a_baseline_that_diverges_is_no_better(diverged):
-    assert judge(rows(0.1, diverged), spread(), NAMES, check(), shifted=()).status == "accepted"
+    assert judge(rows(0.1, diverged)).status == "accepted"
 
 
 def test_the_longest_horizon_on_held_out_data_decides():
     prediction = rows(2.0, 1.0, horizon_s=0.1) + rows(0.5, 1.0, horizon_s=1.0) + rows(9.0, 1.0, 2.0, held_out=False)
-    assert judge(prediction, spread(), NAMES, check(), shifted=()).status == "accepted"
-    nothing = [{"model": "identified", "horizon_s": 3.0, "held_out": True, "rmse": None}]
-    assert judge(prediction + nothing, spread(), NAMES, check(), shifted=()).status == "accepted"
+    assert judge(prediction).status == "accepted"
+    nothing = [{"model": "identified", "horizon_s": 3.0, "held_out": True, "th_rmse": None}]
+    assert judge(prediction + nothing).status == "accepted"
 
 
-def test_hit_a_bound():
-    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(), shifted=())
-    assert found.status == "hit a bound"
-    assert any(r.startswith("at a bound: gain; widen it with --bounds") for r in found.reasons)
+GOOD = {"identified": 0.01, "no delay": 0.05, "nominal": 0.2, "hold": 0.4, "told": 0.1}
 
 
-def test_not_identifiable():
-    found = judge(rows(0.1, 1.0), spread(), NAMES, check(("gain",)), shifted=())
-    assert found.status == "not identifiable"
-    assert "nothing in this data determines gain: excite it, fix it or give it a prior" in found.reasons
+@pytest.mark.parametrize("worse", [{"identified": 50.0}, {"told": 0.009}, {"hold": 0.01}, {"no delay": 0.009}])
+def test_every_position_has_to_improve_on_every_baseline(worse):
+    assert judge(both(GOOD, GOOD), positions=TWO).status == "accepted"
+    for culprit, prediction in (("tilt", both(GOOD, GOOD | worse)), ("pan", both(GOOD | worse, GOOD))):
+        found = judge(prediction, positions=TWO)
+        assert found.status == "no improvement on held-out data"
+        assert [r.split("data ")[1].split(" ")[0] for r in found.reasons if "no better than" in r] == [culprit]
 
 
-def test_delays_of_which_the_sum_counts_are_as_they_should_be():
-    group = check(("sensor_delay", "actuator_delay"))
-    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=DELAYS).status == "accepted"
-    assert judge(rows(0.1, 1.0), spread(), NAMES, group, shifted=()).status == "not identifiable"
-    mixed = check(("gain", "actuator_delay"))
-    assert judge(rows(0.1, 1.0), spread(), NAMES, mixed, shifted=DELAYS).status == "not identifiable"
+def test_the_worst_position_comes_first_and_all_are_told():
+    found = judge(both(GOOD, GOOD | {"identified": 0.04}), positions=TWO)
+    assert [r.split("data ")[1].split(" ")[0] for r in found.reasons] == ["tilt", "pan"]
+    assert "0.8 times no delay" in found.reasons[0]
+    lost = judge(both(GOOD | {"identified": 50.0}, GOOD), positions=TWO)
+    assert "pan is no better than: no delay (0.05 rad), nominal (0.2 rad), hold (0.4 rad), told (0.1 rad)" in str(lost)
 
 
-def test_the_first_that_applies_is_the_status_and_all_are_reasons():
-    found = judge(rows(1.0, 1.0), spread("at a bound", "accepted", "accepted", misfit=7.0), NAMES,
-                  check(("gain",)), shifted=())  # fmt: skip
+def test_where_commands_are_no_positions_nothing_was_told():
+    prediction = [*rows(0.1, 1.0), {"model": "told", "horizon_s": 1.0, "held_out": True, "other_rmse": 0.01}]
+    assert judge(prediction).status == "accepted"
+
+
+def test_a_joint_that_stood_still_cannot_be_predicted_better_than_its_noise():
+    still = dict.fromkeys(GOOD, 0.0015) | {"identified": 0.0024}
+    assert judge(both(GOOD, still), positions=TWO).status == "accepted"
+    drifts = still | {"identified": 0.02}
+    assert judge(both(GOOD, drifts), positions=TWO).status == "no improvement on held-out data"
+
+
+def test_worse_than_without_delays_is_a_failure_and_as_good_is_none():
+    found = judge(rows(0.17, 1.0, **{"no delay": 0.1}))
     assert found.status == "no improvement on held-out data"
-    assert len(found.reasons) == 4
-    assert "residuals are 7 times the measurement's deviation" in found.reasons[-1]
-    found = judge(rows(0.1, 1.0), spread("at a bound", "accepted", "accepted"), NAMES, check(("gain",)), shifted=())
-    assert found.status == "hit a bound"
-
-
-def test_nothing_held_out_is_told():
-    found = judge(rows(0.1, 1.0, held_out=False), spread(), NAMES, check(), shifted=())
-    assert found.reasons == ("nothing was held out: how well it predicts is not known",)
-
-
-def test_a_delay_that_is_not_needed_is_no_failure():
-    prediction = rows(0.1, 1.0, **{"no delay": 0.1})
-    found = judge(prediction, spread(), NAMES, check(), shifted=DELAYS)
+    assert "no delay (0.1 rad); its own error is 0.17 rad" in found.reasons[0]
+    assert not any("as well" in r for r in found.reasons)
+    found = judge(rows(0.1, 1.0, **{"no delay": 0.1}))
     assert found.status == "accepted"
     assert any("does not need one" in r for r in found.reasons)
 
 
+@pytest.mark.parametrize(
+    ("name", "side", "flags"),
+    [
+        ("gain", "upper", "--bounds gain 1 16"),
+        ("gain", "lower", "--bounds gain 0.25 4"),
+        ("offset", "upper", "--bounds offset -1 3"),
+        ("static", "upper", "--bounds static 0 0.6"),
+        ("static", "lower", "--fix static 0"),
+        ("share", "upper", "--bounds share 0.1 0.975"),
+        ("share", "lower", "--bounds share 0.025 0.9"),
+    ],
+)
+def test_a_bound_comes_with_flags_that_are_accepted(name, side, flags):
+    x = (TABLE.low + TABLE.high) / 2
+    i = TABLE.names.index(name)
+    x[i] = TABLE.low[i] if side == "lower" else TABLE.high[i]
+    found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
+    assert found.status == "hit a bound"
+    assert found.flags == flags
+    assert any(r.startswith(f"at a bound: {name} is at its {side} one, ") and flags in r for r in found.reasons)
+    kind, _, *numbers = flags.split()
+    values = [float(v) for v in numbers]
+    wider = TABLE.with_bounds({name: tuple(values)}) if kind == "--bounds" else TABLE.with_fixed({name: values[0]})
+    assert wider[name].free == (kind == "--bounds")
+
+
+@pytest.mark.parametrize(
+    ("total", "flags"), [(0.0, "--fix sensor_delay 0 --fix actuator_delay 0"), (0.12, "--max-delay-s 0.12")]
+)
+def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not(total, flags):
+    loose = dict.fromkeys(DELAYS, "not identifiable")
+    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(total))
+    assert (found.status, found.flags) == ("hit a bound", flags)
+    assert any("the sum of the delays is at its" in r for r in found.reasons)
+
+
+def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
+    narrow = TABLE.with_bounds({"sensor_delay": (0.0, 0.01)}).with_fixed({"actuator_delay": 0.0})
+    x, own = (narrow.low + narrow.high) / 2, narrow.names.index("sensor_delay")
+    x[own] = narrow.high[own]
+    verdicts = ["accepted"] * own + ["at a bound"]
+    made = SimpleNamespace(verdict=tuple(verdicts), misfit=1.0)
+    found = verdict.judge(scores(rows(0.1, 1.0), ONE), narrow, x, made, check(), max_delay_s=0.06)
+    assert found.flags == "--bounds sensor_delay 0 0.02"
+
+
+def test_not_identifiable():
+    found = judge(rows(0.1, 1.0), check=check(("gain",)))
+    assert found.status == "not identifiable"
+    assert "nothing in this data determines gain: excite it, fix it or give it a prior" in found.reasons
+
+
+def test_delays_are_judged_by_their_sum_which_is_named():
+    group, loose = check(DELAYS), spread(**dict.fromkeys(DELAYS, "not identifiable"))
+    found = judge(rows(0.1, 1.0), loose, group, trip=trip())
+    assert found.status == "accepted"
+    said = "sensor_delay and actuator_delay cannot be told apart from a log; what is known is their sum, 16.6 ms [16.0,"
+    assert any(r.startswith(said) for r in found.reasons)
+    found = judge(rows(0.1, 1.0), loose, group, trip=trip(error=0.02))
+    assert found.status == "not identifiable"
+    assert any(r.startswith("not even their sum is known: 16.6 ms") for r in found.reasons)
+    mixed = check(("gain", "actuator_delay"))
+    assert judge(rows(0.1, 1.0), loose, mixed, trip=trip()).status == "not identifiable"
+    assert judge(rows(0.1, 1.0), spread(), group, trip=trip(apart=True)).status == "not identifiable"
+
+
+def test_the_first_that_applies_is_the_status_and_all_are_reasons():
+    bound, x = spread(misfit=7.0, gain="at a bound"), TABLE.high.copy()
+    found = judge(rows(1.0, 1.0), bound, check(("gain",)), x=x)
+    assert found.status == "no improvement on held-out data"
+    assert len(found.reasons) == 4
+    assert "residuals are 7 times the measurement's deviation" in found.reasons[-1]
+    assert judge(rows(0.1, 1.0), bound, check(("gain",)), x=x).status == "hit a bound"
+
+
+def test_nothing_held_out_is_told():
+    found = judge(rows(0.1, 1.0, held_out=False))
+    assert found.reasons == ("nothing was held out: how well it predicts is not known",)
+
+
 def test_extrapolation_is_said():
-    found = judge(rows(0.1, 1.0), spread(), NAMES, check(), DELAYS, ["held-out data extrapolates: kp"])
+    found = judge(rows(0.1, 1.0), beyond=["held-out data extrapolates: kp"])
     assert "held-out data extrapolates: kp" in found.reasons

@@ -14,8 +14,10 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
 
 MAX_DELAY_S, PERIOD_S, SEGMENT_S = 0.03, 0.02, 0.6
-SENSOR_DELAY_S = 0.01
-"""A tick: the sensor does not interpolate."""
+SENSOR_DELAY_S = 0.004
+"""Less than a tick: when a sample is stamped, the tick behind it is not over."""
+SAMPLE_S = 0.005
+"""Samples are taken so long after the slots, in the middle of a tick."""
 BEGINS_S = (0.35, 1.35)
 TRUTH = {**VALUES, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": 0.0}
 
@@ -33,11 +35,14 @@ def episode(pair):
     goals = np.stack([0.6 * np.sin(4 * t), np.where(t % 1.0 < 0.5, 0.2, -0.1)], axis=1)
     params = pair.node_params(VALUES, [0.0, 0.0], [0.0, 0.0], jnp.zeros(1))["world"]
     _, positions, speeds, _ = play_on_c(pair, params, np.repeat(goals, 2, axis=0))
-    shown = np.concatenate([np.zeros((1, 2)), positions])[: 2 * count : 2]  # where joints are at 0, 20, 40 ms
-    fast = np.concatenate([np.zeros((1, 2)), speeds])[: 2 * count : 2]
+    ticks = pair.tick_s * np.arange(2 * count + 1)
+    shown, fast = (
+        np.stack([np.interp(t + SAMPLE_S, ticks, np.append(0.0, rows[:, j])) for j in range(2)], axis=1)
+        for rows in (positions, speeds)
+    )
     slots = np.arange(count) * round(PERIOD_S * 1e6)
     # A measurement is stamped a delay after the instant that it shows; goals leave just before their tick.
-    stamp = slots + round(SENSOR_DELAY_S * 1e6)
+    stamp = slots + round((SAMPLE_S + SENSOR_DELAY_S) * 1e6)
     sent = np.maximum(slots - 1250 - 5, 0)
     return Episode(
         steps={"sensor": steps(stamp, stamp, stamp + 10), "actuator": steps(sent, np.full(count, -1), sent)},

@@ -20,6 +20,7 @@ from sim2real.robots.loop import (
     delay_of,
     delay_parameters,
     draw_values,
+    in_a_loop,
     recorded_loop,
     simulated_loop,
 )
@@ -46,10 +47,10 @@ def drawn():
     return many(DRAWS, SPREAD_S, 500)
 
 
-def test_delays_to_identify_begin_where_the_sensor_need_not_see_the_future():
-    sensor, actuator = delay_parameters(0.06, TICK_S)
+def test_delays_to_identify_may_be_as_short_as_any_robots():
+    sensor, actuator = delay_parameters(0.06)
     assert (sensor.name, actuator.name) == DELAYS
-    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (TICK_S, 0.06, 0.0, 0.06)
+    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (0.0, 0.06, 0.0, 0.06)
     assert (sensor.side, actuator.side) == ("measurement", "command")
     assert (sensor.leaf, actuator.leaf) == ("sensor.delay", "actuator.delay")
     assert {sensor.kind, actuator.kind} == {"delay"}
@@ -57,7 +58,24 @@ def test_delays_to_identify_begin_where_the_sensor_need_not_see_the_future():
     table = ParameterTable([sensor, actuator])
     for z in (-30.0, 0.0, 30.0):
         found = table.decode(jnp.full(2, z))
-        assert TICK_S * (1 - 1e-6) <= float(found["sensor_delay"]) <= 0.06 * (1 + 1e-6)
+        assert 0.0 <= float(found["sensor_delay"]) <= 0.06 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("delays", "expected"),
+    [
+        ((0.0047, 0.0119), (0.012, 0.0046)),  # moved: a tick and the spread are for the sensor
+        ((0.02, 0.025), (0.02, 0.025)),
+        ((0.001, 0.002), (0.003, 0.0)),  # all that there is
+    ],
+)
+def test_a_closed_loop_gets_the_round_trip_as_it_can_simulate_it(delays, expected):
+    values = dict(zip(DELAYS, delays, strict=True)) | {"gain": 2.0}
+    found = in_a_loop(values, TICK_S, SPREAD_S)
+    assert [found[n] for n in DELAYS] == pytest.approx(expected)
+    assert sum(found[n] for n in DELAYS) == pytest.approx(sum(delays))
+    assert found["gain"] == 2.0
+    assert in_a_loop({"gain": 2.0}, TICK_S, SPREAD_S) == {"gain": 2.0}
 
 
 def test_a_delay_comes_from_the_nodes_parameters_where_they_have_one():
@@ -147,10 +165,12 @@ def test_without_delays_the_loop_has_none(nodes):
 
 def test_a_recorded_loop_bears_every_delay_that_may_be_identified(nodes):
     sensor, _, actuator, world = nodes
-    found = recorded_loop(sensor, actuator, world, 0.06, LEAD_S)
+    found = recorded_loop(sensor, actuator, world, 0.06, TICK_S, LEAD_S)
     assert list(found) == ["sensor", "actuator", "world"]
     assert (world.inputs["actuator"].delay_dist.min, world.inputs["actuator"].delay_dist.max) == (0.0, 0.06 + LEAD_S)
-    assert (sensor.inputs["world"].delay_dist.min, sensor.inputs["world"].delay_dist.max) == (0.0, 0.06)
+    # A tick more than the largest delay: the sensor's steps are simulated that much later.
+    from_world = sensor.inputs["world"].delay_dist
+    assert (from_world.min, from_world.max) == (0.0, pytest.approx(0.07))
     assert actuator.inputs == {}, "what it sent was recorded"
 
 

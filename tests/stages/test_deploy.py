@@ -2,10 +2,14 @@
 
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from sim2real.errors import Sim2RealError
+from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
@@ -36,7 +40,7 @@ def states(tmp_path_factory):
         steps={n: steps(len(next(iter(o.values())))) for n, o in outputs.items()}, messages={}, outputs=outputs
     )
     nowhere = tmp_path_factory.mktemp("deploy") / "truth.bin"
-    return outputs, *deploy._true_states(nowhere, {}, episode, ARM)
+    return outputs, *deploy._states(nowhere, {}, episode, ARM)
 
 
 def test_vectors_become_columns(states):
@@ -96,7 +100,7 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    assert deploy._simulate(ARM, None, {"gain": 1.0}, episode, 1.0, 1) == (None, None)
+    assert deploy._simulate(ARM, None, {"gain": 1.0}, episode, 1.0, 1, "world") == (None, None)
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -123,3 +127,30 @@ def test_a_policy_may_not_ask_for_more_than_the_robot_bears(tmp_path, name):
     deploy._load_policy(robot, bundle(1))
     with pytest.raises(Sim2RealError, match=r"(?s)this robot bears -.*hint: train a policy"):
         deploy._load_policy(robot, bundle(50))
+
+
+@struct.dataclass
+class Push(Base):
+    """A policy that always asks for the same voltage."""
+
+    volts: jax.Array
+
+    def get_action(self, obs):
+        return self.volts
+
+
+def test_simulated_measurements_are_compared_with_measurements():
+    """A sensor's reading is as old as on the robot: like is compared with like."""
+    robot, late_s = load_pipeline("pendulum").load(), 0.03
+    values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
+    episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
+    policy = Push(jnp.full(1, 1.5))
+    (t_s, world), (at_s, sensor) = (
+        deploy._simulate(robot, policy, values, episode, 0.6, 1, seen)[0][0] for seen in ("world", "sensor")
+    )
+    assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
+    assert len(sensor["th"]) == len(at_s) < len(t_s)
+    then = np.interp(at_s - late_s, t_s, world["th"])
+    moving = at_s > 0.1
+    np.testing.assert_allclose(sensor["th"][moving], then[moving], atol=1e-4)
+    assert np.abs(sensor["th"] - np.interp(at_s, t_s, world["th"]))[moving].max() > 0.03

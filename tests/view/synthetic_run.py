@@ -115,6 +115,13 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             for h in (0.1, 0.5, 1.0)
             for o in (False, True)
         ],
+        "held_out": [
+            {
+                "name": n, "column": f, "unit": "rad", "horizon_s": 1.0, "beaten_by": b,
+                "rmse": {"identified": e, "no delay": 0.2, "nominal": 0.58, "hold": None},
+            }
+            for n, f, e, b in (("th", "th", 0.0234, ["no delay"]), (EVIL, "other", 0.0117, []))
+        ],
         "free_run": [
             {
                 "model": m, "recording": 0, "begin_s": 3.3, "seconds": 1.7, "held_out": True, "field": f,

@@ -69,6 +69,13 @@ def test_the_numbers_are_there(page):
     assert {"gate.limit", "2", "ab" * 32} <= words, "configuration and hashes"
 
 
+def test_the_head_names_the_worst_position_and_a_table_has_them_all(page):
+    words = page.words
+    assert {"held-out RMSE of th, the worst of 2, after 1 s", "0.0234 rad"} <= set(words)
+    rows = words.index("Held-out RMSE of every position after 1 s, the worst first")
+    assert {"no better than", "no delay", "none", "0.01170"} <= set(words[rows : rows + 60])
+
+
 def test_the_verdict_stands_above_everything_in_words_and_colour(page):
     banner = next(attrs for _, attrs in page.elements if "banner" in (attrs.get("class") or ""))
     assert banner["class"] == "banner doubt"

@@ -1,0 +1,52 @@
+"""The way out of a bound: a command that the parser takes as it is printed."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sim2real.stages import advice, flags
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.pipeline import load_pipeline
+
+ARM = load_pipeline("arm")
+
+
+def parsed(command):
+    """Return what the command line makes of a printed command: the pipeline, and its flags."""
+    program, stage, pipeline, *rest = shlex.split(command)
+    assert (program, stage) == ("sim2real", "identify")
+    kind = flags.StageFlags[IdentifyConfig]
+    return pipeline, flags.parse(flags.StageFlags(ARM.identify), rest, "sim2real identify", "", kind=kind)
+
+
+def test_nothing_new_is_no_command():
+    assert advice.again(ARM, IdentifyConfig(), Path("runs"), "") == ""
+
+
+@pytest.mark.parametrize(
+    ("new", "bounds", "fix", "max_delay_s"),
+    [
+        ("--bounds gain 1 16", {"gain": (1.0, 16.0), "mass": (0.1, 0.4)}, {"friction": 0.5}, 0.05),
+        ("--bounds mass -3 1", {"gain": (1.0, 4.0), "mass": (-3.0, 1.0)}, {"friction": 0.5}, 0.05),
+        ("--fix gain 0", {"mass": (0.1, 0.4)}, {"gain": 0.0, "friction": 0.5}, 0.05),
+        ("--max-delay-s 0.12", {"gain": (1.0, 4.0), "mass": (0.1, 0.4)}, {"friction": 0.5}, 0.12),
+    ],
+)
+def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix, max_delay_s):
+    before = replace(
+        ARM.identify,
+        log=("my log.mcap", "b.mcap"),
+        hold_out=("c.mcap",),
+        bounds={"gain": (1.0, 4.0), "mass": (0.1, 0.4)},
+        fix={"friction": 0.5},
+        each=True,
+        generations=7,
+        horizon_s=2.5,
+        initial_state="rest",
+        max_delay_s=0.05,
+    )
+    pipeline, asked = parsed(advice.again(ARM, before, Path("elsewhere"), new))
+    assert (pipeline, asked.runs) == ("arm", Path("elsewhere"))
+    assert asked.config == replace(before, bounds=bounds, fix=fix, max_delay_s=max_delay_s)

@@ -1,0 +1,75 @@
+"""A search that is ended by a signal leaves its best so far."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.errors import Sim2RealError
+from sim2real.stages import identify
+from sim2real.stages.partial import Best
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.runs import attempts
+from sim2real.stages.train import load_parameters
+
+ROOT = Path(__file__).parents[2]
+LOG = next((ROOT / "datasets" / "pendulum").glob("*.mcap"))
+
+
+@pytest.fixture
+def pendulum():
+    return load_pipeline("pendulum")
+
+
+def interrupted(pipeline, root, monkeypatch, ending, told=True):
+    """Identify, until a signal comes after two batches of generations; return the stage's folder."""
+
+    def fit(model, logs, windows, config, table, tell=None):
+        own = table.for_recordings(1)
+        for gain, loss in ((20.0, 3.0), (21.0, 1.0), (22.0, 2.0)):
+            if told:
+                values = {p.name: gain if p.name == "gain" else p.high / 2 for p in own}
+                tell("search", 0.25, loss, own.encode(values))
+        raise ending
+
+    monkeypatch.setattr(identify, "_fit", fit)
+    config = replace(pipeline.identify, log=(str(LOG),))
+    with pytest.raises(type(ending)):
+        identify.run(pipeline, config, root, None)
+    (run,) = (root / "pendulum").iterdir()
+    return attempts(run, "identify")[0]
+
+
+@pytest.mark.parametrize(("ending", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
+def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeypatch, ending, code):
+    stage = interrupted(pendulum, tmp_path, monkeypatch, ending)
+    assert (stage.manifest["status"], stage.manifest["exit_code"]) == ("interrupted", code)
+    path = stage.output("partial")
+    document = json.loads(path.read_text())
+    assert document["verdict"]["status"] == "interrupted"
+    assert "75% of search" in document["verdict"]["reasons"][0]
+    rows = {p["name"]: p for p in document["parameters"]}
+    assert rows["gain"]["estimate"] == pytest.approx(21.0, rel=1e-4)
+    assert rows["gain"]["verdict"] == "interrupted"
+    assert document["search"]["loss"] == 1.0
+    with pytest.raises(Sim2RealError, match="holds no identified parameters"):
+        load_parameters(path, pendulum)
+
+
+def test_nothing_is_left_where_nothing_was_found_or_something_else_went_wrong(pendulum, tmp_path, monkeypatch):
+    stage = interrupted(pendulum, tmp_path / "early", monkeypatch, KeyboardInterrupt(), told=False)
+    assert not (stage.folder / "partial.json").exists()
+    stage = interrupted(pendulum, tmp_path / "error", monkeypatch, ValueError("broken"))
+    assert stage.manifest["status"] == "failed"
+    assert not (stage.folder / "partial.json").exists()
+
+
+def test_a_refinement_goes_on_from_the_searchs_best_and_counts_from_then_on():
+    best = Best()
+    best.advance("search", 1.0, 0.5, np.zeros(1))
+    best.advance("refine", 0.1, 0.6, np.ones(1))  # of all segments; the search had seen a batch
+    assert (best.loss, best.z.tolist()) == (0.6, [1.0])
+    best.advance("refine", 0.1, 0.7, np.full(1, 2.0))
+    assert (best.loss, best.done) == (0.6, {"search": 1.0, "refine": 0.2})
