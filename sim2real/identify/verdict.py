@@ -93,7 +93,7 @@ class Score:
         if closest is None or not math.isfinite(self.others[closest]):
             return said
         best = self.others[closest]
-        return f"{said}, {self.own / best:.2g} times {closest}" if best else f"{said}, {closest} by nothing"
+        return f"{said}, {self.own / best:.2g} times {closest}" if best else f"{said}, where {closest} is exact"
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def _on_held_out(found: Sequence[Score]) -> tuple[bool, list[str]]:
         return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
     reasons = [f"{ahead} {s}" for s in found[:_MOST]]
     if len(found) > _MOST:
-        reasons.append(f"{len(found) - _MOST} more positions improve further")
+        reasons.append(f"{len(found) - _MOST} more positions improve at least as much")
     if not any(s.needs_delay for s in found):
         reasons.append("without any delay it predicts as well: this data does not need one")
     return True, reasons
