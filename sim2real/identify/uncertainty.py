@@ -181,11 +181,14 @@ def time_shift(table: ParameterTable) -> np.ndarray:
 def _verdict(error: float, margin: float, shifts: bool) -> str:
     """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width.
 
-    What time can be shifted from or to is not identifiable, however little room its bounds leave for that.
+    What time can be shifted from or to is not identifiable, however little room its bounds leave for that. What lies at
+    a bound would go further, however narrow the bounds and vague the estimate beside them.
     """
-    if error > VAGUE or shifts:
+    if shifts:
         return "not identifiable"
-    return "at a bound" if margin < AT_BOUND else "accepted"
+    if margin < AT_BOUND:
+        return "at a bound"
+    return "not identifiable" if error > VAGUE else "accepted"
 
 
 def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:

@@ -159,7 +159,8 @@ def judge(
     """
     improves, reasons = _on_held_out(found)
     reasons += beyond
-    bounded, flags = _at_bounds(table, x, spread, trip, max_delay_s)
+    known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
+    bounded, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)
@@ -208,13 +209,22 @@ def _errors(s: Score) -> str:
 
 
 def _at_bounds(
-    table: ParameterTable, x: np.ndarray, spread: Uncertainty, trip: RoundTrip | None, max_delay_s: float
+    table: ParameterTable,
+    x: np.ndarray,
+    spread: Uncertainty,
+    known: Sequence[int],
+    trip: RoundTrip | None,
+    max_delay_s: float,
 ) -> tuple[list[str], str]:
-    """Return a sentence about each estimate at a bound, and the flags to identify again with."""
+    """Return a sentence about each estimate at a bound, and the flags to identify again with.
+
+    Only of what is ``known``: what nothing determines may lie anywhere, and other bounds do not help.
+    """
     said, flags = [], []
-    for c, at, verdict, low, high in zip(table.columns, x, spread.verdict, table.low, table.high, strict=True):
-        if verdict == "at a bound":
-            upper = bool(high - at < at - low)
+    for i in known:
+        c = table.columns[i]
+        if spread.verdict[i] == "at a bound":
+            upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
             out = way_out(c.parameter, upper, max_delay_s)
             bound = c.parameter.high if upper else c.parameter.low
             said.append(_bound(c.label, "upper" if upper else "lower", f"{bound:.4g} {c.parameter.unit}", out))

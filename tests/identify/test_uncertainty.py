@@ -150,6 +150,13 @@ def test_an_estimate_at_a_bound_is_told():
         assert -1.0 <= found.low[0] < found.high[0] <= 1.0
 
 
+def test_what_lies_at_a_narrow_bound_is_no_less_at_a_bound_for_being_vague():
+    table = ParameterTable([Parameter("a", "1", 0.0, -0.1, 0.1, "linear")])
+    noise = np.random.default_rng(0).normal(size=(2, 10, 1))
+    at = Linearised(noise, np.ones((2, 10, 1, 1)), np.diag(12.0 / table.span**2), np.array([0.1]), noise)
+    assert from_linearised(stub(table), at).verdict == ("at a bound",)
+
+
 @pytest.fixture
 def delayed():
     """A gain and two delays of which the residuals know the sum alone."""

@@ -171,6 +171,11 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     assert found.flags == "--bounds sensor_delay 0 0.02"
 
 
+def test_what_nothing_determines_is_not_helped_by_other_bounds():
+    found = judge(rows(0.1, 1.0), spread(gain="at a bound"), check(("gain",)), x=TABLE.high)
+    assert (found.status, found.flags) == ("not identifiable", "")
+
+
 def test_not_identifiable():
     found = judge(rows(0.1, 1.0), check=check(("gain",)))
     assert found.status == "not identifiable"
@@ -193,11 +198,11 @@ def test_delays_are_judged_by_their_sum_which_is_named():
 
 def test_the_first_that_applies_is_the_status_and_all_are_reasons():
     bound, x = spread(misfit=7.0, gain="at a bound"), TABLE.high.copy()
-    found = judge(rows(1.0, 1.0), bound, check(("gain",)), x=x)
+    found = judge(rows(1.0, 1.0), bound, check(("offset",)), x=x)
     assert found.status == "no improvement on held-out data"
     assert len(found.reasons) == 4
     assert "residuals are 7 times the measurement's deviation" in found.reasons[-1]
-    assert judge(rows(0.1, 1.0), bound, check(("gain",)), x=x).status == "hit a bound"
+    assert judge(rows(0.1, 1.0), bound, check(("offset",)), x=x).status == "hit a bound"
 
 
 def test_nothing_held_out_is_told():
