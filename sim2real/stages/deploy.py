@@ -26,6 +26,7 @@ from sim2real.runtime.clock import realtime
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, progress, table
+from sim2real.stages.interruption import patiently
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
 from sim2real.stages.rig import announce, warn
@@ -66,7 +67,9 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         # What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
         seen = "world" if truth.is_file() else "sensor"
         with progress(None, "simulate the same"):
-            simulated, timeline = _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs), seen)
+            simulated, timeline = patiently(
+                lambda: _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs), seen)
+            )
         result = _compare(robot, real, simulated)
         result["gap"] += _age_rows(robot, episodes, timeline)
         stage.output("result", "result.json").write_text(

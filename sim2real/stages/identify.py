@@ -30,6 +30,7 @@ from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.stages import advice, identified
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, shown
+from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
@@ -77,11 +78,11 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     ):
         begin = time.monotonic()
         with _told("identify", best) as told:
-            found = _fit(model, logs, windows, config, table, told)
-        note("identify: errors, predictions and baselines")
-        at = uncertainty.linearise(found.problem, found.z)
-        seconds = time.monotonic() - begin
-        samples, free, rows = _predicted(model, logs, config, table, found)
+            found = patiently(lambda: _fit(model, logs, windows, config, table, told))
+        with progress(None, "identify: errors, predictions and baselines"):
+            at = patiently(lambda: uncertainty.linearise(found.problem, found.z))
+            seconds = time.monotonic() - begin
+            samples, free, rows = patiently(lambda: _predicted(model, logs, config, table, found))
         outside = beyond(model, logs.episodes, windows, config.settle_s + config.horizon_s)
         document = _judged(pipeline, logs, stage.run_dir, config, found, at, rows["prediction"], outside)
         document["verdict"]["next"] = advice.again(pipeline, config, root, document["verdict"].pop("flags"))
