@@ -144,13 +144,7 @@ def open_stage(
         UsageError: When there is no such stage, or the pipeline's name is none for a folder.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
-    if stage not in STAGES:
-        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
-    # The name may come out of a file of somebody else's: it must not lead out of the folder of runs.
-    if not _NAME.fullmatch(pipeline):
-        raise UsageError(
-            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
-        )
+    _check_names(pipeline, stage)
     hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
     hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
@@ -186,6 +180,16 @@ def open_stage(
         if told is error:
             raise
         raise told from error
+
+
+def _check_names(pipeline: str, stage: str) -> None:
+    """Refuse what is no stage, and a pipeline's name that may lead out of the folder of runs: files hold such names."""
+    if stage not in STAGES:
+        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
+    if not _NAME.fullmatch(pipeline):
+        raise UsageError(
+            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
+        )
 
 
 def portable(path: Path, run_dir: Path) -> str:

@@ -393,15 +393,6 @@ def test_a_burst_that_the_window_does_not_hold_is_an_error():
     assert not bursty_episodes(nodes, calm).any()
 
 
-@pytest.mark.parametrize(("policy_hz", "world_hz", "rows"), [(50, 50, 2), (50, 200, 2), (30, 100, 3)])
-def test_a_gpu_s_pass_holds_the_pattern_of_steps_and_ticks(policy_hz, world_hz, rows, monkeypatch):
-    nodes, supervisor = topologies.robot(jax_hash_node, world_hz, policy_hz)
-    timeline = draw(nodes, DURATION_S)
-    assert CompiledGraph(nodes, supervisor, timeline).rows_per_pass == 1  # on a CPU
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert CompiledGraph(nodes, supervisor, timeline).rows_per_pass == rows
-
-
 # The report
 
 
