@@ -34,6 +34,7 @@ def compose(model: Model) -> Any:
     out = _compose(model)
     models = list(model.all_models())
     merge.apply(out, merge.merged(models))
+    _point_aside(out, models)
     if len(models) > 1 and any(m._spec.keys for m in models):
         keyframes.restore(out, models)
     return out
@@ -87,6 +88,7 @@ def _copy(model: Model) -> Any:
         for native, _ in unnamed:
             native.name = ""
     merge.clear(out, model.settings())
+    merge.inherit_compiler(out, model)
     if model.attachments or model.parent_model is not None:  # else MuJoCo's own handling of keyframes does
         for key in list(out.keys):
             out.delete(key)
@@ -113,7 +115,26 @@ def _unnamed(model: Model) -> Any:
 def _name_seen_from(model: Model, target: Any) -> str:
     if target.root is model:
         return target._native.name
+    if _is_aside(model, target):  # any element of its kind does for now: what names nothing is dropped
+        own = model.find_all(target.kind, exclude_attachments=True)
+        if own:
+            return own[0]._native.name
     return model_name(target, model)
+
+
+def _is_aside(model: Model, target: Any) -> bool:
+    """Return whether an element is in the same world as a model, but neither in it nor below it."""
+    above = _above(target.root)
+    return target.root is not model and model not in above and target.root.root_model is model.root_model
+
+
+def _point_aside(out: Any, models: list[Model]) -> None:
+    """Let elements name what is beside or above their own model, now that all models are in one spec."""
+    for model in models:
+        for (native, key), target in model.references.items():
+            if _is_aside(model, target):
+                element = model.find_handle(native)
+                setattr(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
 
 
 def model_name(target: Any, model: Model) -> str:

@@ -109,3 +109,22 @@ def apply(spec: Any, found: Settings) -> None:
     """Set settings."""
     for (path, name), value in found.items():
         setattr(_part(spec, path), name, value)
+
+
+_INHERITED = ("boundmass", "boundinertia", "balanceinertia", "inertiafromgeom", "autolimits", "alignfree", "fitaabb")
+"""Settings of the compiler that hold for attached models too, unless they have their own."""
+
+
+def inherit_compiler(spec: Any, model: Any) -> None:
+    """Give a copy of a model's spec the settings of the compiler that the models above have and it has not."""
+    default = _blank().compiler
+    for name in _INHERITED:
+        above = model.parent_model
+        while above is not None and getattr(spec.compiler, name) == getattr(default, name):
+            setattr(spec.compiler, name, getattr(above._spec.compiler, name))
+            above = above.parent_model
+
+
+@functools.cache
+def _blank() -> Any:
+    return mj.MjSpec()

@@ -8,7 +8,7 @@ from collections import OrderedDict
 from typing import Any
 
 from sim2real.composer import define
-from sim2real.composer.observation.base import Generic, Observable
+from sim2real.composer.observation.observable.base import Generic, Observable
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
 """What ``set_options`` can set."""

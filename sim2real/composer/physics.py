@@ -334,6 +334,11 @@ class Physics:
             renderer.update_scene(self.data.ptr, camera_id, scene_option)
             return renderer.render()
 
+    @property
+    def contexts(self) -> None:
+        """None: there is no rendering context to keep up to date; what is drawn follows the model by itself."""
+        return
+
     def free(self) -> None:
         """Drop the model and the state."""
         for binding in self._bindings.values():

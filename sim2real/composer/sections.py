@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import builder, translate
+from sim2real.composer import builder, schema, translate
+from sim2real.composer.defaults import Defaults
 from sim2real.composer.element import Element
+from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
@@ -24,6 +26,8 @@ _LISTS = {
     "custom": ("numeric", "text", "tuple"),
     "keyframe": ("key",),
 }
+SECTION_OF = {kind: section for section, kinds in _LISTS.items() for kind in kinds}
+"""Kind of element -> the section that it stands in."""
 _INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 _CHOICES = {
     "integrator": {k: getattr(mj.mjtIntegrator, f"mjINT_{k.upper()}") for k in _INTEGRATORS},
@@ -71,6 +75,9 @@ class Section:
             raise UsageError(f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}")
         return builder.add_to_section(self._model, kind, tag, attrs)
 
+    def _everything(self) -> list[Element]:
+        return [e for kind in self._kinds for e in self._model.find_all(kind)]
+
     def all_children(self) -> list[Element]:
         """Return the elements of this section, without those of attached models."""
         return [e for kind in self._kinds for e in self._model.find_all(kind, exclude_attachments=True)]
@@ -83,8 +90,8 @@ class Section:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if name in self._kinds:
-            return self._model.find_all(name, exclude_attachments=True)
+        if self._kinds and any(path[:1] == (self._name,) and path[1:] == (name,) for path in schema.tables()):
+            return ElementList(lambda: [e for e in self._everything() if name in (e.tag, e.kind)], name)
         if self._name == "compiler" and name == "angle":
             return "degree" if self._native.degree else "radian"
         if self._name == "visual":
@@ -103,6 +110,7 @@ class Section:
         self._model.touch_settings()
         if self._name == "compiler" and name == "angle":
             native.degree = value == "degree"
+            self._model.records.say_angle()
             return
         if self._name == "size" and name == "memory" and isinstance(value, str):
             value = int(float(value.rstrip("kKmMgG")) * _BYTES.get(value[-1].lower(), 1))
@@ -153,32 +161,6 @@ class Flags:
         raised = (value == "enable") == (field == "enableflags")
         setattr(self._model._spec.option, field, bits | bit if raised else bits & ~bit)
         self._model.touch_settings()
-
-
-class Defaults:
-    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another."""
-
-    __slots__ = ("_model", "name")
-
-    def __init__(self, model: Model, name: str) -> None:
-        self._model, self.name = model, name
-
-    def add(self, tag: str, dclass: str) -> Defaults:
-        """Add a class below this one."""
-        if tag != "default":
-            raise UsageError(f"a <{tag}> cannot be added to <default>", hint="set default.<tag>.<attribute>")
-        spec = self._model._spec
-        spec.add_default(dclass, spec.find_default(self.name))
-        self._model.touch()
-        return Defaults(self._model, dclass)
-
-    def __getattr__(self, tag: str) -> Element:
-        if tag.startswith("__"):
-            raise AttributeError(tag)
-        native = getattr(self._model._spec.find_default(self.name), tag, None)
-        if native is None:
-            raise AttributeError(f"<default> has no elements {tag!r}")
-        return Element(self._model, tag, native)
 
 
 def make_sections(model: Model) -> dict[str, Any]:

@@ -2,8 +2,8 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.observation.base import AGGREGATORS
 from sim2real.composer.observation.observable import Generic, MJCFFeature
+from sim2real.composer.observation.observable.base import AGGREGATORS
 
 
 class Pair(composer.Observables):

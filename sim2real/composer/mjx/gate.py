@@ -7,8 +7,8 @@ from typing import Any
 
 from mujoco import mjx
 
-from sim2real.composer.observation.base import MujocoCamera, Observable
-from sim2real.composer.observation.mjcf import MJCFCamera
+from sim2real.composer.observation.observable.base import MujocoCamera, Observable
+from sim2real.composer.observation.observable.mjcf import MJCFCamera
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState
-from sim2real.composer.observation.base import Observable
+from sim2real.composer.observation.observable.base import Observable
 from sim2real.composer.variation import deterministic, distributions
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError

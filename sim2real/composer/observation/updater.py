@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.observation.base import Observable
+from sim2real.composer.observation.observable.base import Observable
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
 
@@ -46,8 +46,8 @@ class Channel:
         self.size = int(size() if callable(size) else size)
         self._strip = strip and self.size == 1
         self._pad_initial = pad_initial
-        # Samples that no observation can hold are left out, unless taking them may have a side effect.
-        self._skips = observable.corruptor is None and not callable(self._interval) and not callable(self._delay)
+        # Samples that no observation can hold are left out, as long as it is known beforehand which ones these are.
+        self._skips = not callable(self._interval) and not callable(self._delay)
         self._arrivals: list[tuple[int, int, np.ndarray]] = []
         self._count = 0
         self._next = 0
