@@ -234,4 +234,4 @@ def _add_inertial(model: Model, body: Element, attrs: dict[str, Any]) -> Element
         model.touch()
         translate.assign(body._native, "body", names[key], value)
     body._native.explicitinertial = True
-    return Element(model, "inertial", body._native)
+    return model.handle("inertial", body._native)

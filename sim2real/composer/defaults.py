@@ -128,6 +128,12 @@ class DefaultElement(Element):
     def __repr__(self) -> str:
         return f"<defaults of {self._tag} in {self._owner!r}>"
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DefaultElement) and (self._owner, self._tag) == (other._owner, other._tag)
+
+    def __hash__(self) -> int:
+        return hash((self._owner, self._tag))
+
     @property
     def tag(self) -> str:
         """The tag in MJCF."""

@@ -64,7 +64,7 @@ class Element:
     """One element of a model; made by ``Model.find``, ``find_all`` and ``add``.
 
     Reading and setting any other attribute reads and sets it in the model's ``MjSpec``, in MJCF's spelling or in
-    MuJoCo's own. Two handles on the same element are equal.
+    MuJoCo's own; what was not given reads as None, whatever the defaults are. There is one handle on each element.
 
     Attributes:
         root: The model that the element belongs to.
@@ -80,12 +80,6 @@ class Element:
     def __init__(self, root: Model, kind: str, native: Any) -> None:
         for name, value in (("root", root), ("kind", kind), ("_native", native)):
             object.__setattr__(self, name, value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Element) and self._native is other._native and self.kind == other.kind
-
-    def __hash__(self) -> int:
-        return hash(self._native)
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.full_identifier!r}>"
@@ -227,7 +221,7 @@ class Element:
             if name == "freejoint":
                 return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
             if name == "inertial":
-                return Element(self.root, "inertial", native) if native.explicitinertial else None
+                return self.root.handle("inertial", native) if native.explicitinertial else None
         said = self.root.given(self)
         if name not in said.values and name in schema.attributes(kind, said.tag):
             return None

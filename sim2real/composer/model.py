@@ -157,9 +157,10 @@ class Model:
 
     def handle(self, kind: str, native: Any) -> Element:
         """Return the handle on an element of the spec; always the same one."""
-        found = self._handles.get(native)
+        key = (native, kind) if kind == "inertial" else native  # a part of its body
+        found = self._handles.get(key)
         if found is None:
-            found = self._handles[native] = Element(self, kind, native)
+            found = self._handles[key] = Element(self, kind, native)
         return found
 
     def given(self, element: Element) -> Given:
