@@ -15,9 +15,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 
-PARTS = ("build", "reset", "steps", "engines", "speed")
+PARTS = ("build", "reset", "step", "steps", "engines", "speed")
 ENTITIES, LINKS, STEPS = 20, 6, 1000
 ROW = 10
 """Resets in a row: a single one would be timed with what the program before it left in the caches."""
@@ -32,7 +33,9 @@ def kit(package: str) -> Any:
     """Return the composer and the models of ``sim2real`` or ``dm_control``."""
     models = "sim2real.composer.mjcf" if package == "sim2real" else "dm_control.mjcf"
     return SimpleNamespace(
-        composer=importlib.import_module(f"{package}.composer"), mjcf=importlib.import_module(models)
+        composer=importlib.import_module(f"{package}.composer"),
+        mjcf=importlib.import_module(models),
+        observable=importlib.import_module(f"{package}.composer.observation.observable"),
     )
 
 
@@ -67,15 +70,17 @@ def world(k: Any, entities: int = ENTITIES) -> Any:
     return arena
 
 
-def medians(programs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+def medians(
+    programs: dict[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
     """Run programs in turn, once to warm up; return the median of the seconds that each takes."""
     times: dict[str, list[float]] = {name: [] for name in programs}
     for i in range(repeats + 1):
         for name, program in programs.items():
-            begin = time.perf_counter()
+            begin = clock()
             program()
             if i:
-                times[name].append(time.perf_counter() - begin)
+                times[name].append(clock() - begin)
     return {name: statistics.median(t) for name, t in times.items()}
 
 
@@ -127,6 +132,81 @@ def reset(repeats: int) -> list[dict[str, Any]]:
             theirs = ms["dm_control", every]
             text = f"dm_control: {theirs:.3g} ms, {told}" + ("" if every else ": MuJoCo alone takes nearly all of it")
             rows.append(row(f"compose/{name}/over_dm_control", round(theirs / mine, 1), "1", text, ">= 100"))
+    return rows
+
+
+def push(k: Any, camera: bool, shadows: bool = True) -> Any:
+    """Return a task with what tasks have: an arm on a floor, observables of which one is late, hooks, a reward."""
+    arm = robot(k)
+    joints, tip = arm.mjcf_model.find_all("joint"), arm.mjcf_model.find("body", f"link{LINKS - 1}")
+    actuators = arm.mjcf_model.find_all("actuator")
+    gyro = arm.mjcf_model.sensor.add("gyro", site=tip.add("site", name="tip"))
+
+    class Push(k.composer.Task):
+        """Move the tip of the arm with little effort."""
+
+        def __init__(self) -> None:
+            self._arena, self._effort = k.composer.Arena(), 0.0
+            model = self._arena.mjcf_model
+            model.option.noslip_iterations = 0
+            model.worldbody.add("geom", type="plane", size=[2, 2, 0.1])
+            model.worldbody.add("light", pos=[0, 0, 4])
+            eye = model.worldbody.add("camera", pos=[0, -2, 1], xyaxes=[1, 0, 0, 0, 0.4, 1])
+            if not shadows:
+                model.visual.quality.shadowsize = 0
+            self._arena.attach(arm)
+            feature, add = k.observable.MJCFFeature, arm.observables.add_observable
+            add("angles", feature("qpos", joints, delay=3, buffer_size=2))
+            add("speeds", feature("qvel", joints))
+            add("gyro", feature("sensordata", gyro, update_interval=2, buffer_size=4, aggregator="mean"))
+            add("tip", feature("xpos", tip))
+            if camera:
+                add("eye", k.observable.MJCFCamera(eye, height=48, width=64))
+            self.set_timesteps(0.02, 0.004)
+
+        @property
+        def root_entity(self) -> Any:
+            return self._arena
+
+        def initialize_episode(self, physics: Any, random_state: Any) -> None:
+            physics.bind(joints).qpos = random_state.uniform(-0.1, 0.1, LINKS)
+            self._effort = 0.0
+
+        def after_substep(self, physics: Any, random_state: Any) -> None:
+            self._effort += np.abs(physics.bind(joints).qvel * physics.bind(actuators).force).sum()
+
+        def get_reward(self, physics: Any) -> Any:
+            return physics.bind(tip).xpos[2] - 0.01 * self._effort
+
+    return Push()
+
+
+def step(repeats: int) -> list[dict[str, Any]]:
+    """Return how long control steps of a task take, in processor time: with a camera as well, where there is OpenGL."""
+    rows = []
+    for name, count, camera, shadows, goal in (
+        ("step", 200, False, True, ">= 1.3"),
+        ("camera", 5, True, True, ">= 1.2"),
+        ("camera_without_shadows", 20, True, False, ">= 1.2"),
+    ):
+        programs: dict[str, Callable[[], Any]] = {}
+        try:
+            for package, k in kits().items():
+                env = k.composer.Environment(push(k, camera, shadows), random_state=0)
+                env.reset()
+                programs[package] = lambda env=env, count=count: [env.step(np.full(LINKS, 0.3)) for _ in range(count)]
+            ms = {p: 1e3 * s / count for p, s in medians(programs, repeats, time.process_time).items()}
+        except (mujoco.FatalError, ImportError, RuntimeError) as error:
+            print(f"no images here, {name} is left out: {error}", file=sys.stderr)
+            continue
+        told = "a control step of five physics steps, an arm with four observables, processor time"
+        told += ", and an image of 48 x 64" if camera else ""
+        rows.append(row(f"compose/{name}_ms", round(ms["sim2real"], 3), "ms", told))
+        if "dm_control" in ms:
+            over = round(ms["dm_control"] / ms["sim2real"], 2)
+            rows.append(
+                row(f"compose/{name}/over_dm_control", over, "1", f"dm_control: {ms['dm_control']:.3g} ms", goal)
+            )
     return rows
 
 
@@ -300,6 +380,7 @@ def main(arguments: list[str]) -> dict[str, Any]:
     parts: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "build": lambda: build(3 * options.repeats),
         "reset": lambda: reset(options.repeats),
+        "step": lambda: step(options.repeats),
         "steps": steps,
         "engines": engines,
         "speed": lambda: speed(options.copies, options.repeats),

@@ -25,7 +25,7 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
     name = attrs.get("name")
     if name is not None:
         model.check_name(kind, name)
-    foreign = _foreign(model, attrs.get("dclass"))
+    foreign = _foreign(model, attrs["dclass"]) if "dclass" in attrs else None
     defaults = None if foreign else _defaults(model, attrs)
     if tag == "freejoint":
         native = body._native.add_freejoint()
@@ -39,8 +39,8 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
         if name is not None:
             native.name = name
         named = REFERENCES.get(kind, ())
-        for key, value in attrs.items():
-            if value is None or key in ("name", "dclass", "class_"):
+        for key, value in tuple(attrs.items()):
+            if key in ("name", "dclass"):
                 continue
             if key in named or isinstance(value, Element):
                 model.refer(element, translate.native_name(kind, key), value)
@@ -51,7 +51,7 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
     except Exception:
         remove(model, element)
         raise
-    if body.is_frame:  # joints of a frame are called after it
+    if kind == "joint" and body.is_frame:  # joints of a frame are called after it
         native.name = body._native.name + (f"{name}/" if name else "")
     model.touch()
     return element
@@ -77,10 +77,13 @@ def _lay_down(model: Model, element: Element) -> None:
     """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
     native, kind, said = element._native, element.kind, model.given(element)
     given = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
-    if kind == "actuator" and said.tag != "general":  # shortcuts set these altogether, whatever the class says
+    if (
+        kind == "actuator" and said.tag != "general" and model.records.has_defaults
+    ):  # shortcuts set these altogether, whatever the class says
         translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
         given = _inherited(model, element) | given
-    given = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in given.items()}
+    if kind in files.KINDS:
+        given = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in given.items()}
     references = [k for k in REFERENCES.get(kind, ()) if k in given]
     _fill(model, element, *translate.from_xml(kind, said.tag, given, references))
 
@@ -203,11 +206,12 @@ def remove(model: Model, element: Element) -> None:
 
 
 def _given(attrs: dict[str, Any]) -> dict[str, Any]:
-    """Return the attributes that were given a value, under PyMJCF's names."""
-    found = {k: v for k, v in attrs.items() if v is not None}
-    if "class_" in found:
-        found["dclass"] = found.pop("class_")
-    return found
+    """Leave those attributes that were given a value, under PyMJCF's names."""
+    if "class_" in attrs:
+        attrs["dclass"] = attrs.pop("class_")
+    for name in [name for name, value in attrs.items() if value is None]:
+        del attrs[name]
+    return attrs
 
 
 def _foreign(model: Model, dclass: Any) -> Any:

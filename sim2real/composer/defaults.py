@@ -175,9 +175,7 @@ class DefaultElement(Element):
                 available = ", ".join(sorted(known))
                 raise AttributeError(f"{name!r} is not a valid attribute for <{self._tag}>. Available: {available}")
             fixed, _ = translate.from_xml(self.kind, self._tag, {name: value}, ())
-        said = self.root.given(self)
-        said.tag = self._tag
-        said.note(name, value)
+        self.root.records.note_default(self, self._tag, name, value)
         for follower in self._followers(name):
             if follower.kind == "actuator" and follower.tag != "general" and not isinstance(follower, DefaultElement):
                 self.root.builder.rebuild(self.root, follower)

@@ -14,6 +14,8 @@ from sim2real.errors import UsageError
 if TYPE_CHECKING:
     from sim2real.composer.model import Model
 
+KINDS = ("mesh", "hfield", "texture", "skin")
+"""Elements that may come from files."""
 _LISTS = {"meshes": "meshdir", "hfields": "meshdir", "skins": "meshdir", "textures": "texturedir"}
 
 

@@ -90,11 +90,25 @@ class Records:
 
     Args:
         document: What the model was made from, where it is known.
+        is_blank: Whether it was made from nothing: then nothing is given but what is noted.
     """
 
-    def __init__(self, document: Document | None = None) -> None:
-        self._document = document
+    def __init__(self, document: Document | None = None, is_blank: bool = False) -> None:
+        self._document, self.is_blank = document, is_blank
+        self._has_defaults = False
         self._of: dict[Any, Given] = {}
+
+    @property
+    def has_defaults(self) -> bool:
+        """Whether there may be a class of defaults that says something."""
+        return self._has_defaults or not self.is_blank
+
+    def note_default(self, element: Element, tag: str, name: str, value: Any) -> None:
+        """Note that an attribute of a class of defaults was set."""
+        self._has_defaults = True
+        said = self.of(element)
+        said.tag = tag
+        said.note(name, value)
 
     @property
     def is_silent_on_angles(self) -> bool:
@@ -136,8 +150,14 @@ class Records:
         key = (native, kind) if kind == "inertial" else native
         found = self._of.get(key)
         if found is None:
-            found = self._of[key] = self._written(native, kind) or read(native, kind, element.class_defaults)
+            found = self._of[key] = self._found(element)
         return found
+
+    def _found(self, element: Element) -> Given:
+        native, kind = element._native, element.kind
+        if self.is_blank and kind != "inertial":
+            return Given(_tag(native, kind))
+        return self._written(native, kind) or read(native, kind, element.class_defaults)
 
     def _written(self, native: Any, kind: str) -> Given | None:
         words = native.info.split()

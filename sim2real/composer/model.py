@@ -47,7 +47,7 @@ class Model:
         self.references: dict[tuple[Any, str], Element] = {}
         self._handles: dict[Any, Element] = {}
         self._order: dict[Any, int] = {}
-        self.records = Records(document)
+        self.records = Records(document, is_blank=spec is None)
         self._clock = itertools.count(_ADDED_LATER)
         self._sections = make_sections(self)
 
@@ -99,7 +99,7 @@ class Model:
 
     def expose(self) -> None:
         """Note that the spec may change from now on without the model knowing."""
-        self._revision = None
+        self._revision, self.records.is_blank = None, False
 
     def touch(self) -> None:
         """Note a change."""

@@ -111,13 +111,25 @@ def read(native: Any, kind: str, key: str) -> Any:
 
 def is_plain(native: Any, kind: str, key: str, value: Any) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
+    found = _PLAIN.get((kind, key))
+    if found is None:
+        found = _PLAIN[kind, key] = _is_plain(native, kind, key)
+    return found[isinstance(value, str)]
+
+
+_PLAIN: dict[tuple[str, str], tuple[bool, bool]] = {}
+"""Kind and attribute -> whether a value can be put there: one that is no text, one that is."""
+
+
+def _is_plain(native: Any, kind: str, key: str) -> tuple[bool, bool]:
     if key in _ORIENTATIONS and hasattr(native, "alt"):
-        return True
+        return True, True
     name = native_name(kind, key)
     if name in _SKIPPED or not hasattr(native, name):
-        return False
-    is_keyword = isinstance(value, str) and type(getattr(native, name)).__module__.endswith("_enums")
-    return not is_keyword or (kind, key) in _ENUMS or isinstance(getattr(native, name), mj.mjtLimited)
+        return False, False
+    value = getattr(native, name)
+    is_keyword = type(value).__module__.endswith("_enums") and not isinstance(value, mj.mjtLimited)
+    return True, not is_keyword or (kind, key) in _ENUMS
 
 
 def reset(native: Any, source: Any, names: tuple[str, ...] | None = None) -> None:
