@@ -58,6 +58,9 @@ REFERENCES = {
 
 _IN_BODIES = (*TREE_KINDS, "inertial")
 _LISTED = frozenset(TREE_KINDS)
+_UNROLLED = ("composite", "flexcomp", "replicate", "frame", "attach", "plugin")
+FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
+"""The way to elements that programs cannot add."""
 
 
 class Element:
@@ -161,7 +164,8 @@ class Element:
                 hint="add it to the attached model, or to a body of the model it is attached to",
             )
         if self.kind != "body" or KIND_OF_TAG.get(tag, tag) not in _IN_BODIES:
-            raise UsageError(f"a <{tag}> cannot stand in the {self.kind} {self.full_identifier!r}")
+            hint = FROM_DOCUMENTS if tag in _UNROLLED else f"bodies hold {', '.join(_IN_BODIES)}"
+            raise UsageError(f"a <{tag}> cannot be added to the {self.kind} {self.full_identifier!r}", hint=hint)
         if tag == "freejoint" and not (self._native.parent is not None and self._native.parent.parent is None):
             raise UsageError(
                 f"a free joint is only for bodies that stand in the world, {self.full_identifier!r} does not",

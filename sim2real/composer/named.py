@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,11 @@ class NamedArray(NDArrayOperatorsMixin):
 
     def __setitem__(self, key: Any, value: Any) -> None:
         self._array[self.rows(key)] = value
+
+    @property
+    def axes(self) -> Any:
+        """``axes.row.convert_key_item(names)`` returns the rows of some names, as in dm_control."""
+        return SimpleNamespace(row=SimpleNamespace(convert_key_item=self._rows))
 
     def rows(self, key: Any) -> Any:
         """Return the numeric index for a key of names, elements or numbers.

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.composer import builder, schema, translate
 from sim2real.composer.defaults import Defaults
-from sim2real.composer.element import Element
+from sim2real.composer.element import FROM_DOCUMENTS, Element
 from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
@@ -72,7 +72,10 @@ class Section:
             raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
         kind = self._kinds[0] if len(self._kinds) == 1 else tag
         if kind not in self._kinds:
-            raise UsageError(f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}")
+            hint = FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
+            raise UsageError(
+                f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}", hint=hint
+            )
         return builder.add_to_section(self._model, kind, tag, attrs)
 
     def _everything(self) -> list[Element]:
@@ -163,11 +166,33 @@ class Flags:
         self._model.touch_settings()
 
 
+class DocumentsOnly:
+    """A section that documents may have, and programs cannot add to: plug-ins, skins and flexes.
+
+    Args:
+        name: The section.
+    """
+
+    __slots__ = ("_name",)
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def add(self, tag: str, **attrs: Any) -> Any:
+        """Refuse.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=FROM_DOCUMENTS)
+
+
 def make_sections(model: Model) -> dict[str, Any]:
     """Return the sections of a model by name."""
     found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in _LISTS.items()}
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
         found[name] = Section(model, name, path)
     found["statistic"] = Section(model, "statistic", "stat")
+    found |= {name: DocumentsOnly(name) for name in ("extension", "deformable")}
     found["default"] = Defaults(model, "main")
     return found
