@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import keyframes, merge, translate
+from sim2real.composer import files, keyframes, merge, translate
 from sim2real.composer.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
@@ -31,8 +32,9 @@ def compile_model(model: Model) -> Any:
 
 def compose(model: Model) -> Any:
     """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options."""
-    out = _compose(model)
     models = list(model.all_models())
+    with files.renamed(model) if any(map(files.is_mixed, models)) else contextlib.nullcontext():
+        out = _compose(model)
     merge.apply(out, merge.merged(models))
     _point_aside(out, models)
     if len(models) > 1 and any(m._spec.keys for m in models):

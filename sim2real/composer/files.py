@@ -86,12 +86,16 @@ def _named(model: Model) -> Iterator[tuple[Any, Asset]]:
 def renamed(model: Model) -> Iterator[None]:
     """Call every file of a model, and of what is attached to it, as ``collect`` does, in a ``with`` block."""
     undo: list[tuple[Any, str, str]] = []
+    added: list[tuple[Any, str]] = []
     try:
         for one in model.all_models():
             for native, asset in list(_named(one)):
+                name = asset.get_vfs_filename()
                 undo.append((native, "file", native.file))
-                one._spec.assets.setdefault(asset.get_vfs_filename(), asset.contents)
-                native.file = asset.get_vfs_filename()
+                if name not in one._spec.assets:
+                    added.append((one._spec, name))
+                    one._spec.assets[name] = asset.contents
+                native.file = name
             for key in ("meshdir", "texturedir", "modelfiledir"):
                 undo.append((one._spec, key, getattr(one._spec, key)))
                 setattr(one._spec, key, "")
@@ -99,6 +103,26 @@ def renamed(model: Model) -> Iterator[None]:
     finally:
         for owner, key, value in undo:
             setattr(owner, key, value)
+        for spec, name in added:
+            del spec.assets[name]
+
+
+def is_mixed(model: Model) -> bool:
+    """Return whether a model has files in memory and others on disk: attached, MuJoCo looks for all in one place."""
+    assets = model._spec.assets
+    if not assets:
+        return False
+    return any(n.file and n.file not in assets for plural in _LISTS for n in getattr(model._spec, plural))
+
+
+def flatten(spec: Any) -> None:
+    """Take the folders off the names of a composed spec's files: MuJoCo puts those of attached models into some."""
+    for plural in _LISTS:
+        for native in getattr(spec, plural):
+            name = native.file.rsplit("/", 1)[-1]
+            if name != native.file and native.file in spec.assets:
+                spec.assets[name] = spec.assets[native.file]
+                native.file = name
 
 
 def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | None = None) -> None:

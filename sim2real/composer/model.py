@@ -357,6 +357,7 @@ class Model:
         """Return the composed model as MJCF; its files are called as ``get_assets`` calls them."""
         with files.renamed(self):
             spec = compose.compose(self)
+        files.flatten(spec)
         spec.compile()
         return spec.to_xml()
 

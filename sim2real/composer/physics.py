@@ -154,20 +154,27 @@ class Physics:
         """Return a copy of act, shape ``(na,)``."""
         return self.data.ptr.act.copy()
 
-    def get_state(self) -> np.ndarray:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
-        data = self.data.ptr
-        return np.concatenate([data.qpos, data.qvel, data.act])
+    def get_state(self, sig: int | None = None) -> np.ndarray:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or what ``mj_getState`` does."""
+        model, data = self.model.ptr, self.data.ptr
+        if sig is None:
+            return np.concatenate([data.qpos, data.qvel, data.act])
+        state = np.empty(mj.mj_stateSize(model, sig))
+        mj.mj_getState(model, data, state, sig)
+        return state
 
     state = get_state
 
-    def set_state(self, state: Any) -> None:
-        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+    def set_state(self, state: Any, sig: int | None = None) -> None:
+        """Set what ``get_state`` returns.
 
         Raises:
             UsageError: When the shape is another.
         """
         data, model = self.data.ptr, self.model.ptr
+        if sig is not None:
+            mj.mj_setState(model, data, np.asarray(state, float), sig)
+            return
         expected = (model.nq + model.nv + model.na,)
         if np.shape(state) != expected:
             raise UsageError(f"Input physics state has shape {np.shape(state)}. Expected {expected}.")

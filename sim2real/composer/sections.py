@@ -71,7 +71,7 @@ class Section:
         if not self._kinds:
             raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
         kind = self._kinds[0] if len(self._kinds) == 1 else tag
-        if kind not in self._kinds:
+        if kind not in self._kinds or tag == "plugin":
             hint = FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
             raise UsageError(
                 f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}", hint=hint

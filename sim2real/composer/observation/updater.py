@@ -57,7 +57,8 @@ class Channel:
         self.size = int(size() if callable(size) else size)
         self._strip = strip and self.size == 1
         self._pad_initial = pad_initial
-        # Samples that no observation can hold are left out, as long as it is known beforehand which ones these are.
+        # Samples that no observation can hold are left out, as in dm_control and on MJX: reading one may compute the
+        # physics anew, which other observables would show.
         self._is_regular = not callable(self._interval) and not callable(self._delay)
         self._gaps: dict[int, tuple[int, int]] = {}
         self._steps_per_read = steps_per_read
