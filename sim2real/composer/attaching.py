@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import warnings
+import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sim2real.composer.element import Element
     from sim2real.composer.model import Model
 
+_log = logging.getLogger(__name__)
 _POSE = ("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis")
 
 
@@ -66,11 +67,12 @@ def _warn_of_degrees(parent: Model, model: Model) -> None:
     turning = [j for j in model.find_all("joint", exclude_attachments=True) if j._native.type in _TURNING]
     angular = [j for j in turning if {"range", "ref", "springref"} & model.given(j).values.keys()]
     if angular and model._spec.compiler.degree:
-        warnings.warn(
-            f"the document of model {model.model!r} does not say in which unit its angles are: they are read in "
-            f"degrees, as MuJoCo reads them, also below {parent.model!r}, whose unit is the radian. "
-            "hint: set compiler.angle of the model to 'degree' or 'radian'",
-            stacklevel=5,
+        _log.warning(
+            "the document of model %r does not say in which unit its angles are: they are read in degrees, as MuJoCo "
+            "reads them, also below %r, whose unit is the radian. hint: set compiler.angle of the model to 'degree' or "
+            "'radian'",
+            model.model,
+            parent.model,
         )
 
 

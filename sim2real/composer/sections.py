@@ -93,7 +93,7 @@ class Section:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if self._kinds and any(path[:1] == (self._name,) and path[1:] == (name,) for path in schema.tables()):
+        if name in self._kinds or (self._kinds and (self._name, name) in schema.tables()):
             return ElementList(lambda: [e for e in self._everything() if name in (e.tag, e.kind)], name)
         if self._name == "compiler" and name == "angle":
             return "degree" if self._native.degree else "radian"

@@ -162,7 +162,6 @@ def play(composer, task, steps=10):
     return found
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("name", TASKS)
 def test_tasks_give_the_same_rewards_and_observations(oracle, ours, name, monkeypatch):
     monkeypatch.setattr("dm_control.mujoco.engine.Physics.contexts", None)  # which would need OpenGL
