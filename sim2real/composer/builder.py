@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import files, schema, translate
+import numpy as np
+
+from sim2real.composer import files, given, schema, translate
 from sim2real.composer.element import KIND_OF_TAG, REFERENCES, Element
 from sim2real.composer.translate import TREE_KINDS
 from sim2real.errors import UsageError
@@ -76,16 +78,17 @@ def add_to_section(model: Model, kind: str, tag: str, attrs: dict[str, Any]) -> 
 def _lay_down(model: Model, element: Element) -> None:
     """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
     native, kind, said = element._native, element.kind, model.given(element)
-    given = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
-    if (
-        kind == "actuator" and said.tag != "general" and model.records.has_defaults
-    ):  # shortcuts set these altogether, whatever the class says
+    values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
+    is_shortcut = kind == "actuator" and said.tag != "general"
+    if is_shortcut and model.records.has_defaults:  # they set these altogether, whatever the class says
         translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
-        given = _inherited(model, element) | given
+        values = _inherited(model, element) | values
     if kind in files.KINDS:
-        given = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in given.items()}
-    references = [k for k in REFERENCES.get(kind, ()) if k in given]
-    _fill(model, element, *translate.from_xml(kind, said.tag, given, references))
+        values = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in values.items()}
+    references = [k for k in REFERENCES.get(kind, ()) if k in values]
+    _fill(model, element, *translate.from_xml(kind, said.tag, values, references))
+    for key in translate.ORIENTATIONS & values.keys():
+        translate.assign(native, kind, key, values[key])
 
 
 def _inherited(model: Model, element: Element) -> dict[str, Any]:
@@ -136,6 +139,7 @@ def rebuild(model: Model, element: Element, key: str | None = None) -> None:
         translate.reset(native, element.class_defaults, (translate.native_name(kind, key),))
         model.touch()
         return
+    _catch_up(element, said.values)
     native_only = {k: said.values.pop(k) for k in list(said.values) if k not in known and k not in ("name", "dclass")}
     foreign = _foreign(model, said.values.get("dclass"))
     translate.reset(native, getattr(foreign.native, kind) if foreign else element.class_defaults)
@@ -147,6 +151,19 @@ def rebuild(model: Model, element: Element, key: str | None = None) -> None:
             translate.assign(native, kind, extra, value)
     finally:
         said.values.update(native_only)
+
+
+def _catch_up(element: Element, said: dict[str, Any]) -> None:
+    """Take over the numbers that an element holds now: arrays may have been written into."""
+    for name in said:
+        if name in ("name", "dclass") or name in REFERENCES.get(element.kind, ()):
+            continue
+        try:
+            value = translate.read(element._native, element.kind, name)
+        except AttributeError:
+            continue
+        if isinstance(value, np.ndarray):
+            said[name] = np.array(given.show(value, said[name]))
 
 
 def reclass(model: Model, element: Element, name: str, value: Any) -> None:

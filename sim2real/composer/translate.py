@@ -23,6 +23,8 @@ _ORIENTATIONS = {
     "xyaxes": mj.mjtOrientation.mjORIENTATION_XYAXES,
     "zaxis": mj.mjtOrientation.mjORIENTATION_ZAXIS,
 }
+ORIENTATIONS = frozenset(_ORIENTATIONS)
+"""Attributes that say how something is turned, besides ``quat``."""
 _RENAMED = {
     "geom": {"mesh": "meshname", "hfield": "hfieldname", "fluidcoef": "fluid_coefs"},
     "joint": {

@@ -1,6 +1,7 @@
 """What was said of elements, and what PyMJCF's users look for: lists by tag, classes of defaults, files."""
 
 import mujoco
+import numpy as np
 import pytest
 
 from sim2real import composer
@@ -98,6 +99,13 @@ def test_elements_follow_their_classes_of_defaults(servo):
     assert servo.find("geom", "ball").dclass == thin
     servo.find("geom", "ball").set_attributes(dclass="main", size=[0.1])
     assert servo.compile().body("tip").mass != 1.5
+    plain = servo.find("geom", "plain")
+    plain.size = [0.1]
+    plain.size[0] = 0.4
+    plain.dclass = "main"  # lays it down anew, as it is now
+    model = servo.compile()
+    assert model.geom("plain").size[0] == 0.4
+    np.testing.assert_allclose(model.geom("plain").quat, [0.5**0.5, 0, 0, 0.5**0.5])
     with pytest.raises(UsageError, match="cannot be taken back"):
         servo.default.geom.rgba = None
 
