@@ -57,6 +57,7 @@ REFERENCES = {
 
 
 _IN_BODIES = (*TREE_KINDS, "inertial")
+_set = object.__setattr__
 _LISTED = frozenset(TREE_KINDS)
 _UNROLLED = ("composite", "flexcomp", "replicate", "frame", "attach", "plugin")
 FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
@@ -81,8 +82,9 @@ class Element:
     _native: Any
 
     def __init__(self, root: Model, kind: str, native: Any) -> None:
-        for name, value in (("root", root), ("kind", kind), ("_native", native)):
-            object.__setattr__(self, name, value)
+        _set(self, "root", root)
+        _set(self, "kind", kind)
+        _set(self, "_native", native)
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.full_identifier!r}>"
