@@ -111,7 +111,10 @@ def _fill(model: Model, element: Element, fixed: Mapping[str, Any], named: dict[
         if isinstance(value, Element):
             model.refer(element, key, value)
         elif isinstance(value, list) and any(isinstance(v, Element) for v in value):
-            setattr(native, key, [v.name if isinstance(v, Element) else v for v in value])
+            setattr(native, key, ["" if isinstance(v, Element) else v for v in value])
+            for i, item in enumerate(value):
+                if isinstance(item, Element):
+                    model.refer(element, f"{key}[{i}]", item)
         else:
             setattr(native, key, value)
     model.touch()

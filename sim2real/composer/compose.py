@@ -82,7 +82,7 @@ def _copy(model: Model) -> Any:
         for native, name in unnamed:
             native.name = name
         for (native, key), target in model.references.items():
-            setattr(native, key, _name_seen_from(model, target))
+            translate.point(native, key, _name_seen_from(model, target))
         out = spec.copy()
         for kind in _MAY_DANGLE:
             _restore(spec, out, kind)
@@ -136,7 +136,7 @@ def _point_aside(out: Any, models: list[Model]) -> None:
         for (native, key), target in model.references.items():
             if _is_aside(model, target):
                 element = model.find_handle(native)
-                setattr(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
+                translate.point(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
 
 
 def model_name(target: Any, model: Model) -> str:

@@ -179,6 +179,10 @@ class Model:
         """Return the handle on an element that has one."""
         return self._handles[native]
 
+    def all_children(self) -> list[Any]:
+        """Return the sections that hold elements, and the world."""
+        return [self._sections[name] for name in dict.fromkeys(SECTION_OF.values())] + [self.worldbody]
+
     def check_name(self, kind: str, name: str | None) -> None:
         """Refuse a name with a slash in it: slashes separate the names of models."""
         if name and "/" in name:
@@ -300,7 +304,7 @@ class Model:
             target = target.name or ""
         else:
             self.references.pop((element._native, key), None)
-        setattr(element._native, key, target or "")
+        translate.point(element._native, key, target or "")
         self.touch()
 
     def referenced(self, element: Element, name: str) -> Any:

@@ -22,7 +22,7 @@ _LISTS = {
     "equality": ("equality",),
     "tendon": ("tendon",),
     "contact": ("pair", "exclude"),
-    "asset": ("mesh", "material", "texture", "hfield"),
+    "asset": ("mesh", "material", "texture", "hfield", "skin"),
     "custom": ("numeric", "text", "tuple"),
     "keyframe": ("key",),
 }
@@ -53,6 +53,11 @@ class Section:
 
     def __repr__(self) -> str:
         return f"<{self._name} of model {self._model.model!r}>"
+
+    @property
+    def tag(self) -> str:
+        """The tag in MJCF."""
+        return self._name.rsplit(".", 1)[-1]
 
     @property
     def _native(self) -> Any:
@@ -167,7 +172,7 @@ class Flags:
 
 
 class DocumentsOnly:
-    """A section that documents may have, and programs cannot add to: plug-ins, skins and flexes.
+    """A section that documents may have, and programs cannot add to: plug-ins and flexes.
 
     Args:
         name: The section.

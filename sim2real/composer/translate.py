@@ -111,6 +111,17 @@ def read(native: Any, kind: str, key: str) -> Any:
     return value
 
 
+def point(native: Any, key: str, name: str) -> None:
+    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several."""
+    key, _, number = key.partition("[")
+    if not number:
+        setattr(native, key, name)
+        return
+    names = list(getattr(native, key))
+    names[int(number[:-1])] = name
+    setattr(native, key, names)
+
+
 def is_plain(native: Any, kind: str, key: str, value: Any) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
     found = _PLAIN.get((kind, key))

@@ -160,6 +160,18 @@ def test_defaults_taken_back(oracle, ours):
                 del root.default.geom.rgba
 
 
+def test_folders_of_assets(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.composer.Arena().mjcf_model
+        root.compiler.texturedir = "../locomotion/arenas/assets/outdoor_natural"
+        root.asset.add("texture", name="grass", type="2d", file="OutdoorGrassFloorD.png")
+        if kit is oracle:
+            assert kit.mjcf.Physics.from_mjcf_model(root).model.ntex == 1
+        else:
+            with pytest.raises(ValueError, match="Error opening file"):
+                kit.mjcf.Physics.from_mjcf_model(root)
+
+
 @pytest.mark.parametrize("name", ["insert", "include_copy", "is_same_as", "to_xml", "namescope"])
 def test_tree_surgery(oracle, ours, name):
     assert [hasattr(model(kit), name) for kit in (oracle, ours)] == [True, False]

@@ -145,6 +145,18 @@ def test_references_beside_their_model_resolve(servo):
     assert model.sensor("servo/where").objid == model.body("other/tip").id
 
 
+def test_textures_of_attached_models_are_found():
+    root, house = mjcf.RootElement(model="root"), mjcf.RootElement(model="house")
+    brick = house.asset.add("texture", name="brick", type="2d", builtin="flat", width=8, height=8)
+    root.attach(house)
+    wall = root.asset.add("material", name="wall", texture=brick)
+    root.worldbody.add("geom", size=[1], material=wall)
+    house.model = "villa"
+    model = root.compile()
+    assert wall.texture is brick
+    assert (model.tex("villa/brick").id, 0 in model.mat_texid[0]) == (0, True)
+
+
 def test_files_are_collected_and_written(tmp_path):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "tip.obj").write_text(
@@ -210,8 +222,7 @@ def test_what_only_documents_can_hold_is_refused_by_name():
     for add in (
         lambda: root.worldbody.add("composite", type="cable"),
         lambda: root.extension.add("plugin", plugin="mujoco.pid"),
-        lambda: root.asset.add("skin", file="body.skn"),
         lambda: root.actuator.add("plugin", plugin="mujoco.pid"),
     ):
-        with pytest.raises(UsageError, match=r"(composite|plugin|skin)(.|\n)*mjcf\.from_xml_string"):
+        with pytest.raises(UsageError, match=r"(composite|plugin)(.|\n)*mjcf\.from_xml_string"):
             add()
