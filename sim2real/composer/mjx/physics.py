@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from sim2real.composer import layout
@@ -20,21 +19,6 @@ from sim2real.errors import UsageError
 
 _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
 """MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
-
-
-def keyframe_state(model: Any, keyframe_id: int | None) -> dict[str, Any]:
-    """Return the state of a keyframe, or the initial one: field -> value.
-
-    Raises:
-        UsageError: When there is no such keyframe.
-    """
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    if keyframe_id is not None:
-        if not 0 <= keyframe_id < model.nkey:
-            raise UsageError(f"`keyframe_id` must be between 0 and {model.nkey - 1} inclusive, got: {keyframe_id}")
-        mujoco.mj_resetDataKeyframe(model, data, keyframe_id)  # pyright: ignore[reportAttributeAccessIssue]
-    names = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "time")
-    return {name: np.array(getattr(data, name)) for name in names}
 
 
 class DataView:
@@ -221,35 +205,6 @@ class MjxPhysics:
     def velocity(self) -> Any:
         """Return qvel, shape ``(nv,)``."""
         return self.mjx_data.qvel
-
-    def get_state(self) -> Any:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
-        data = self.mjx_data
-        return jnp.concatenate([data.qpos, data.qvel, data.act])
-
-    state = get_state
-
-    def set_state(self, state: Any) -> None:
-        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
-
-        Raises:
-            UsageError: When the shape is another.
-        """
-        sizes = (self.host.nq, self.host.nv, self.host.na)
-        if jnp.shape(state) != (sum(sizes),):
-            raise UsageError(f"Input physics state has shape {jnp.shape(state)}. Expected {(sum(sizes),)}.")
-        for name, part in zip(("qpos", "qvel", "act"), jnp.split(state, np.cumsum(sizes)[:-1]), strict=True):
-            self.replace("data", name, part)
-
-    def reset(self, keyframe_id: int | None = None) -> None:
-        """Return to the initial state, or to a keyframe."""
-        start = keyframe_state(self.host, keyframe_id)
-        if keyframe_id is None:
-            start["qpos"] = self.mjx_model.qpos0
-        for name, value in start.items():
-            self.replace("data", name, value)
-        self.variables.clear()
-        self.forward(actuation=False)
 
     def step(self) -> None:
         """Advance by a time step."""

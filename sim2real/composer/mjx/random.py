@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import UsageError
-
 
 class Registry:
     """Which variations keep something from draw to draw, such as the position of a random walk.
@@ -99,23 +97,10 @@ class JaxRandomState:
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
 
-    def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
-        """Return items of ``a``, or integers below it; ``p`` are their probabilities."""
+    def choice(self, a: Any, size: Any = None) -> Any:
+        """Return items of ``a``, or integers below it."""
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
-        return jax.random.choice(self.next_key(), values, _shape(size), replace, None if p is None else jnp.asarray(p))
-
-    def shuffle(self, x: Any) -> None:
-        """Put the items of a list, numbers or arrays of one shape, in random order.
-
-        Raises:
-            UsageError: When it is an array: those of JAX cannot be changed.
-        """
-        if not isinstance(x, list):
-            raise UsageError(
-                f"MJX cannot shuffle a {type(x).__name__} in place",
-                hint="x = random_state.permutation(x) does the same on both engines",
-            )
-        x[:] = list(self.permutation(jnp.asarray(x)))
+        return jax.random.choice(self.next_key(), values, _shape(size))
 
     def permutation(self, x: Any) -> Any:
         """Return ``x``, or the integers below it, in random order."""

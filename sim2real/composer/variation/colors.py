@@ -41,12 +41,7 @@ class HsvVariation(Variation):
     def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
         """Return a colour."""
         h, s, v, alpha = evaluate(self._channels, initial_value, current_value, random_state)
-        xp = namespace(h, s, v, alpha)
-        if xp is np:
-            return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
-        turned = (xp.array([5.0, 3.0, 1.0]) + 6.0 * h) % 6.0  # what colorsys does, without branches
-        rgb = v * (1.0 - s * xp.clip(xp.minimum(turned, 4.0 - turned), 0.0, 1.0))
-        return xp.concatenate([rgb, xp.reshape(xp.asarray(alpha, rgb.dtype), (1,))])
+        return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, HsvVariation) and self._channels == other._channels
