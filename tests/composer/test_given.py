@@ -54,6 +54,15 @@ def test_what_was_not_said_reads_as_none(servo):
     assert set(geom.get_attributes()) == {"name", "size", "contype"}
 
 
+def test_of_a_spec_what_differs_from_its_class_counts_as_said():
+    model = mjcf.RootElement(spec=mujoco.MjSpec.from_string(SERVO))
+    shell, ball, joint = (model.find(k, n) for k, n in (("geom", "shell"), ("geom", "ball"), ("joint", "hinge")))
+    assert (shell.size[0], shell.contype, shell.rgba, ball.size) == (0.2, 0, None, None)
+    assert (joint.limited, joint.range.tolist(), joint.damping) == ("true", [-1, 1], None)
+    assert model.sensor.gyro["gyro"].tag == "gyro"
+    assert model.find("actuator", "servo").tag == "general"
+
+
 def test_what_a_program_says_is_said(servo):
     geom = servo.find("body", "tip").add("geom", size=[0.1, 0.2], type="sphere", rgba=None)
     assert (geom.size.tolist(), geom.type, geom.rgba, geom.mass) == ([0.1, 0.2], "sphere", None, None)
