@@ -87,6 +87,7 @@ def _copy(model: Model) -> Any:
         for native, _ in unnamed:
             native.name = ""
     merge.clear(out, model.settings())
+    out.compiler.degree = model.reads_degrees()
     if model.attachments or model.parent_model is not None:  # else MuJoCo's own handling of keyframes does
         for key in list(out.keys):
             out.delete(key)
