@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.composer import translate
+from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
@@ -190,7 +191,7 @@ class Element:
             raise AttributeError(name)
         native, kind = self._native, self.kind
         if kind == "body" and name in TREE_KINDS:
-            return self.find_all(name, immediate_children_only=True)
+            return ElementList(lambda: self.find_all(name, immediate_children_only=True), name)
         if kind == "body" and name == "freejoint":
             return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
         if name in REFERENCES.get(kind, ()):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -142,6 +142,13 @@ class Overrides:
         """Return whether a setting holds over that of another model."""
         when, covered = self._noted.get(key, (-1, ()))
         return model in covered and when > model.overrides.since(key)
+
+    def among(self, twins: Mapping[Any, Any]) -> Overrides:
+        """Return the same of a copied model, among the copies of the others: model -> its copy."""
+        made = Overrides()
+        for key, (when, covered) in self._noted.items():
+            made._noted[key] = when, weakref.WeakSet(twins[m] for m in covered if m in twins)
+        return made
 
     def __bool__(self) -> bool:
         return bool(self._noted)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sim2real.composer import builder, compose, merge, parse, translate
+from sim2real.composer import builder, compose, duplicate, merge, parse, translate
 from sim2real.composer.element import KIND_OF_TAG, Element
 from sim2real.composer.sections import Section, make_sections
 from sim2real.composer.translate import TREE_KINDS, mj
@@ -89,6 +89,12 @@ class Model:
 
     def __repr__(self) -> str:
         return f"<model {self.model!r}>"
+
+    def __copy__(self) -> Model:
+        return duplicate.duplicate(self)
+
+    def __deepcopy__(self, memo: Any) -> Model:
+        return duplicate.duplicate(self)
 
     @property
     def spec(self) -> Any:

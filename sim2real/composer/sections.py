@@ -8,6 +8,7 @@ import numpy as np
 
 from sim2real.composer import builder, merge, translate
 from sim2real.composer.element import Element
+from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
@@ -84,7 +85,7 @@ class Section:
         if name.startswith("__"):
             raise AttributeError(name)
         if name in self._kinds:
-            return self._model.find_all(name, exclude_attachments=True)
+            return ElementList(lambda: self._model.find_all(name, exclude_attachments=True), name)
         if self._name == "compiler" and name == "angle":
             return "degree" if self._model.reads_degrees() else "radian"
         if self._name == "visual":

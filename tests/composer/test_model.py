@@ -1,5 +1,6 @@
 """Composition: attach, detach, rename, references between models, options, keyframes, assets."""
 
+import copy
 from types import SimpleNamespace
 
 import mujoco
@@ -284,3 +285,77 @@ def test_programs_write_angles_in_the_unit_of_the_world(oracle, ours):
     own.worldbody.add("geom", size=[0.1], euler=[0, 0, 90])
     arena.mjcf_model.attach(own)
     np.testing.assert_allclose(arena.mjcf_model.compile().geom_quat[-1], [2**-0.5, 0, 0, 2**-0.5])
+
+
+def test_lists_of_elements_are_alive(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement()
+        body = root.worldbody.add("body")
+        for name in "abc":
+            body.add("geom", name=name, type="sphere", size=[0.1])
+        shown = body.geom
+        del body.geom[0]
+        del body.geom["c"]
+        assert [g.name for g in shown] == ["b"]
+        body.geom.clear()
+        assert (len(shown), root.find_all("geom")) == (0, [])
+        root.worldbody.add("site", name="s")
+        root.sensor.add("gyro", site="s")
+        root.sensor.all_children()[0].remove()
+        assert root.sensor.all_children() == []
+    model = mjcf.from_xml_string(ARM)
+    model.actuator.actuator.clear()
+    assert model.compile().nu == 0
+    with pytest.raises(KeyError, match=r"no <body> 'hip'. Available: upper"):
+        _ = model.worldbody.body["hip"]
+
+
+def test_copies_are_independent():
+    """With what is attached, references across models, names of unnamed elements and their order."""
+    root, hand = mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
+    root.attach(hand)
+    root.option.gravity = [0, 0, -9.81]
+    root.worldbody.add("geom", type="box", size=[1, 1, 1])
+    root.equality.add("weld", body1="upper", body2=hand.find("body", "finger"), active="false")
+    before = root.to_xml_string()
+    for other in (copy.copy(root), copy.deepcopy(root)):
+        assert other.to_xml_string() == before
+        other.model = "other"
+        other.find("body", "upper").pos = [1, 2, 3]
+        other.find("attached_model", "hand").worldbody.add("geom", name="more", size=[0.1])
+        other.find("attached_model", "hand").find("geom", "palm").name = "back"
+        assert other.compile().geom("hand/back").id == root.compile().geom("hand/palm").id
+        assert other.worldbody.geom[-1].full_identifier == "//unnamed_geom_4"
+        assert other.compile().opt.gravity[2] == -9.81
+    assert (root.model, root.to_xml_string()) == ("arm", before)
+
+
+@pytest.mark.parametrize(
+    ("section", "tag", "attributes", "match"),
+    [
+        (
+            "actuator",
+            "motor",
+            {"joint": "nope"},
+            r"actuator 'x' of model 'arm' names the joint 'nope'.*Available: should",
+        ),
+        ("sensor", "gyro", {"site": "nope"}, "sensor 'x' of model 'arm' names the site 'nope'"),
+        ("contact", "exclude", {"body1": "nope", "body2": "upper"}, "exclude 'x' of model 'arm' names the body 'nope'"),
+    ],
+)
+@pytest.mark.parametrize("attached", [False, True])
+def test_elements_that_name_nothing_are_refused_by_name(attached, section, tag, attributes, match):
+    model = mjcf.from_xml_string(ARM)
+    getattr(model, section).add(tag, name="x", **attributes)
+    if attached:
+        mjcf.RootElement().attach(model)
+    with pytest.raises(UsageError, match=match):
+        model.root_model.compile()
+
+
+def test_references_across_models_may_have_names():
+    root, hand = mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
+    root.attach(hand)
+    root.equality.add("weld", name="w", body1="upper", body2=hand.find("body", "finger"))
+    model = root.compile()
+    assert model.equality("w").obj2id == model.body("hand/finger").id
