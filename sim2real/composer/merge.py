@@ -71,7 +71,8 @@ def _entry(value: Any) -> tuple[Any, Any]:
 def _bits() -> dict[str, tuple[str, dict[str, int]]]:
     """Return part -> where MuJoCo notes which of its fields a document wrote, and the bit of each field."""
     structs: dict[str, Any] = {"option": STRUCTS["mjOption"]}
-    structs |= {f"visual.{f.name}": f.type for f in STRUCTS["mjVisual"].fields}
+    parts: Any = STRUCTS["mjVisual"].fields
+    structs |= {f"visual.{part.name}": part.type for part in parts}
     found = {}
     for path in PARTS:
         struct = structs.get(path.rstrip("_"))

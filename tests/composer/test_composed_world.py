@@ -180,8 +180,18 @@ def test_brax_runs_the_task_with_its_own_wrappers(environment):
     first, (done, _, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
     assert first.shape == (3, 3)
     assert [np.flatnonzero(d).tolist() for d in np.asarray(done)] == [[9, 19]] * 3
-    np.testing.assert_array_equal(observations[:, 9], first)
+    starts = np.stack([first, observations[:, 9], observations[:, 19]])[..., 2]
+    assert len(np.unique(starts)) == 9  # every episode of every copy starts somewhere else
     assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
+
+
+def test_brax_may_save_the_fresh_starts(environment):
+    """Episodes then start from the same state, and go on with numbers of their own."""
+    env = composer.BraxEnv(environment, fresh_starts=False)
+    first = jax.jit(env.reset)(jax.random.key(0))
+    step = jax.jit(lambda key: env.step(first.replace(info={**first.info, "key": key}), jnp.ones(1)))
+    keys = [jax.random.key_data(step(jax.random.key(i)).pipeline_state.key) for i in range(2)]
+    assert (keys[0] != keys[1]).any()
 
 
 @pytest.fixture(scope="module")

@@ -46,8 +46,9 @@ class Channel:
         self.size = int(size() if callable(size) else size)
         self._strip = strip and self.size == 1
         self._pad_initial = pad_initial
-        # Samples that no observation can hold are left out, unless taking them may have a side effect.
-        self._skips = observable.corruptor is None and not callable(self._interval) and not callable(self._delay)
+        # Samples that no observation can hold are left out, as in dm_control and on MJX: reading one may compute the
+        # physics anew, which other observables would show.
+        self._skips = not callable(self._interval) and not callable(self._delay)
         self._arrivals: list[tuple[int, int, np.ndarray]] = []
         self._count = 0
         self._next = 0
