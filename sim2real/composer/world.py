@@ -140,9 +140,17 @@ class ComposedWorld(BaseWorld):
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Take a control step under the newest action."""
         action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
-        state = self.environment.step(step_state.state, action, self._model(step_state.params))
+        before = step_state.state
+        state = self.environment.step(before, action, self._model(step_state.params))
+        # What is over stays over: others look only now and then.
+        truncated = jnp.where(before.done, before.truncated, state.truncated)
+        state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
         return new, self.output(state)
+
+    def ends(self, state: State) -> tuple[Any, Any]:
+        """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""
+        return state.done & ~state.truncated, state.truncated
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:
         found = (graph_state or GraphState()).params.get(self.name)

@@ -213,3 +213,10 @@ def test_controls_of_another_size_are_refused():
     state = jax.eval_shape(environment.reset, jax.random.key(0))
     with pytest.raises(UsageError, match=r"there are 1 controls, and set_control was given an array of shape \(3,\)"):
         jax.eval_shape(environment.step, state, jnp.zeros(3))
+
+
+def test_rewards_may_be_arrays():
+    environment = made(get_reward=lambda task, physics: physics.bind(task.tip).xpos[:2])
+    state = jax.eval_shape(environment.reset, jax.random.key(0))
+    after = jax.eval_shape(environment.step, state, jnp.zeros(1))
+    assert state.reward.shape == after.reward.shape == (2,)

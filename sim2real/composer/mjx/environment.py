@@ -135,6 +135,7 @@ class MjxEnvironment:
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
         self._steady = True
+        self._shapes: tuple[Any, Any] = ((), ())  # of rewards and discounts
         self._discover()
 
     def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
@@ -178,6 +179,7 @@ class MjxEnvironment:
         self._dry = True
         with self._hooks.watching((self.task, *self.task.iter_entities())):
             state, after = self._trace(key, action)
+            self._shapes = after.reward.shape, after.discount.shape
             if self._stays_dirty:
                 state, after = self._trace(key, action)
         self._dry = False
@@ -219,8 +221,9 @@ class MjxEnvironment:
         observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
-        zero, no = jnp.zeros((), data.qpos.dtype), jnp.zeros((), bool)
-        outcome = (observation, zero, zero + 1, no, no, failed)
+        reward, discount = (jnp.zeros(shape, data.qpos.dtype) for shape in self._shapes)
+        no = jnp.zeros((), bool)
+        outcome = (observation, reward, discount + 1, no, no, failed)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def step(self, state: State, action: Any, model: Any = None) -> State:
