@@ -118,6 +118,17 @@ def test_wrong_rates_and_parameters_are_refused():
         composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
 
 
+def test_parameters_bring_the_constants_that_follow_from_them():
+    task = Push()
+    cart = task.root_entity.mjcf_model.find("body", "cart")
+    world = composer.ComposedWorld("world", task, parameters={"mass": (cart, "mass")})
+    params = world.init_params().replace(values={"mass": jnp.array(2.0)})
+    model = jax.jit(lambda params: world._model(params, starts=True))(params)
+    np.testing.assert_allclose(model.body_invweight0[1], [0.5, 0.0], rtol=1e-6)
+    state = jax.eval_shape(lambda: world.init_state(None, GraphState(params={"world": params})))
+    assert {"body_invweight0", "body_subtreemass", "dof_invweight0"} <= set(state.leaves)  # steps go on with them
+
+
 class Witness(Push):
     """Leaves the start as it is, and keeps what it finds there."""
 

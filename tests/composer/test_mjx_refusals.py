@@ -160,6 +160,15 @@ def test_constants_of_a_program_are_read_only(write, name):
         made(**start(write))
 
 
+def test_options_belong_to_each_copy():
+    def initialize_episode(self, physics, random_state):
+        physics.model.opt.gravity = random_state.uniform(-1, 1, 3)
+
+    environment = made(initialize_episode=initialize_episode)
+    states = jax.eval_shape(jax.vmap(environment.reset), jax.random.split(jax.random.key(0), 4))
+    assert states.leaves["opt.gravity"].shape == (4, 3)
+
+
 def test_the_compiled_model_is_read_only():
     environment = made()
     with pytest.raises(ValueError, match="read-only"):
