@@ -141,7 +141,7 @@ class ComposedWorld(BaseWorld):
         """Take a control step under the newest action."""
         action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
         before = step_state.state
-        state = self.environment.step(before, action, self._model(step_state.params))
+        state: Any = self.environment.step(before, action, self._model(step_state.params))
         # What is over stays over: others look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
