@@ -10,6 +10,7 @@ from dm_env import specs
 
 from sim2real import composer
 from sim2real.composer import mjcf
+from sim2real.composer.variation.colors import HsvVariation
 from sim2real.errors import UsageError
 
 ROD = """
@@ -17,6 +18,7 @@ ROD = """
   <worldbody><body name="rod"><joint name="hinge" axis="0 1 0"/><geom name="rod" type="capsule" fromto="0 0 0 .3 0 0"
     size=".02"/><site name="tip" pos=".3 0 0"/></body></worldbody>
   <actuator><motor joint="hinge" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+  <keyframe><key name="up" qpos=".7" qvel=".2" time="1.5"/></keyframe>
 </mujoco>
 """
 
@@ -229,3 +231,31 @@ def test_rewards_may_be_arrays():
     state = jax.eval_shape(environment.reset, jax.random.key(0))
     after = jax.eval_shape(environment.step, state, jnp.zeros(1))
     assert state.reward.shape == after.reward.shape == (2,)
+
+
+def test_states_keyframes_colours_and_choices():
+    """What hooks of dm_control's call; the same numbers as on C where nothing is drawn."""
+
+    def begin(self, physics, random_state):
+        physics.reset(0)
+        physics.set_state(0.5 * physics.get_state())
+        hue = 0.6 + 0.0 * physics.bind(self.hinge).qpos[0]
+        physics.bind(self.geom).rgba = HsvVariation(hue, 0.5, 0.8)(random_state=random_state)
+        drawn = physics.np.asarray(random_state.choice(3, size=4, p=[0, 0, 1]))
+        physics.variables["drawn"] = drawn + 0.0 * random_state.standard_normal(4)
+
+    state = jax.jit(made(initialize_episode=begin).reset)(jax.random.key(0))
+    env = composer.Environment(type("Rod", (Rod,), {"initialize_episode": begin})())
+    env.reset()
+    data = env.physics.data
+    np.testing.assert_allclose([state.data.qpos[0], state.data.qvel[0], state.data.time], [0.35, 0.1, 1.5])
+    np.testing.assert_allclose([data.qpos[0], data.qvel[0], data.time], [0.35, 0.1, 1.5])
+    np.testing.assert_allclose(state.leaves["geom_rgba"], env.physics.model.geom_rgba, rtol=1e-6)
+    np.testing.assert_array_equal(state.variables["drawn"], [2, 2, 2, 2])
+
+    with pytest.raises(UsageError, match=r"hint: use x = random_state.permutation\(x\)"):
+        made(initialize_episode=lambda self, physics, random_state: random_state.shuffle(np.arange(3)))
+    with pytest.raises(AttributeError, match="on MJX random_state has no 'vonmises'"):
+        made(initialize_episode=lambda self, physics, random_state: random_state.vonmises(0, 1))
+    with pytest.raises(UsageError, match="must be between 0 and 0 inclusive, got: 3"):
+        made(**start(lambda task, physics: physics.reset(3)))

@@ -161,6 +161,7 @@ class MjxEnvironment:
         physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp or stepping)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()
+        physics.start = self._start
         physics.dry = self._dry
         if state is None:
             # On Warp nothing was computed yet; a model of the copy's own is not the one that was computed with.

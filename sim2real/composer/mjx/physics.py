@@ -41,6 +41,7 @@ class MjxPhysics:
     Attributes:
         np: The module that computes with this engine's arrays: ``jax.numpy``.
         changed: Names of the model's fields that were set.
+        start: The ``mjx.Data`` that ``reset`` returns to.
         dry: Whether steps compute nothing: for finding out what hooks set and keep.
         failed: Whether no acceptable initial state was found, a boolean array.
     """
@@ -58,7 +59,7 @@ class MjxPhysics:
     ) -> None:
         self._engine = engine
         self.host, self.mjx_model, self.mjx_data = host, model, data
-        self.variables = variables
+        self.variables, self.start = variables, data
         self.legacy_step = legacy
         self.changed: set[str] = set()
         self.failed: Any = jnp.zeros((), bool)
@@ -215,6 +216,47 @@ class MjxPhysics:
     def velocity(self) -> Any:
         """Return qvel, shape ``(nv,)``."""
         return self.mjx_data.qvel
+
+    def activation(self) -> Any:
+        """Return act, shape ``(na,)``."""
+        return self.mjx_data.act
+
+    def get_state(self) -> Any:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
+        data = self.mjx_data
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    state = get_state
+
+    def set_state(self, state: Any) -> None:
+        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        nq, nv, na = self.host.nq, self.host.nv, self.host.na
+        if jnp.shape(state) != (nq + nv + na,):
+            raise UsageError(f"Input physics state has shape {jnp.shape(state)}. Expected {(nq + nv + na,)}.")
+        for name, part in zip(("qpos", "qvel", "act"), jnp.split(jnp.asarray(state), [nq, nq + nv]), strict=True):
+            self.replace("data", name, part)
+
+    def reset(self, keyframe_id: int | None = None) -> None:
+        """Return to the initial state, or to a keyframe; variables are forgotten.
+
+        Raises:
+            UsageError: When there is no such keyframe.
+        """
+        self.mjx_data = self.start
+        if keyframe_id is not None:
+            if not 0 <= keyframe_id < self.host.nkey:
+                raise UsageError(
+                    f"`keyframe_id` must be between 0 and {self.host.nkey - 1} inclusive, got: {keyframe_id}"
+                )
+            names = {"qpos": "qpos", "qvel": "qvel", "act": "act", "ctrl": "ctrl", "time": "time"}
+            for name, key in {**names, "mocap_pos": "mpos", "mocap_quat": "mquat"}.items():
+                self.replace("data", name, getattr(self.host, f"key_{key}")[keyframe_id])
+        self.variables.clear()
+        self.forward(actuation=False)
 
     def step(self) -> None:
         """Advance by a time step."""
