@@ -40,7 +40,7 @@ def check_model(model: Any) -> None:
         if late:
             raise UsageError(
                 f"MJX ignores MuJoCo's own delays and intervals: {kind} {', '.join(map(repr, late))}",
-                hint="take delay, nsample and interval out of the MJCF; delay the observable or the graph's connection instead",
+                hint="take delay, nsample and interval out of the MJCF; delay the observable or the connection instead",
             )
     if model.opt.integrator not in _INTEGRATORS:
         raise UsageError(
