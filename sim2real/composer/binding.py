@@ -149,19 +149,19 @@ class Binding:
         self.write(name, value)
 
     def __getitem__(self, key: Any) -> Any:
-        name, columns = key if isinstance(key, tuple) else (key, None)
+        name, axes = key if isinstance(key, tuple) else (key, None)
         value = getattr(self, name)
-        if columns is None:
+        if axes is None:
             return value
-        return np.asarray(value)[..., _columns(columns)]
+        return np.asarray(value)[..., columns(axes)]
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        name, columns = key if isinstance(key, tuple) else (key, None)
-        if columns is None:
+        name, axes = key if isinstance(key, tuple) else (key, None)
+        if axes is None:
             self.write(name, value)
             return
         whole = np.array(getattr(self, name))
-        whole[..., _columns(columns)] = value
+        whole[..., columns(axes)] = value
         self.write(name, whole)
 
     def __dir__(self) -> list[str]:
@@ -186,7 +186,7 @@ class EmptyBinding:
         raise UsageError("Cannot assign a value to an empty binding.")
 
 
-def _columns(key: Any) -> Any:
+def columns(key: Any) -> Any:
     """Return column numbers for names of axes such as ``'x'`` or ``['x', 'z']``."""
     axes = {name: i for i, name in enumerate("xyz")}
     if isinstance(key, str):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -143,6 +144,13 @@ class Records:
     def forget(self, native: Any) -> None:
         """Note that an element was deleted."""
         self._of.pop(native, None)
+
+    def among(self, natives: Mapping[Any, Any]) -> Records:
+        """Return the same of a copied model: element -> its copy."""
+        made = Records(self._document, self.is_blank)
+        made._has_defaults = self._has_defaults
+        made._of = {natives[n]: Given(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
+        return made
 
     def of(self, element: Element) -> Given:
         """Return what was given of an element."""

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
-from sim2real.composer import attaching, builder, compose, files, merge, parse, translate
+from sim2real.composer import attaching, builder, compose, duplicate, files, merge, parse, translate
 from sim2real.composer.attaching import Attachment
 from sim2real.composer.element import KIND_OF_TAG, Element
 from sim2real.composer.given import Document, Given, Records
@@ -31,6 +31,9 @@ class Model:
     Attributes:
         parent_model: The model that this one is attached to, or None.
         attachments: Name -> what is attached to this one, in order.
+        inherits_angle: Whether angles are read in the unit of the model that this one is attached to: so it is until
+            ``compiler.angle`` is set, for models that programs make. Documents have a unit of their own.
+        overrides: Settings that were written while other models were attached.
     """
 
     builder: ClassVar[Any] = builder
@@ -42,6 +45,8 @@ class Model:
         self._spec.modelname = model or (self._spec.modelname if spec is not None else "unnamed_model")
         self.check_name("model", self._spec.modelname)
         self._settings: merge.Settings | None = {} if spec is None else None
+        self.overrides = merge.Overrides()
+        self.inherits_angle = spec is None
         self.parent_model: Model | None = None
         self.attachments: dict[str, Attachment] = {}
         self.references: dict[tuple[Any, str], Element] = {}
@@ -80,6 +85,12 @@ class Model:
     def __repr__(self) -> str:
         return f"<model {self.model!r}>"
 
+    def __copy__(self) -> Model:
+        return duplicate.duplicate(self)
+
+    def __deepcopy__(self, memo: Any) -> Model:
+        return duplicate.duplicate(self)
+
     @property
     def spec(self) -> Any:
         """The ``MjSpec``, without what is attached. Once it was handed out, every compilation starts from scratch."""
@@ -96,6 +107,12 @@ class Model:
         """Note a change of the options."""
         self._settings = None
         self.touch()
+
+    def reads_degrees(self) -> bool:
+        """Return whether angles in this model are in degrees, rather than in radians."""
+        if self.inherits_angle and self.parent_model is not None:
+            return self.parent_model.reads_degrees()
+        return bool(self._spec.compiler.degree)
 
     def expose(self) -> None:
         """Note that the spec may change from now on without the model knowing."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim2real.composer import layout
+from sim2real.composer.arrays import is_jax
 from sim2real.composer.element import Element
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
@@ -59,7 +60,11 @@ class NamedArray(NDArrayOperatorsMixin):
         return self._array[self.rows(key)]
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        self._array[self.rows(key)] = value
+        array, rows = self._array, self.rows(key)
+        if is_jax(array):
+            setattr(self._holder, self._field.name, array.at[rows].set(value))
+        else:
+            array[rows] = value
 
     @property
     def axes(self) -> Any:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import builder, schema, translate
+from sim2real.composer import builder, merge, schema, translate
 from sim2real.composer.defaults import Defaults
 from sim2real.composer.element import FROM_DOCUMENTS, Element
 from sim2real.composer.element_list import ElementList
@@ -101,14 +101,14 @@ class Section:
         if name in self._kinds or (self._kinds and (self._name, name) in schema.tables()):
             return ElementList(lambda: [e for e in self._everything() if name in (e.tag, e.kind)], name)
         if self._name == "compiler" and name == "angle":
-            return "degree" if self._native.degree else "radian"
+            return "degree" if self._model.reads_degrees() else "radian"
         if self._name == "visual":
             return Section(self._model, f"visual.{name}", f"visual.{name.rstrip('_')}")
         if self._name == "option" and name == "flag":
             return Flags(self._model)
         if not hasattr(self._native, name):
             raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
-        value = getattr(self._native, name)
+        value = merge.in_world(self._model, self._path, name, getattr(self._native, name))
         if isinstance(value, np.ndarray):  # which the caller may write into
             self._model.touch_settings()
         return next((k for k, v in _CHOICES[name].items() if v == value), value) if name in _CHOICES else value
@@ -117,7 +117,7 @@ class Section:
         native = self._native
         self._model.touch_settings()
         if self._name == "compiler" and name == "angle":
-            native.degree = value == "degree"
+            native.degree, self._model.inherits_angle = value == "degree", False
             self._model.records.say_angle()
             return
         if self._name == "size" and name == "memory" and isinstance(value, str):
@@ -133,6 +133,7 @@ class Section:
             native.eulerseq = list(value)
             return
         setattr(native, name, translate.like(current, value))
+        merge.note(self._model, self._path, name)
 
     def _known(self) -> str:
         return ", ".join(n for n in dir(self._native) if not n.startswith("_"))
@@ -146,29 +147,22 @@ class Flags:
     def __init__(self, model: Model) -> None:
         object.__setattr__(self, "_model", model)
 
-    def _bit(self, name: str) -> tuple[str, int]:
-        for field, kind, prefix in (
-            ("disableflags", mj.mjtDisableBit, "mjDSBL_"),
-            ("enableflags", mj.mjtEnableBit, "mjENBL_"),
-        ):
-            bit = kind.__members__.get(prefix + name.upper())
-            if bit is not None:
-                return field, int(bit)
-        raise AttributeError(f"<option.flag> has no attribute {name!r}")
+    def _check(self, name: str) -> None:
+        if name not in merge.FLAGS:
+            raise AttributeError(f"<option.flag> has no attribute {name!r}. Available: {', '.join(merge.FLAGS)}")
 
     def __getattr__(self, name: str) -> str:
-        field, bit = self._bit(name)
+        self._check(name)
+        field, bit = merge.FLAGS[name]
         on = bool(getattr(self._model._spec.option, field) & bit) == (field == "enableflags")
-        return "enable" if on else "disable"
+        return merge.in_world(self._model, merge.FLAG, name, "enable" if on else "disable")
 
     def __setattr__(self, name: str, value: str) -> None:
-        field, bit = self._bit(name)
+        self._check(name)
         if value not in ("enable", "disable"):
             raise UsageError(f"option.flag.{name}={value!r} is not valid. Available: disable, enable")
-        bits = getattr(self._model._spec.option, field)
-        raised = (value == "enable") == (field == "enableflags")
-        setattr(self._model._spec.option, field, bits | bit if raised else bits & ~bit)
-        self._model.touch_settings()
+        merge.set_flag(self._model._spec, name, value)
+        merge.note(self._model, merge.FLAG, name)
 
 
 class DocumentsOnly:
