@@ -33,6 +33,7 @@ settings.load_profile("sim2real")
 LONGEST = ("real time", "identify", "composer", "integration", "train", "robots", "runtime", "pipelines")
 
 
+@pytest.hookimpl(tryfirst=True)  # xdist reads the groups after that
 def pytest_collection_modifyitems(items):
     """Give each room to one worker, which so compiles its programs once; all tests in real time to the same one.
 

@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arena import Arena as Arena
+from sim2real.composer.constants import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.define import abstract_observable as abstract_observable
 from sim2real.composer.define import cached_property as cached_property
 from sim2real.composer.define import observable as observable
@@ -35,9 +36,6 @@ if TYPE_CHECKING:
     from sim2real.composer.mjx.environment import MjxEnvironment as MjxEnvironment
     from sim2real.composer.vector_env import MjxVectorEnv as MjxVectorEnv
     from sim2real.composer.world import ComposedWorld as ComposedWorld
-
-SENSOR_SITES_GROUP = 4
-"""The group of sites that sensors are attached to."""
 
 _LAZY = {
     "BraxEnv": "sim2real.composer.brax_env",

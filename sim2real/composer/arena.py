@@ -27,7 +27,7 @@ BASE = """
 
 @functools.cache
 def _base() -> Any:
-    return parse.from_string(BASE)
+    return parse.from_string(BASE)[0]
 
 
 class Arena(Entity):

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import translate
+import numpy as np
+
+from sim2real.composer import files, given, schema, translate
 from sim2real.composer.element import KIND_OF_TAG, REFERENCES, Element
 from sim2real.composer.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.model import Model
+
+_OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
+"""What every actuator but ``<general>`` sets by itself."""
 
 
 def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) -> Element:
@@ -21,26 +27,33 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
     name = attrs.get("name")
     if name is not None:
         model.check_name(kind, name)
-    defaults = _defaults(model, attrs)
+    foreign = _foreign(model, attrs["dclass"]) if "dclass" in attrs else None
+    defaults = None if foreign else _defaults(model, attrs)
     if tag == "freejoint":
         native = body._native.add_freejoint()
     else:
         adder = getattr(body._native, f"add_{kind}")
         native = adder() if defaults is None or kind == "body" else adder(defaults)
-    element = model.enlist(kind, native)
+    if foreign:
+        translate.reset(native, getattr(foreign.native, kind))
+    element = model.enlist(kind, native, tag, _given(attrs))
     try:
         if name is not None:
             native.name = name
         named = REFERENCES.get(kind, ())
-        for key, value in attrs.items():
+        for key, value in tuple(attrs.items()):
+            if key in ("name", "dclass"):
+                continue
             if key in named or isinstance(value, Element):
-                setattr(element, key, value)
-            elif key not in ("name", "dclass", "class_"):
+                model.refer(element, translate.native_name(kind, key), value)
+            elif translate.is_plain(native, kind, key, value):
                 translate.assign(native, kind, key, value)
+            else:
+                rebuild(model, element, key)
     except Exception:
         remove(model, element)
         raise
-    if body.is_frame:  # joints of a frame are called after it
+    if kind == "joint" and body.is_frame:  # joints of a frame are called after it
         native.name = body._native.name + (f"{name}/" if name else "")
     model.touch()
     return element
@@ -50,24 +63,135 @@ def add_to_section(model: Model, kind: str, tag: str, attrs: dict[str, Any]) -> 
     """Add an element that stands in no body; MuJoCo's parser reads its attributes."""
     model.check_name(kind, attrs.get("name"))
     defaults = _defaults(model, attrs)
-    references = [k for k in REFERENCES.get(kind, ()) if attrs.get(k) is not None]
-    given = {k: v for k, v in attrs.items() if k not in ("name", "dclass", "class_") and v is not None}
-    fixed, named = translate.from_xml(kind, tag, given, references)
     adder = getattr(model._spec, f"add_{kind}")
     native = adder() if defaults is None else adder(defaults)
-    native.name = attrs.get("name") or ""
-    element = model.enlist(kind, native)
+    element = model.enlist(kind, native, tag, _given(attrs))
+    try:
+        native.name = attrs.get("name") or ""
+        _lay_down(model, element)
+    except Exception:
+        remove(model, element)
+        raise
+    return element
+
+
+def _lay_down(model: Model, element: Element) -> None:
+    """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
+    native, kind, said = element._native, element.kind, model.given(element)
+    values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
+    is_shortcut = kind == "actuator" and said.tag != "general"
+    if is_shortcut and model.records.has_defaults:  # they set these altogether, whatever the class says
+        translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
+        values = _inherited(model, element) | values
+    if kind in files.KINDS:
+        values = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in values.items()}
+    references = [k for k in REFERENCES.get(kind, ()) if k in values]
+    _fill(model, element, *translate.from_xml(kind, said.tag, values, references))
+    for key in translate.ORIENTATIONS & values.keys():
+        translate.assign(native, kind, key, values[key])
+
+
+def _inherited(model: Model, element: Element) -> dict[str, Any]:
+    """Return what the classes of an element say of its own tag: the nearest one's word counts."""
+    found: dict[str, Any] = {}
+    one = model.default_class(class_of(model, element))
+    while one is not model:
+        said = model.given(getattr(one, element.tag))
+        found = (said.values if said.tag == element.tag else {}) | found
+        one = one.parent
+    return found
+
+
+def _fill(model: Model, element: Element, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
+    """Set what MuJoCo's parser read: plain attributes, and those that name elements."""
+    native = element._native
     for key, value in fixed.items():
         setattr(native, key, value)
     for key, value in named.items():
         if isinstance(value, Element):
             model.refer(element, key, value)
         elif isinstance(value, list) and any(isinstance(v, Element) for v in value):
-            setattr(native, key, [v.name if isinstance(v, Element) else v for v in value])
+            setattr(native, key, ["" if isinstance(v, Element) else v for v in value])
+            for i, item in enumerate(value):
+                if isinstance(item, Element):
+                    model.refer(element, f"{key}[{i}]", item)
         else:
             setattr(native, key, value)
     model.touch()
-    return element
+
+
+def rebuild(model: Model, element: Element, key: str | None = None) -> None:
+    """Lay an element down anew: the defaults of its class, then the attributes given, as MuJoCo's parser reads them.
+
+    For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
+
+    Args:
+        model: The model.
+        element: The element.
+        key: The attribute that was set or taken back; None: its class changed.
+
+    Raises:
+        AttributeError: When such an element has no such attribute.
+    """
+    native, kind, said = element._native, element.kind, model.given(element)
+    known = schema.attributes(kind, said.tag)
+    if key is not None and key not in known:
+        available = ", ".join(sorted(known))
+        raise AttributeError(f"{key!r} is not a valid attribute for <{said.tag}>. Available: {available}")
+    if key is not None and kind in ("body", "inertial"):  # whose children and inertia are no attributes of its own
+        translate.reset(native, element.class_defaults, (translate.native_name(kind, key),))
+        model.touch()
+        return
+    _catch_up(element, said.values)
+    native_only = {k: said.values.pop(k) for k in list(said.values) if k not in known and k not in ("name", "dclass")}
+    foreign = _foreign(model, said.values.get("dclass"))
+    translate.reset(native, getattr(foreign.native, kind) if foreign else element.class_defaults)
+    for reference in [r for r in model.references if r[0] is native]:
+        del model.references[reference]
+    try:
+        _lay_down(model, element)
+        for extra, value in native_only.items():
+            translate.assign(native, kind, extra, value)
+    finally:
+        said.values.update(native_only)
+
+
+def _catch_up(element: Element, said: dict[str, Any]) -> None:
+    """Take over the numbers that an element holds now: arrays may have been written into."""
+    for name in said:
+        if name in ("name", "dclass") or name in REFERENCES.get(element.kind, ()):
+            continue
+        try:
+            value = translate.read(element._native, element.kind, name)
+        except AttributeError:
+            continue
+        if isinstance(value, np.ndarray):
+            said[name] = np.array(given.show(value, said[name]))
+
+
+def reclass(model: Model, element: Element, name: str, value: Any) -> None:
+    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
+    value = getattr(value, "dclass", value)
+    model.given(element).note(name, value)
+    if name == "childclass":
+        element._native.childclass = value or ""
+        followers = [
+            e for kind in TREE_KINDS if kind != "body" for e in element.find_all(kind, exclude_attachments=True)
+        ]
+    else:
+        followers = [element]
+    for follower in followers:
+        follower._native.classname = _defaults(model, {"dclass": class_of(model, follower)})
+        rebuild(model, follower)
+    model.touch()
+
+
+def class_of(model: Model, element: Element) -> str:
+    """Return the class of an element: its own one, or that of the nearest body that has one for what it holds."""
+    name, holder = model.given(element).values.get("dclass"), element.parent
+    while name is None and isinstance(holder, Element):
+        name, holder = holder._native.childclass or None, holder.parent
+    return getattr(name, "name", name) or "main"
 
 
 def extend_tendon(model: Model, tendon: Element, tag: str, attrs: dict[str, Any]) -> Element:
@@ -101,11 +225,25 @@ def remove(model: Model, element: Element) -> None:
     model.touch()
 
 
+def _given(attrs: dict[str, Any]) -> dict[str, Any]:
+    """Leave those attributes that were given a value, under PyMJCF's names."""
+    if "class_" in attrs:
+        attrs["dclass"] = attrs.pop("class_")
+    for name in [name for name, value in attrs.items() if value is None]:
+        del attrs[name]
+    return attrs
+
+
+def _foreign(model: Model, dclass: Any) -> Any:
+    """Return a class of defaults that belongs to another model, such as that of a frame's joint; else None."""
+    return dclass if getattr(dclass, "root", model) is not model else None
+
+
 def _defaults(model: Model, attrs: dict[str, Any]) -> Any:
     name = attrs.get("dclass", attrs.get("class_"))
     if name is None:
         return None
-    name = getattr(name, "name", name)
+    name = getattr(name, "name", name)  # a class of defaults, or its name
     found = model._spec.find_default(name)
     if found is None:
         raise UsageError(f"model {model.model!r} has no default class {name!r}")
@@ -120,4 +258,4 @@ def _add_inertial(model: Model, body: Element, attrs: dict[str, Any]) -> Element
         model.touch()
         translate.assign(body._native, "body", names[key], value)
     body._native.explicitinertial = True
-    return body
+    return model.handle("inertial", body._native)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import keyframes, merge, translate
+from sim2real.composer import files, keyframes, layout, merge, translate
 from sim2real.composer.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
@@ -31,9 +32,11 @@ def compile_model(model: Model) -> Any:
 
 def compose(model: Model) -> Any:
     """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options."""
-    out = _compose(model)
     models = list(model.all_models())
+    with files.renamed(model) if any(map(files.is_mixed, models)) else contextlib.nullcontext():
+        out = _compose(model)
     merge.apply(out, merge.merged(models))
+    _point_aside(out, models)
     if len(models) > 1 and any(m._spec.keys for m in models):
         keyframes.restore(out, models)
     return out
@@ -71,7 +74,7 @@ def free_body(model: Model) -> Any:
     return None
 
 
-def _copy(model: Model) -> Any:
+def copy_spec(model: Model) -> Any:
     """Return a copy of a model's own spec in which every element has a name and names what it should."""
     spec = model._spec
     unnamed = list(_unnamed(model))
@@ -79,14 +82,23 @@ def _copy(model: Model) -> Any:
         for native, name in unnamed:
             native.name = name
         for (native, key), target in model.references.items():
-            setattr(native, key, _name_seen_from(model, target))
+            translate.point(native, key, _name_seen_from(model, target))
         out = spec.copy()
-        for kind in _MAY_DANGLE:
-            _restore(spec, out, kind)
+        lost = [kind for kind in _MAY_DANGLE if _count(out, kind) != _count(spec, kind)]
+        if lost:
+            out = _copy_all(model, lost)
     finally:
         for native, _ in unnamed:
             native.name = ""
+    return out
+
+
+def _copy(model: Model) -> Any:
+    """Return a copy of a model's own spec that can become a part of another one."""
+    out = copy_spec(model)
     merge.clear(out, model.settings())
+    out.compiler.degree = model.reads_degrees()
+    merge.inherit_compiler(out, model)
     if model.attachments or model.parent_model is not None:  # else MuJoCo's own handling of keyframes does
         for key in list(out.keys):
             out.delete(key)
@@ -113,7 +125,26 @@ def _unnamed(model: Model) -> Any:
 def _name_seen_from(model: Model, target: Any) -> str:
     if target.root is model:
         return target._native.name
+    if _is_aside(model, target):  # any element of its kind does for now: what names nothing is dropped
+        own = model.find_all(target.kind, exclude_attachments=True)
+        if own:
+            return own[0]._native.name
     return model_name(target, model)
+
+
+def _is_aside(model: Model, target: Any) -> bool:
+    """Return whether an element is in the same world as a model, but neither in it nor below it."""
+    above = _above(target.root)
+    return target.root is not model and model not in above and target.root.root_model is model.root_model
+
+
+def _point_aside(out: Any, models: list[Model]) -> None:
+    """Let elements name what is beside or above their own model, now that all models are in one spec."""
+    for model in models:
+        for (native, key), target in model.references.items():
+            if _is_aside(model, target):
+                element = model.find_handle(native)
+                translate.point(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
 
 
 def model_name(target: Any, model: Model) -> str:
@@ -134,18 +165,73 @@ def _above(model: Model) -> list[Any]:
     return found
 
 
-def _restore(source: Any, out: Any, kind: str) -> None:
-    """Bring back what a copy dropped, in the source's order; done before anything is attached, so that it resolves."""
-    wanted = getattr(source, translate.plural(kind))
-    held = getattr(out, translate.plural(kind))
-    if len(wanted) == len(held):
-        return
-    for native in held:
-        out.delete(native)
-    for native in wanted:
+def _count(spec: Any, kind: str) -> int:
+    return len(getattr(spec, translate.plural(kind)))
+
+
+def _copy_all(model: Model, lost: list[str]) -> Any:
+    """Return a copy of a spec with what a plain copy drops of some kinds: elements that name others elsewhere.
+
+    They are added anew, in the source's order; done before anything is attached, so that they resolve.
+
+    Raises:
+        UsageError: When one names an element that is not below the model either.
+    """
+    spec = model._spec
+    wanted = [(kind, native, native.name) for kind in lost for native in getattr(spec, translate.plural(kind))]
+    for kind, native, _ in wanted:
+        _check_targets(model, kind, native)
+    try:
+        for _, native, _ in wanted:  # the names of what a copy drops stay taken in it
+            native.name = ""
+        out = spec.copy()
+    finally:
+        for _, native, name in wanted:
+            native.name = name
+    for kind in lost:
+        for native in getattr(out, translate.plural(kind)):
+            out.delete(native)
+    for kind, native, name in wanted:
         new = getattr(out, f"add_{kind}")()
-        new.name, new.info = native.name, native.info
+        new.name, new.info = name, native.info
         for key in translate.attributes(native):
             value = getattr(native, key)
             if not callable(value) and value is not None:
                 setattr(new, key, value)
+    return out
+
+
+_OBJECTS = {**{k.object_type: name for name, k in layout.KINDS.items()}, mj.mjtObj.mjOBJ_XBODY: "body"}
+_TRANSMISSIONS = {
+    **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "joint" for name in ("JOINT", "JOINTINPARENT")},
+    **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "site" for name in ("SITE", "SLIDERCRANK")},
+    mj.mjtTrn.mjTRN_TENDON: "tendon",
+    mj.mjtTrn.mjTRN_BODY: "body",
+}
+
+
+def _targets(kind: str, native: Any) -> list[tuple[Any, str]]:
+    """Return kind and name of the elements that one names."""
+    if kind == "actuator":
+        return [
+            (_TRANSMISSIONS.get(native.trntype), native.target),
+            ("site", native.refsite),
+            ("site", native.slidersite),
+        ]
+    if kind == "sensor":
+        return [(_OBJECTS.get(native.objtype), native.objname), (_OBJECTS.get(native.reftype), native.refname)]
+    if kind == "equality":
+        return [(_OBJECTS.get(native.objtype), name) for name in (native.name1, native.name2)]
+    names = ("geomname1", "geomname2") if kind == "pair" else ("bodyname1", "bodyname2")
+    return [("geom" if kind == "pair" else "body", getattr(native, name)) for name in names]
+
+
+def _check_targets(model: Model, kind: str, native: Any) -> None:
+    for target, name in _targets(kind, native):
+        if target and name and model.find(target, name) is None:
+            known = ", ".join(filter(None, (e.name for e in model.find_all(target, exclude_attachments=True))))
+            raise UsageError(
+                f"{kind} {native.name!r} of model {model.model!r} names the {target} {name!r}, which is not there. "
+                f"Available: {known}",
+                hint="elements of attached models have the names of those in front: arm/hand/finger",
+            )

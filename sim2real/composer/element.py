@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import translate
+from sim2real.composer import files, given, schema, translate
+from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
@@ -56,13 +57,18 @@ REFERENCES = {
 
 
 _IN_BODIES = (*TREE_KINDS, "inertial")
+_set = object.__setattr__
+_LISTED = frozenset(TREE_KINDS)
+_UNROLLED = ("composite", "flexcomp", "replicate", "frame", "attach", "plugin")
+FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
+"""The way to elements that programs cannot add."""
 
 
 class Element:
     """One element of a model; made by ``Model.find``, ``find_all`` and ``add``.
 
     Reading and setting any other attribute reads and sets it in the model's ``MjSpec``, in MJCF's spelling or in
-    MuJoCo's own. Two handles on the same element are equal.
+    MuJoCo's own; what was not given reads as None, whatever the defaults are. There is one handle on each element.
 
     Attributes:
         root: The model that the element belongs to.
@@ -76,14 +82,9 @@ class Element:
     _native: Any
 
     def __init__(self, root: Model, kind: str, native: Any) -> None:
-        for name, value in (("root", root), ("kind", kind), ("_native", native)):
-            object.__setattr__(self, name, value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Element) and self._native is other._native
-
-    def __hash__(self) -> int:
-        return hash(self._native)
+        _set(self, "root", root)
+        _set(self, "kind", kind)
+        _set(self, "_native", native)
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.full_identifier!r}>"
@@ -112,8 +113,14 @@ class Element:
 
     @property
     def tag(self) -> str:
-        """The kind, or ``worldbody``."""
-        return "worldbody" if self.is_worldbody else self.kind
+        """The tag in MJCF: ``motor`` for what ``<motor>`` made, ``worldbody`` for the world."""
+        return "worldbody" if self.is_worldbody else self.root.given(self).tag
+
+    @property
+    def class_defaults(self) -> Any:
+        """The native element that holds the defaults of this element's class."""
+        found = getattr(getattr(self._native, "classname", None), self.kind, None)
+        return translate.blank(self.kind) if found is None else found
 
     @property
     def is_worldbody(self) -> bool:
@@ -126,10 +133,19 @@ class Element:
         return self.kind == "body" and self._native.name.endswith("/")
 
     @property
-    def parent(self) -> Element | None:
-        """The body that holds this element; None for the world and for what stands in no body."""
+    def is_removed(self) -> bool:
+        """Whether the element was deleted."""
+        return self._native is None
+
+    @property
+    def parent(self) -> Any:
+        """The body that holds this element, the section where it stands in no body, the model for the world."""
+        if self.kind == "inertial":
+            return self.root.handle("body", self._native)
+        if self.is_worldbody:
+            return self.root
         native = getattr(self._native, "parent", None)
-        return None if native is None else self.root.handle("body", native)
+        return self.root.section_of(self.kind) if native is None else self.root.handle("body", native)
 
     def add(self, tag: str, **attrs: Any) -> Element:
         """Add an element to a body, or a path element to a tendon.
@@ -150,7 +166,8 @@ class Element:
                 hint="add it to the attached model, or to a body of the model it is attached to",
             )
         if self.kind != "body" or KIND_OF_TAG.get(tag, tag) not in _IN_BODIES:
-            raise UsageError(f"a <{tag}> cannot stand in the {self.kind} {self.full_identifier!r}")
+            hint = FROM_DOCUMENTS if tag in _UNROLLED else f"bodies hold {', '.join(_IN_BODIES)}"
+            raise UsageError(f"a <{tag}> cannot be added to the {self.kind} {self.full_identifier!r}", hint=hint)
         if tag == "freejoint" and not (self._native.parent is not None and self._native.parent.parent is None):
             raise UsageError(
                 f"a free joint is only for bodies that stand in the world, {self.full_identifier!r} does not",
@@ -170,11 +187,24 @@ class Element:
         self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
     ) -> list[Element]:
         """Return the elements of a kind below this body, in the order of the document."""
+        if self.kind != "body":
+            return []
+        kind = KIND_OF_TAG.get(kind, kind)
         return list(self.root.walk(self._native, kind, immediate_children_only, exclude_attachments))
+
+    def find(self, kind: str, identifier: str) -> Element | None:
+        """Return the element of a kind with a name, if it stands below this body; else None."""
+        found = self.root.find(kind, identifier)
+        return found if found is not None and found in self.find_all(kind) else None
 
     def all_children(self) -> list[Element]:
         """Return what stands directly in this body."""
-        return [e for kind in TREE_KINDS for e in self.find_all(kind, immediate_children_only=True)]
+        inertial = [] if self.inertial is None else [self.inertial]
+        return inertial + [e for kind in TREE_KINDS for e in self.find_all(kind, immediate_children_only=True)]
+
+    def get_attributes(self) -> dict[str, Any]:
+        """Return the attributes that were given to this element: name -> value."""
+        return {name: getattr(self, name) for name in self.root.given(self).values}
 
     def set_attributes(self, **attrs: Any) -> None:
         """Set several attributes."""
@@ -189,27 +219,64 @@ class Element:
         if name.startswith("__"):
             raise AttributeError(name)
         native, kind = self._native, self.kind
-        if kind == "body" and name in TREE_KINDS:
-            return self.find_all(name, immediate_children_only=True)
-        if kind == "body" and name == "freejoint":
-            return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
+        if native is None:
+            raise UsageError(f"this {kind} was removed from model {self.root.model!r}")
+        if kind == "body":
+            if name in _LISTED:
+                return ElementList(lambda: self.find_all(name, immediate_children_only=True), name)
+            if name == "freejoint":
+                return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
+            if name == "inertial":
+                return self.root.handle("inertial", native) if native.explicitinertial else None
+        said = self.root.given(self)
+        if name not in said.values and name in schema.attributes(kind, said.tag):
+            return None
         if name in REFERENCES.get(kind, ()):
             return self.root.referenced(self, name)
+        if name.startswith("file") and said.values.get(name):
+            return files.asset_of(self.root, kind, said.values[name])
         if name == "dclass":
-            return native.classname.name
-        value = translate.read(native, kind, name)
+            return self.root.default_class(said.values[name])
+        return self._shown(name, said)
+
+    def _shown(self, name: str, said: given.Given) -> Any:
+        """Return the value of a plain attribute, in PyMJCF's form where it was given."""
+        try:
+            value = translate.read(self._native, self.kind, name)
+        except AttributeError:
+            if name not in said.values:
+                raise
+            return given.parse(said.values[name])
         if isinstance(value, np.ndarray):  # which the caller may write into
             self.root.touch()
-        return value
+        return given.show(value, said.values[name]) if name in said.values else value
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "name":
             type(self).name.__set__(self, value)
-        elif name in REFERENCES.get(self.kind, ()) or isinstance(value, Element):
-            self.root.refer(self, translate.native_name(self.kind, name), value)
-        else:
-            translate.assign(self._native, self.kind, name, value)
+            return
+        kind, said = self.kind, self.root.given(self)
+        value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value
+        if name in ("dclass", "childclass"):
+            self.root.builder.reclass(self.root, self, name, value)
+        elif name in REFERENCES.get(kind, ()) and hasattr(self._native, translate.native_name(kind, name)):
+            self.root.refer(self, translate.native_name(kind, name), value)
+            said.note(name, value)
+        elif value is not None and translate.is_plain(self._native, kind, name, value):
+            translate.assign(self._native, kind, name, value)
+            said.note(name, value)
             self.root.touch()
+        else:
+            before = said.values.get(name)
+            said.note(name, value)
+            try:
+                self.root.builder.rebuild(self.root, self, name)
+            except Exception:
+                said.note(name, before)
+                raise
+
+    def __delattr__(self, name: str) -> None:
+        setattr(self, name, None)
 
 
 def as_elements(elements: Any) -> tuple[tuple[Element, ...], bool]:

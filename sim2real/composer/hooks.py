@@ -32,7 +32,8 @@ class Hooks:
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._entity_hooks: dict[str, list[Callable[..., Any]]] = {}
+        self._labels = {name: f"{type(task).__name__}.{name}" for name in HOOK_NAMES}
+        self._entity_hooks: dict[str, list[tuple[str, Callable[..., Any]]]] = {}
         self._extra: dict[str, list[Callable[..., Any]]] = {name: [] for name in HOOK_NAMES}
         self.refresh()
 
@@ -40,8 +41,9 @@ class Hooks:
         """Collect the hooks of the entities that are attached now."""
         entities = list(self._task.iter_entities())
         for name in HOOK_NAMES:
-            hooks = [getattr(e, name) for e in entities if _overrides(e, Entity, name)]
-            self._entity_hooks[name] = [_with_action(h) for h in hooks] if name in WITH_ACTION else hooks
+            wrap = _with_action if name in WITH_ACTION else _as_it_is
+            found = [(f"{type(e).__name__}.{name}", getattr(e, name)) for e in entities if _overrides(e, Entity, name)]
+            self._entity_hooks[name] = [(label, wrap(hook)) for label, hook in found]
 
     def add(self, name: str, hook: Callable[..., Any]) -> None:
         """Run a function after the hooks of the task and the entities.
@@ -61,16 +63,25 @@ class Hooks:
 
     def run(self, name: str, *args: Any) -> None:
         """Run all hooks of a name with the arguments that the task's hook takes."""
-        getattr(self._task, name)(*args)
-        for hook in self._entity_hooks[name]:
-            hook(*args)
+        self.call(self._labels[name], getattr(self._task, name), *args)
+        for label, hook in self._entity_hooks[name]:
+            self.call(label, hook, *args)
         for hook in self._extra[name]:
-            hook(*args)
+            self.call(name, hook, *args)
+
+    def call(self, label: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Return what a function returns; ``label`` says which one it is."""
+        del label
+        return function(*args)
 
 
 def _overrides(owner: Any, base: type, name: str) -> bool:
     """Return whether an object has a hook of its own, in its class or as an attribute."""
     return name in vars(owner) or getattr(type(owner), name, None) is not getattr(base, name)
+
+
+def _as_it_is(hook: Callable[..., Any]) -> Callable[..., Any]:
+    return hook
 
 
 def _with_action(hook: Callable[..., Any]) -> Callable[..., Any]:

@@ -43,7 +43,7 @@ def _spread(compiled: Any, model: Model, name: str, part: str, values: np.ndarra
     kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
     whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
     own = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
-    frames = [e for e in own if e.parent is not None and e.parent.is_frame]  # their joints came later
+    frames = [e for e in own if e.kind == "joint" and e.parent.is_frame]  # their joints came later
     rows: Any = np.zeros(0)
     for elements in (own, [e for e in own if e not in frames]):
         ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))

@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sim2real.composer import builder, compose, merge, parse, translate
+from sim2real.composer import attaching, builder, compose, duplicate, files, merge, parse, translate
+from sim2real.composer.attaching import Attachment
 from sim2real.composer.element import KIND_OF_TAG, Element
-from sim2real.composer.sections import Section, make_sections
+from sim2real.composer.given import Document, Given, Records
+from sim2real.composer.sections import SECTION_OF, Section, make_sections
 from sim2real.composer.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
 _ADDED_LATER = 1_000_000_000
 """Elements that were parsed are ordered by their line; those that a program added come after them."""
-
-
-@dataclass(eq=False)
-class Attachment:
-    """A model below another one, and the empty body that holds its place there."""
-
-    model: Model
-    frame: Any
 
 
 class Model:
@@ -33,40 +26,47 @@ class Model:
     Args:
         model: The name; prefix of all names in it once it is attached.
         spec: An ``MjSpec`` to wrap; default: an empty one.
+        document: What the spec was parsed from, where that is known.
 
     Attributes:
         parent_model: The model that this one is attached to, or None.
         attachments: Name -> what is attached to this one, in order.
+        inherits_angle: Whether angles are read in the unit of the model that this one is attached to: so it is until
+            ``compiler.angle`` is set, for models that programs make. Documents have a unit of their own.
+        overrides: Settings that were written while other models were attached.
     """
 
     builder: ClassVar[Any] = builder
     """What adds and removes elements; the handles reach it through their model, as it needs them itself."""
 
-    def __init__(self, model: str | None = None, spec: Any = None) -> None:
+    def __init__(self, model: str | None = None, spec: Any = None, document: Document | None = None) -> None:
         self._revision: int | None = 0 if spec is None else None
         self._spec: Any = mj.MjSpec() if spec is None else spec
         self._spec.modelname = model or (self._spec.modelname if spec is not None else "unnamed_model")
         self.check_name("model", self._spec.modelname)
         self._settings: merge.Settings | None = {} if spec is None else None
+        self.overrides = merge.Overrides()
+        self.inherits_angle = spec is None
         self.parent_model: Model | None = None
         self.attachments: dict[str, Attachment] = {}
         self.references: dict[tuple[Any, str], Element] = {}
         self._handles: dict[Any, Element] = {}
         self._order: dict[Any, int] = {}
+        self.records = Records(document, is_blank=spec is None)
         self._clock = itertools.count(_ADDED_LATER)
         self._sections = make_sections(self)
 
     @classmethod
-    def owning(cls, spec: Any) -> Model:
+    def owning(cls, spec: Any, document: Document | None = None) -> Model:
         """Return a model around a spec that nobody else changes: changes are then seen, and results kept till then."""
-        model = cls(spec=spec)
+        model = cls(spec=spec, document=document)
         model._revision = 0
         return model
 
     @classmethod
     def from_xml_string(cls, xml_string: str | bytes, assets: dict[str, bytes] | None = None) -> Model:
         """Return a model from MJCF; ``assets`` are its files by name."""
-        return cls.owning(parse.from_string(xml_string, assets))
+        return cls.owning(*parse.from_string(xml_string, assets))
 
     @classmethod
     def from_path(cls, path: Any, assets: dict[str, bytes] | None = None) -> Model:
@@ -75,7 +75,7 @@ class Model:
         Raises:
             UsageError: When there is no such file.
         """
-        return cls.owning(parse.from_path(path, assets))
+        return cls.owning(*parse.from_path(path, assets))
 
     @classmethod
     def from_file(cls, file: Any, assets: dict[str, bytes] | None = None) -> Model:
@@ -84,6 +84,12 @@ class Model:
 
     def __repr__(self) -> str:
         return f"<model {self.model!r}>"
+
+    def __copy__(self) -> Model:
+        return duplicate.duplicate(self)
+
+    def __deepcopy__(self, memo: Any) -> Model:
+        return duplicate.duplicate(self)
 
     @property
     def spec(self) -> Any:
@@ -102,9 +108,15 @@ class Model:
         self._settings = None
         self.touch()
 
+    def reads_degrees(self) -> bool:
+        """Return whether angles in this model are in degrees, rather than in radians."""
+        if self.inherits_angle and self.parent_model is not None:
+            return self.parent_model.reads_degrees()
+        return bool(self._spec.compiler.degree)
+
     def expose(self) -> None:
         """Note that the spec may change from now on without the model knowing."""
-        self._revision = None
+        self._revision, self.records.is_blank = None, False
 
     def touch(self) -> None:
         """Note a change."""
@@ -131,7 +143,7 @@ class Model:
     def model(self, name: str) -> None:
         self.check_name("model", name)
         if self.parent_model is not None:
-            self.parent_model.rename(self.model, name)
+            attaching.rename(self.parent_model, self.model, name)
         self.touch()
         self._spec.modelname = name
 
@@ -162,10 +174,31 @@ class Model:
 
     def handle(self, kind: str, native: Any) -> Element:
         """Return the handle on an element of the spec; always the same one."""
-        found = self._handles.get(native)
+        key = (native, kind) if kind == "inertial" else native  # a part of its body
+        found = self._handles.get(key)
         if found is None:
-            found = self._handles[native] = Element(self, kind, native)
+            found = self._handles[key] = Element(self, kind, native)
         return found
+
+    def given(self, element: Element) -> Given:
+        """Return what was given of an element, rather than left at its default."""
+        return self.records.of(element)
+
+    def section_of(self, kind: str) -> Section:
+        """Return the section that elements of a kind stand in."""
+        return self._sections[SECTION_OF[kind]]
+
+    def default_class(self, name: Any) -> Any:
+        """Return a class of defaults by its name."""
+        return self.default.find("default", getattr(name, "dclass", name))
+
+    def find_handle(self, native: Any) -> Element:
+        """Return the handle on an element that has one."""
+        return self._handles[native]
+
+    def all_children(self) -> list[Any]:
+        """Return the sections that hold elements, and the world."""
+        return [self._sections[name] for name in dict.fromkeys(SECTION_OF.values())] + [self.worldbody]
 
     def check_name(self, kind: str, name: str | None) -> None:
         """Refuse a name with a slash in it: slashes separate the names of models."""
@@ -205,6 +238,8 @@ class Model:
         if tail:
             attachment = self.attachments.get(head)
             return None if attachment is None else attachment.model.find(kind, tail)
+        if kind == "default":
+            return self.default.find(kind, head)
         if kind in ("attachment_frame", "attached_model"):
             attachment = self.attachments.get(head)
             if attachment is None:
@@ -217,6 +252,10 @@ class Model:
             raise UsageError(f"{kind!r} is not a kind of element")
         native = getter(identifier)
         return None if native is None else self.handle(KIND_OF_TAG.get(kind, kind), native)
+
+    def enter_scope(self, scope_identifier: str) -> Model | None:
+        """Return the model attached under a name such as ``arm/hand``, or None."""
+        return self.find("attached_model", scope_identifier.rstrip("/"))
 
     def find_all(
         self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
@@ -258,15 +297,17 @@ class Model:
 
     # -- adding and removing
 
-    def enlist(self, kind: str, native: Any) -> Element:
-        """Note that an element was added after all others; return its handle."""
+    def enlist(self, kind: str, native: Any, tag: str, values: dict[str, Any]) -> Element:
+        """Note that an element was added after all others, with its tag and attributes; return its handle."""
         self._order[native] = next(self._clock)
+        self.records.note(native, tag, values)
         return self.handle(kind, native)
 
     def strike(self, natives: list[Any]) -> None:
         """Forget elements that are about to be deleted."""
         for native in natives:
             self._order.pop(native, None)
+            self.records.forget(native)
             handle = self._handles.pop(native, None)
             if handle is not None:
                 object.__setattr__(handle, "_native", None)
@@ -280,16 +321,20 @@ class Model:
             target = target.name or ""
         else:
             self.references.pop((element._native, key), None)
-        setattr(element._native, key, target or "")
+        translate.point(element._native, key, target or "")
         self.touch()
 
     def referenced(self, element: Element, name: str) -> Any:
         """Return the element that an attribute names, its name where it does not exist, or None."""
         kind = name.rstrip("12")
+        if name in ("objname", "refname"):
+            kind = self.given(element).values.get(name.replace("name", "type"), "body").replace("xbody", "body")
         key = "target" if element.kind == "actuator" and name in ("joint", "site", "tendon", "body") else None
         key = key or translate.native_name(element.kind, name)
         target = self.references.get((element._native, key))
-        text = getattr(element._native, key)
+        text = getattr(element._native, key, self.given(element).values.get(name))
+        if isinstance(text, Element):
+            return text
         if target is not None or not text:
             return target
         kind = "body" if kind == "target" else kind
@@ -311,46 +356,11 @@ class Model:
         """
         if not isinstance(model, Model):
             raise UsageError(f"Expected a model, got {type(model).__name__}: {model!r}")
-        if model.parent_model is not None:
-            raise UsageError(f"The model {model.model!r} is already attached elsewhere", hint="detach it first")
-        if model is self.root_model:
-            raise UsageError(f"Cannot attach model {model.model!r} to itself")
-        merge.merged([*self.root_model.all_models(), *model.all_models()])
-        taken, name = set(self.attachments), model.model
-        numbers = itertools.count(1)
-        while name in taken:
-            name = f"{model.model}_{next(numbers)}"
-        model._spec.modelname = name
-        host = site._native if site.is_worldbody else site._native.parent
-        frame = host.add_body(name=f"{name}/")
-        if not site.is_worldbody:
-            frame.pos, frame.quat = site._native.pos, site._native.quat
-            for key in ("euler", "axisangle", "xyaxes", "zaxis", "type"):
-                setattr(frame.alt, key, getattr(site._native.alt, key))
-        self.attachments[name] = Attachment(model, frame)
-        model.parent_model = self
-        self.touch()
-        return self.enlist("body", frame)
+        return attaching.attach(self, site, model)
 
     def detach(self) -> None:
         """Take this model off the one that it is attached to."""
-        parent = self.parent_model
-        if parent is None:
-            raise UsageError(f"Cannot detach model {self.model!r}: it is not attached")
-        attachment = parent.attachments.pop(self.model)
-        builder.remove(parent, parent.handle("body", attachment.frame))
-        self.parent_model = None
-
-    def rename(self, old: str, new: str) -> None:
-        """Rename an attached model, with its frame and the frame's joints."""
-        if new in self.attachments and new != old:
-            raise UsageError(
-                f"model {self.model!r} has {new!r} attached already. Attached: {', '.join(self.attachments)}"
-            )
-        attachment = self.attachments[old]
-        for native in (attachment.frame, *attachment.frame.joints):
-            native.name = f"{new}/" + native.name[len(old) + 1 :]
-        self.attachments = {new if k == old else k: v for k, v in self.attachments.items()}
+        attaching.detach(self)
 
     def all_models(self) -> Iterator[Model]:
         """Yield this model and all attached to it, depth first."""
@@ -365,7 +375,13 @@ class Model:
         return compose.compile_model(self)
 
     def to_xml_string(self) -> str:
-        """Return the composed model as MJCF."""
-        spec = compose.compose(self)
+        """Return the composed model as MJCF; its files are called as ``get_assets`` calls them."""
+        with files.renamed(self):
+            spec = compose.compose(self)
+        files.flatten(spec)
         spec.compile()
         return spec.to_xml()
+
+    def get_assets(self) -> dict[str, bytes]:
+        """Return the contents of the files that ``to_xml_string`` names: name -> bytes."""
+        return files.collect(self)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim2real.composer import layout
+from sim2real.composer.arrays import is_jax
 from sim2real.composer.element import Element
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
@@ -58,7 +60,16 @@ class NamedArray(NDArrayOperatorsMixin):
         return self._array[self.rows(key)]
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        self._array[self.rows(key)] = value
+        array, rows = self._array, self.rows(key)
+        if is_jax(array):
+            setattr(self._holder, self._field.name, array.at[rows].set(value))
+        else:
+            array[rows] = value
+
+    @property
+    def axes(self) -> Any:
+        """``axes.row.convert_key_item(names)`` returns the rows of some names, as in dm_control."""
+        return SimpleNamespace(row=SimpleNamespace(convert_key_item=self._rows))
 
     def rows(self, key: Any) -> Any:
         """Return the numeric index for a key of names, elements or numbers.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import weakref
 from collections import OrderedDict
 from typing import Any
 
 from sim2real.composer import define
-from sim2real.composer.observation.base import Generic, Observable
+from sim2real.composer.observation.observable.base import Generic, Observable
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
 """What ``set_options`` can set."""
@@ -118,4 +119,7 @@ class Observables:
         found = self.__dict__.get("_observables", {})
         if name in found:
             return found[name]
+        declared = inspect.getattr_static(type(self), name, None)
+        if isinstance(declared, property):  # Python asks here when a property failed: let it say itself what it missed
+            return declared.__get__(self, type(self))
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}. Observables: {', '.join(found)}")

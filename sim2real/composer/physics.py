@@ -5,21 +5,22 @@ from __future__ import annotations
 import contextlib
 import logging
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from sim2real.composer import layout
-from sim2real.composer.binding import Binding, EmptyBinding
+from sim2real.composer.binding import Binding, EmptyBinding, Staleness
 from sim2real.composer.element import as_elements
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.named import Named
+from sim2real.composer.rendering import Renderers
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
 _log = logging.getLogger(__name__)
-_NO_ACTUATION = int(mj.mjtDisableBit.mjDSBL_ACTUATION)
+_RK4 = int(mj.mjtIntegrator.mjINT_RK4)
 
 
 class _Wrapper:
@@ -99,9 +100,10 @@ class Physics:
         self.data = DataView(data)
         self.named = Named(model, model, self.data.ptr)
         self._bindings: dict[Any, Any] = {}
-        self._dirty = False
+        self._renderers = Renderers(model)
+        self.staleness = Staleness()
         self._warnings = self.data.ptr.warning.number
-        self._warned = self._warnings.copy()
+        self._warned = self._warnings.tobytes()
 
     @classmethod
     def from_mjcf_model(cls, model: Any) -> Physics:
@@ -152,20 +154,27 @@ class Physics:
         """Return a copy of act, shape ``(na,)``."""
         return self.data.ptr.act.copy()
 
-    def get_state(self) -> np.ndarray:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
-        data = self.data.ptr
-        return np.concatenate([data.qpos, data.qvel, data.act])
+    def get_state(self, sig: int | None = None) -> np.ndarray:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or what ``mj_getState`` does."""
+        model, data = self.model.ptr, self.data.ptr
+        if sig is None:
+            return np.concatenate([data.qpos, data.qvel, data.act])
+        state = np.empty(mj.mj_stateSize(model, sig))
+        mj.mj_getState(model, data, state, sig)
+        return state
 
     state = get_state
 
-    def set_state(self, state: Any) -> None:
-        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+    def set_state(self, state: Any, sig: int | None = None) -> None:
+        """Set what ``get_state`` returns.
 
         Raises:
             UsageError: When the shape is another.
         """
         data, model = self.data.ptr, self.model.ptr
+        if sig is not None:
+            mj.mj_setState(model, data, np.asarray(state, float), sig)
+            return
         expected = (model.nq + model.nv + model.na,)
         if np.shape(state) != expected:
             raise UsageError(f"Input physics state has shape {np.shape(state)}. Expected {expected}.")
@@ -190,10 +199,10 @@ class Physics:
             PhysicsError: When MuJoCo warns.
         """
         model, data = self.model.ptr, self.data.ptr
-        self._warned[:] = self._warnings
+        self._warned = self._warnings.tobytes()
         if not self.legacy_step:
             mj.mj_step(model, data, nstep)
-        elif model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
+        elif model.opt.integrator == _RK4:
             mj.mj_step(model, data, nstep)
             mj.mj_step1(model, data)
         else:  # positions and velocities are those of this state already: finish the step, then prepare the next
@@ -205,9 +214,9 @@ class Physics:
 
     def forward(self) -> None:
         """Compute everything that follows from the state, without advancing."""
-        self._warned[:] = self._warnings
+        self._warned = self._warnings.tobytes()
         mj.mj_forward(self.model.ptr, self.data.ptr)
-        self._dirty = False
+        self.staleness.dirty = False
         self._check_warnings()
 
     def reset(self, keyframe_id: int | None = None) -> None:
@@ -245,9 +254,10 @@ class Physics:
             self._suppress = before
 
     def _check_warnings(self) -> None:
-        if np.array_equal(self._warnings, self._warned):
+        if self._warnings.tobytes() == self._warned:
             return
-        names = [n for n, new in zip(mj.mjtWarning.__members__, self._warnings > self._warned, strict=False) if new]
+        before = np.frombuffer(self._warned, self._warnings.dtype)
+        names = [n for n, new in zip(mj.mjtWarning.__members__, self._warnings > before, strict=False) if new]
         message = f"Physics state is invalid. Warning(s) raised: {', '.join(names)}"
         if not self._suppress:
             raise PhysicsError(message)
@@ -258,11 +268,11 @@ class Physics:
     @property
     def is_dirty(self) -> bool:
         """Whether something was written through a binding since everything was last computed."""
-        return self._dirty
+        return self.staleness.dirty
 
     def mark_as_dirty(self) -> None:
         """Have everything computed again before the next computed attribute is read through a binding."""
-        self._dirty = True
+        self.staleness.dirty = True
 
     def bind(self, elements: Any) -> Any:
         """Return the attributes of an element, or of several of one kind, in this physics.
@@ -270,19 +280,23 @@ class Physics:
         Raises:
             UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
         """
-        found, single = as_elements(elements)
-        key = (found, single)
-        binding = self._bindings.get(key)
-        if binding is None:
-            if not found:
-                binding = EmptyBinding()
-            else:
-                kind = found[0].kind
-                layout.attributes(kind)
-                ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
-                binding = Binding(weakref.proxy(self), kind, ids, single)
-            self._bindings[key] = binding
-        return binding
+        key: Any = tuple(elements) if isinstance(elements, list) else elements
+        try:
+            return self._bindings[key]
+        except (KeyError, TypeError):  # new, or a sequence without a hash
+            found, single = as_elements(elements)
+        key = found[0] if single else found
+        if key not in self._bindings:
+            self._bindings[key] = self._new_binding(found, single)
+        return self._bindings[key]
+
+    def _new_binding(self, found: tuple[Any, ...], single: bool) -> Any:
+        if not found:
+            return EmptyBinding()
+        kind = found[0].kind
+        layout.attributes(kind)
+        ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
+        return Binding(weakref.proxy(self), kind, ids, single)
 
     def get(self, elements: Any, name: str) -> Any:
         """Return an attribute of elements; the same call on both engines."""
@@ -322,20 +336,20 @@ class Physics:
         depth: bool = False,
         segmentation: bool = False,
         scene_option: Any = None,
+        render_flag_overrides: Mapping[Any, bool] | None = None,
     ) -> np.ndarray:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``."""
-        if depth and segmentation:
-            raise UsageError("Only one of depth or segmentation can be rendered at a time.")
-        with mj.Renderer(self.model.ptr, height, width) as renderer:
-            if depth:
-                renderer.enable_depth_rendering()
-            if segmentation:
-                renderer.enable_segmentation_rendering()
-            renderer.update_scene(self.data.ptr, camera_id, scene_option)
-            return renderer.render()
+        given = (depth, segmentation, scene_option, render_flag_overrides)
+        return self._renderers.render(self.data.ptr, (height, width), camera_id, *given)
+
+    @property
+    def contexts(self) -> None:
+        """None: there is no rendering context to keep up to date; what is drawn follows the model by itself."""
+        return
 
     def free(self) -> None:
         """Drop the model and the state."""
+        self._renderers.close()
         for binding in self._bindings.values():
             binding.free()
         self._bindings.clear()

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import builder, translate
-from sim2real.composer.element import Element
+from sim2real.composer import builder, merge, schema, translate
+from sim2real.composer.defaults import Defaults
+from sim2real.composer.element import FROM_DOCUMENTS, Element
+from sim2real.composer.element_list import ElementList
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
@@ -20,10 +22,12 @@ _LISTS = {
     "equality": ("equality",),
     "tendon": ("tendon",),
     "contact": ("pair", "exclude"),
-    "asset": ("mesh", "material", "texture", "hfield"),
+    "asset": ("mesh", "material", "texture", "hfield", "skin"),
     "custom": ("numeric", "text", "tuple"),
     "keyframe": ("key",),
 }
+SECTION_OF = {kind: section for section, kinds in _LISTS.items() for kind in kinds}
+"""Kind of element -> the section that it stands in."""
 _INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 _CHOICES = {
     "integrator": {k: getattr(mj.mjtIntegrator, f"mjINT_{k.upper()}") for k in _INTEGRATORS},
@@ -51,6 +55,11 @@ class Section:
         return f"<{self._name} of model {self._model.model!r}>"
 
     @property
+    def tag(self) -> str:
+        """The tag in MJCF."""
+        return self._name.rsplit(".", 1)[-1]
+
+    @property
     def _native(self) -> Any:
         """Return the part of the ``MjSpec`` that holds the fields."""
         found = self._model._spec
@@ -67,9 +76,15 @@ class Section:
         if not self._kinds:
             raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
         kind = self._kinds[0] if len(self._kinds) == 1 else tag
-        if kind not in self._kinds:
-            raise UsageError(f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}")
+        if kind not in self._kinds or tag == "plugin":
+            hint = FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
+            raise UsageError(
+                f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}", hint=hint
+            )
         return builder.add_to_section(self._model, kind, tag, attrs)
+
+    def _everything(self) -> list[Element]:
+        return [e for kind in self._kinds for e in self._model.find_all(kind)]
 
     def all_children(self) -> list[Element]:
         """Return the elements of this section, without those of attached models."""
@@ -83,17 +98,17 @@ class Section:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if name in self._kinds:
-            return self._model.find_all(name, exclude_attachments=True)
+        if name in self._kinds or (self._kinds and (self._name, name) in schema.tables()):
+            return ElementList(lambda: [e for e in self._everything() if name in (e.tag, e.kind)], name)
         if self._name == "compiler" and name == "angle":
-            return "degree" if self._native.degree else "radian"
+            return "degree" if self._model.reads_degrees() else "radian"
         if self._name == "visual":
             return Section(self._model, f"visual.{name}", f"visual.{name.rstrip('_')}")
         if self._name == "option" and name == "flag":
             return Flags(self._model)
         if not hasattr(self._native, name):
             raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
-        value = getattr(self._native, name)
+        value = merge.in_world(self._model, self._path, name, getattr(self._native, name))
         if isinstance(value, np.ndarray):  # which the caller may write into
             self._model.touch_settings()
         return next((k for k, v in _CHOICES[name].items() if v == value), value) if name in _CHOICES else value
@@ -102,7 +117,8 @@ class Section:
         native = self._native
         self._model.touch_settings()
         if self._name == "compiler" and name == "angle":
-            native.degree = value == "degree"
+            native.degree, self._model.inherits_angle = value == "degree", False
+            self._model.records.say_angle()
             return
         if self._name == "size" and name == "memory" and isinstance(value, str):
             value = int(float(value.rstrip("kKmMgG")) * _BYTES.get(value[-1].lower(), 1))
@@ -117,6 +133,7 @@ class Section:
             native.eulerseq = list(value)
             return
         setattr(native, name, translate.like(current, value))
+        merge.note(self._model, self._path, name)
 
     def _known(self) -> str:
         return ", ".join(n for n in dir(self._native) if not n.startswith("_"))
@@ -130,55 +147,43 @@ class Flags:
     def __init__(self, model: Model) -> None:
         object.__setattr__(self, "_model", model)
 
-    def _bit(self, name: str) -> tuple[str, int]:
-        for field, kind, prefix in (
-            ("disableflags", mj.mjtDisableBit, "mjDSBL_"),
-            ("enableflags", mj.mjtEnableBit, "mjENBL_"),
-        ):
-            bit = kind.__members__.get(prefix + name.upper())
-            if bit is not None:
-                return field, int(bit)
-        raise AttributeError(f"<option.flag> has no attribute {name!r}")
+    def _check(self, name: str) -> None:
+        if name not in merge.FLAGS:
+            raise AttributeError(f"<option.flag> has no attribute {name!r}. Available: {', '.join(merge.FLAGS)}")
 
     def __getattr__(self, name: str) -> str:
-        field, bit = self._bit(name)
+        self._check(name)
+        field, bit = merge.FLAGS[name]
         on = bool(getattr(self._model._spec.option, field) & bit) == (field == "enableflags")
-        return "enable" if on else "disable"
+        return merge.in_world(self._model, merge.FLAG, name, "enable" if on else "disable")
 
     def __setattr__(self, name: str, value: str) -> None:
-        field, bit = self._bit(name)
+        self._check(name)
         if value not in ("enable", "disable"):
             raise UsageError(f"option.flag.{name}={value!r} is not valid. Available: disable, enable")
-        bits = getattr(self._model._spec.option, field)
-        raised = (value == "enable") == (field == "enableflags")
-        setattr(self._model._spec.option, field, bits | bit if raised else bits & ~bit)
-        self._model.touch_settings()
+        merge.set_flag(self._model._spec, name, value)
+        merge.note(self._model, merge.FLAG, name)
 
 
-class Defaults:
-    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another."""
+class DocumentsOnly:
+    """A section that documents may have, and programs cannot add to: plug-ins and flexes.
 
-    __slots__ = ("_model", "name")
+    Args:
+        name: The section.
+    """
 
-    def __init__(self, model: Model, name: str) -> None:
-        self._model, self.name = model, name
+    __slots__ = ("_name",)
 
-    def add(self, tag: str, dclass: str) -> Defaults:
-        """Add a class below this one."""
-        if tag != "default":
-            raise UsageError(f"a <{tag}> cannot be added to <default>", hint="set default.<tag>.<attribute>")
-        spec = self._model._spec
-        spec.add_default(dclass, spec.find_default(self.name))
-        self._model.touch()
-        return Defaults(self._model, dclass)
+    def __init__(self, name: str) -> None:
+        self._name = name
 
-    def __getattr__(self, tag: str) -> Element:
-        if tag.startswith("__"):
-            raise AttributeError(tag)
-        native = getattr(self._model._spec.find_default(self.name), tag, None)
-        if native is None:
-            raise AttributeError(f"<default> has no elements {tag!r}")
-        return Element(self._model, tag, native)
+    def add(self, tag: str, **attrs: Any) -> Any:
+        """Refuse.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=FROM_DOCUMENTS)
 
 
 def make_sections(model: Model) -> dict[str, Any]:
@@ -187,5 +192,6 @@ def make_sections(model: Model) -> dict[str, Any]:
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
         found[name] = Section(model, name, path)
     found["statistic"] = Section(model, "statistic", "stat")
+    found |= {name: DocumentsOnly(name) for name in ("extension", "deformable")}
     found["default"] = Defaults(model, "main")
     return found

@@ -13,10 +13,11 @@ from dm_env import specs
 from sim2real.composer import define
 from sim2real.composer.entity import Entity
 from sim2real.composer.layout import names_of
-from sim2real.composer.observation.base import Generic
+from sim2real.composer.observation.observable.base import Generic
 from sim2real.errors import UsageError
 
-_UNLIMITED = 1e10
+UNLIMITED = 1e10
+"""Bound of an action that has none, in dm_control's specs."""
 
 
 def _steps(control_timestep: float, physics_timestep: float) -> int:
@@ -123,8 +124,8 @@ class Task(ABC):
         return specs.BoundedArray(
             (model.nu,),
             float,
-            np.where(limited, low, -_UNLIMITED),
-            np.where(limited, high, _UNLIMITED),
+            np.where(limited, low, -UNLIMITED),
+            np.where(limited, high, UNLIMITED),
             name="\t".join(name or str(i) for i, name in enumerate(names)),
         )
 

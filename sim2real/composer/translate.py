@@ -23,6 +23,8 @@ _ORIENTATIONS = {
     "xyaxes": mj.mjtOrientation.mjORIENTATION_XYAXES,
     "zaxis": mj.mjtOrientation.mjORIENTATION_ZAXIS,
 }
+ORIENTATIONS = frozenset(_ORIENTATIONS)
+"""Attributes that say how something is turned, besides ``quat``."""
 _RENAMED = {
     "geom": {"mesh": "meshname", "hfield": "hfieldname", "fluidcoef": "fluid_coefs"},
     "joint": {
@@ -44,7 +46,7 @@ _RENAMED = {
         "actuatorfrcrange": "actfrcrange",
         "actuatorfrclimited": "actfrclimited",
     },
-    "actuator": {"kp": "gainprm"},
+    "inertial": {"pos": "ipos", "quat": "iquat", "diaginertia": "inertia"},
     "equality": {"body1": "name1", "body2": "name2", "joint1": "name1", "joint2": "name2"},
     "sensor": dict.fromkeys(("site", "joint", "body", "actuator", "tendon", "camera"), "objname"),
     "pair": {"geom1": "geomname1", "geom2": "geomname2"},
@@ -107,6 +109,63 @@ def read(native: Any, kind: str, key: str) -> Any:
     if kind == "body" and key == "mocap":
         return "true" if value else "false"
     return value
+
+
+def point(native: Any, key: str, name: str) -> None:
+    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several."""
+    key, _, number = key.partition("[")
+    if not number:
+        setattr(native, key, name)
+        return
+    names = list(getattr(native, key))
+    names[int(number[:-1])] = name
+    setattr(native, key, names)
+
+
+def is_plain(native: Any, kind: str, key: str, value: Any) -> bool:
+    """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
+    found = _PLAIN.get((kind, key))
+    if found is None:
+        found = _PLAIN[kind, key] = _is_plain(native, kind, key)
+    return found[isinstance(value, str)]
+
+
+_PLAIN: dict[tuple[str, str], tuple[bool, bool]] = {}
+"""Kind and attribute -> whether a value can be put there: one that is no text, one that is."""
+
+
+def _is_plain(native: Any, kind: str, key: str) -> tuple[bool, bool]:
+    if key in _ORIENTATIONS and hasattr(native, "alt"):
+        return True, True
+    name = native_name(kind, key)
+    if name in _SKIPPED or not hasattr(native, name):
+        return False, False
+    value = getattr(native, name)
+    is_keyword = type(value).__module__.endswith("_enums") and not isinstance(value, mj.mjtLimited)
+    return True, not is_keyword or (kind, key) in _ENUMS
+
+
+def reset(native: Any, source: Any, names: tuple[str, ...] | None = None) -> None:
+    """Put attributes of an element back to those of another one, its defaults; default: all but its name."""
+    for name in attributes(native) if names is None else names:
+        if name in _ORIENTATIONS:
+            native.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
+        elif not callable(getattr(source, name)):
+            setattr(native, name, _detached(getattr(source, name)))
+    if names is None and hasattr(native, "alt"):
+        native.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
+
+
+@functools.cache
+def blank(kind: str) -> Any:
+    """Return an element of a kind as MuJoCo makes it."""
+    spec = mj.MjSpec()
+    kind = "body" if kind == "inertial" else kind
+    _BLANKS.append(spec)  # which owns the element
+    return getattr(spec.worldbody if kind in TREE_KINDS else spec, f"add_{kind}")()
+
+
+_BLANKS: list[Any] = []
 
 
 def assign(native: Any, kind: str, key: str, value: Any) -> None:
@@ -226,15 +285,19 @@ def _parsed(
     kind: str, tag: str, plain: tuple[tuple[str, str], ...], references: tuple[str, ...]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*plain, *((k, f"@{k}") for k in references)))
-    section = _SECTIONS.get(kind, kind)
-    spec = mj.MjSpec.from_string(f"<mujoco><{section}><{tag} {words}/></{section}></mujoco>")
-    source = getattr(spec, plural(kind))[0]
-    blank = getattr(mj.MjSpec(), f"add_{kind}")()
+    spec = mj.MjSpec()
+    if kind in TREE_KINDS:
+        text, owner = f"<worldbody><body><{tag} {words}/></body></worldbody>", spec.worldbody
+    else:
+        section = _SECTIONS.get(kind, kind)
+        text, owner = f"<{section}><{tag} {words}/></{section}>", spec
+    source = getattr(mj.MjSpec.from_string(f"<mujoco>{text}</mujoco>"), plural(kind))[2 if kind == "body" else 0]
+    fresh = getattr(owner, f"add_{kind}")()
     given = {native_name(kind, k) for k, _ in plain}
     fixed, named = {}, {}
     for name in _attributes(type(source)):
         value = getattr(source, name)
-        if name in given or not _same(value, getattr(blank, name)):
+        if name in given or not same(value, getattr(fresh, name)):
             value = _detached(value)
             (named if _is_reference(value) else fixed)[name] = value
     return fixed, named
@@ -255,7 +318,8 @@ def _detached(value: Any) -> Any:
     return list(value) if type(value).__name__.endswith("Vec") else value
 
 
-def _same(a: Any, b: Any) -> bool:
+def same(a: Any, b: Any) -> bool:
+    """Return whether two native values are equal."""
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
     if isinstance(a, str | bool | int | float) or hasattr(a, "value"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from sim2real.composer import compose
@@ -33,3 +34,20 @@ def get_frame_joints(mjcf_model: Model) -> list[Element] | None:
     """Return all joints of the frame of an attached model, or None when it is not attached."""
     frame = get_attachment_frame(mjcf_model)
     return None if frame is None else frame.find_all("joint", immediate_children_only=True)
+
+
+def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -> None:
+    """Give an element, as its own, the values that it takes from its classes of defaults.
+
+    Args:
+        element: The element.
+        attributes: Names of the attributes; default: all.
+    """
+    root = element.root
+    one: Any = root.default_class(root.builder.class_of(root, element))
+    while one is not root:
+        said = root.given(getattr(one, element.tag)).values
+        for name in said:
+            if (attributes is None or name in attributes) and getattr(element, name) is None:
+                setattr(element, name, said[name])
+        one = one.parent

@@ -7,9 +7,12 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
+from dm_env import specs
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from sim2real.composer.mjx.environment import MjxEnvironment
+from sim2real.composer.task import UNLIMITED
+from sim2real.errors import UsageError
 
 
 class MjxVectorEnv(VectorEnv):
@@ -24,11 +27,7 @@ class MjxVectorEnv(VectorEnv):
 
     def __init__(self, environment: MjxEnvironment, num_envs: int) -> None:
         self.environment, self.num_envs = environment, num_envs
-        model = environment.model
-        limited = np.asarray(model.actuator_ctrllimited, bool)
-        low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf).astype(np.float32)
-        high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf).astype(np.float32)
-        self.single_action_space = gymnasium.spaces.Box(low, high)
+        self.single_action_space = _action_box(environment.action_spec())
         self.single_observation_space = gymnasium.spaces.Dict(
             {k: _box(v) for k, v in environment.observation_spec().items()}
         )
@@ -69,6 +68,20 @@ class MjxVectorEnv(VectorEnv):
 
     def _observation(self) -> dict[str, np.ndarray]:
         return {k: np.asarray(v) for k, v in self._state.observation.items()}
+
+
+def _action_box(spec: Any) -> gymnasium.spaces.Box:
+    """Return the space of actions; what dm_env writes as a bound of 1e10 has none."""
+    if not isinstance(spec, specs.Array):
+        raise UsageError(
+            f"MjxVectorEnv takes actions that are one array, and the task's action_spec is {spec!r}",
+            hint="override action_spec in the task",
+        )
+    dtype = np.float32 if np.issubdtype(spec.dtype, np.floating) else spec.dtype
+    bounds = (getattr(spec, "minimum", -np.inf), getattr(spec, "maximum", np.inf))
+    low, high = (np.broadcast_to(b, spec.shape).astype(float) for b in bounds)
+    low, high = np.where(low <= -UNLIMITED, -np.inf, low), np.where(high >= UNLIMITED, np.inf, high)
+    return gymnasium.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
 def _box(leaf: Any) -> gymnasium.spaces.Box:

@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from sim2real.composer.mjx import constants
 from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
+from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseWorld
@@ -91,16 +93,25 @@ class ComposedWorld(BaseWorld):
         super().__init__(name, ticks, color=color, order=order)
         self.input_name, self.field = command, field
         self._parameters = dict(parameters or {})
-        self._model(self.init_params())  # refuses what cannot vary
+        self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
+        found = self._view()
+        self._set(found, self.init_params())  # refuses what cannot vary
+        if self._derives:
+            self.environment.carry(constants.derive(self.environment.model, found.mjx_model))
 
     def _view(self) -> MjxPhysics:
         return MjxPhysics(self.environment.model, self.environment.mjx_model, None, {})
 
-    def _model(self, params: WorldParams) -> Any:
-        """Return the model with the parameters in it."""
-        physics = self._view()
+    def _set(self, physics: MjxPhysics, params: WorldParams) -> None:
         for name, (elements, attribute) in self._parameters.items():
             physics.set(elements, attribute, params.values[name])
+
+    def _model(self, params: WorldParams, starts: bool = False) -> Any:
+        """Return the model with the parameters in it; what follows from masses and lengths is computed at the start."""
+        physics = self._view()
+        self._set(physics, params)
+        if starts and self._derives:
+            physics.recompute_constants()
         return physics.mjx_model
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> WorldParams:
@@ -115,7 +126,7 @@ class ComposedWorld(BaseWorld):
         model = self.environment.model
         qpos = model.qpos0 if params.qpos is None else params.qpos
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
-        return self.environment.reset(key, self._model(params), (qpos, qvel))
+        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
 
     def output(self, state: State) -> Any:
         """Return the message that says what a state is; default: the task's observation."""
@@ -129,9 +140,17 @@ class ComposedWorld(BaseWorld):
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Take a control step under the newest action."""
         action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
-        state = self.environment.step(step_state.state, action, self._model(step_state.params))
+        before = step_state.state
+        state: Any = self.environment.step(before, action, self._model(step_state.params))
+        # What is over stays over: others look only now and then.
+        truncated = jnp.where(before.done, before.truncated, state.truncated)
+        state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
         return new, self.output(state)
+
+    def ends(self, state: State) -> tuple[Any, Any]:
+        """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""
+        return state.done & ~state.truncated, state.truncated
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:
         found = (graph_state or GraphState()).params.get(self.name)

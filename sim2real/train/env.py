@@ -68,6 +68,8 @@ class EnvState(NamedTuple):
 class GraphEnvironment:
     """A graph over its timelines, each episode on a timeline of its own, with parameters of its own.
 
+    An episode is over where its timeline is, and before that where a composed task in it ends.
+
     Args:
         graph: The compiled graph; its supervisor must be the task's.
         task: The pipeline's task.
@@ -85,6 +87,9 @@ class GraphEnvironment:
         self.length = graph.rows - 1
         # Traced once each, for shapes, rollouts and evaluations alike: of MuJoCo's worlds that takes 5 s every time.
         self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
+        # Worlds of composed tasks say themselves when an episode is over; importing them here would import MuJoCo.
+        found: dict[str, Any] = {name: getattr(node, "ends", None) for name, node in graph.nodes.items()}
+        self._ending = {name: ends for name, ends in found.items() if ends is not None}
 
     def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode on a random timeline."""
@@ -105,8 +110,10 @@ class GraphEnvironment:
         second_half = gs.step > self.length // 2
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
-        truncated = gs.step >= self.length
+        ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
+        terminated = jnp.any(jnp.array([e[0] for e in ended], bool))
+        truncated = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (self.length - self.length // 2)}
         new = EnvState(gs, step_state, total, good)
-        return Step(new, self.task.observe(step_state), reward, jnp.bool_(False), truncated, valid, metrics)
+        return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)

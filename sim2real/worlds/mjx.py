@@ -11,6 +11,7 @@ import mujoco
 from flax import struct
 
 from sim2real.composer.import_mjx import mjx
+from sim2real.composer.mjx import gate
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseWorld
@@ -53,7 +54,8 @@ class MjxWorld(BaseWorld):
 
     Raises:
         UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
-            delays of its own (ignored or misplaced there; they belong to the graph) or the no-slip solver.
+            delays of its own (ignored or misplaced there; they belong to the graph), the no-slip solver, an integrator
+            that it does not have, springs without dampers.
     """
 
     def __init__(
@@ -76,13 +78,10 @@ class MjxWorld(BaseWorld):
                 f"world {name!r}: a tick of {1 / self.rate:g} s is {steps:g} time steps of {model.opt.timestep:g} s",
                 hint="choose a rate or a timestep that divides the tick",
             )
-        if int(model.nhistory) > 0:
-            raise UsageError(
-                f"world {name!r}: the model delays actuators or sensors itself, which MJX ignores",
-                hint="take delay and nsample out of the MJCF and put the delay on the graph's connection",
-            )
-        if int(model.opt.noslip_iterations) > 0:
-            raise UsageError(f"world {name!r}: MJX has no no-slip solver", hint="set noslip_iterations to 0")
+        try:
+            gate.check_model(model)
+        except UsageError as error:
+            raise UsageError(f"world {name!r}: {error.args[0]}", hint=error.hint) from None
         self._mjx_model = mjx.put_model(model)
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:

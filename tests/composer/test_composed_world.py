@@ -118,6 +118,17 @@ def test_wrong_rates_and_parameters_are_refused():
         composer.ComposedWorld("world", task, parameters={"c": (geoms, "contype")})
 
 
+def test_parameters_bring_the_constants_that_follow_from_them():
+    task = Push()
+    cart = task.root_entity.mjcf_model.find("body", "cart")
+    world = composer.ComposedWorld("world", task, parameters={"mass": (cart, "mass")})
+    params = world.init_params().replace(values={"mass": jnp.array(2.0)})
+    model = jax.jit(lambda params: world._model(params, starts=True))(params)
+    np.testing.assert_allclose(model.body_invweight0[1], [0.5, 0.0], rtol=1e-6)
+    state = jax.eval_shape(lambda: world.init_state(None, GraphState(params={"world": params})))
+    assert {"body_invweight0", "body_subtreemass", "dof_invweight0"} <= set(state.leaves)  # steps go on with them
+
+
 class Witness(Push):
     """Leaves the start as it is, and keeps what it finds there."""
 
@@ -180,8 +191,18 @@ def test_brax_runs_the_task_with_its_own_wrappers(environment):
     first, (done, _, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
     assert first.shape == (3, 3)
     assert [np.flatnonzero(d).tolist() for d in np.asarray(done)] == [[9, 19]] * 3
-    np.testing.assert_array_equal(observations[:, 9], first)
+    starts = np.stack([first, observations[:, 9], observations[:, 19]])[..., 2]
+    assert len(np.unique(starts)) == 9  # every episode of every copy starts somewhere else
     assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
+
+
+def test_brax_may_save_the_fresh_starts(environment):
+    """Episodes then start from the same state, and go on with numbers of their own."""
+    env = composer.BraxEnv(environment, fresh_starts=False)
+    first = jax.jit(env.reset)(jax.random.key(0))
+    step = jax.jit(lambda key: env.step(first.replace(info={**first.info, "key": key}), jnp.ones(1)))
+    keys = [jax.random.key_data(step(jax.random.key(i)).pipeline_state.key) for i in range(2)]
+    assert (keys[0] != keys[1]).any()
 
 
 @pytest.fixture(scope="module")

@@ -284,3 +284,39 @@ def test_importing_the_composer_does_not_import_jax(tmp_path):
 
     code = "import sys; from sim2real import composer; composer.Environment; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_corruptor_changes_nothing_but_its_own_observable(oracle, ours):
+    """Controls that are bound make the next read of a place compute accelerations anew; it must not come earlier."""
+
+    def felt(kit, corruptor):
+        model = kit.mjcf.from_xml_string(
+            '<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/>'
+            '<site name="tip" pos=".3 0 0"/></body></worldbody>'
+            '<actuator><motor name="m" joint="j" gear="5"/></actuator>'
+            '<sensor><accelerometer site="tip"/></sensor></mujoco>'
+        )
+
+        found = {
+            "felt": kit.observable.MJCFFeature("sensordata", model.sensor.all_children()),
+            "tip": kit.observable.MJCFFeature("xpos", model.find("site", "tip"), corruptor=corruptor),
+        }
+
+        class Shake(kit.composer.NullTask):
+            @property
+            def task_observables(self):
+                return found
+
+            def before_step(self, physics, action, random_state):
+                physics.bind(model.find("actuator", "m")).ctrl = action[0]
+
+        task = Shake(kit.composer.ModelWrapperEntity(model))
+        task.set_timesteps(0.02, 0.005)
+        for value in found.values():
+            value.enabled = True
+        env = kit.composer.Environment(task)
+        env.reset()
+        return [env.step([a]).observation["felt"].tolist() for a in (1.0, -1.0)]
+
+    expected = felt(oracle, None)
+    assert felt(ours, None) == felt(ours, lambda value, random_state: value) == expected

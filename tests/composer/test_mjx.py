@@ -14,7 +14,7 @@ from sim2real.composer.variation import PhysicsVariator, deterministic, distribu
 from sim2real.errors import UsageError
 
 PENDULUM = """
-<mujoco model="pendulum"><option timestep="0.01" {option}/>
+<mujoco model="pendulum"><option timestep="0.01" {option}><flag {flag}/></option>
   <worldbody>
     <camera name="front"/>
     <body name="rod"><joint name="hinge" axis="0 1 0" damping=".05"/>
@@ -31,10 +31,9 @@ STEPS, SUBSTEPS = 100, 3
 class Swing(composer.Task):
     """Every hook does something, in calls that both engines know."""
 
-    def __init__(self, option="", actuator="", vary=False):
-        self._root_entity = composer.ModelWrapperEntity(
-            mjcf.from_xml_string(PENDULUM.format(option=option, actuator=actuator))
-        )
+    def __init__(self, option="", actuator="", flag="", vary=False):
+        text = PENDULUM.format(option=option, actuator=actuator, flag=flag)
+        self._root_entity = composer.ModelWrapperEntity(mjcf.from_xml_string(text))
         model = self._root_entity.mjcf_model
         self.hinge, self.tip, self.sensors = (
             model.find("joint", "hinge"),
@@ -184,6 +183,7 @@ def test_numeric_variations_differ_from_copy_to_copy():
         ({"option": 'noslip_iterations="3"'}, "no-slip solver: option noslip_iterations is 3"),
         ({"actuator": 'delay="0.02" nsample="8"'}, "delays and intervals: actuator 'torque'"),
         ({"option": 'integrator="implicit"'}, "integrator mjINT_IMPLICIT"),
+        ({"flag": 'spring="disable"'}, "springs and dampers where only one of them is disabled"),
     ],
 )
 def test_what_mjx_would_do_otherwise_is_refused_by_name(options, match):

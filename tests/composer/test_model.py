@@ -1,5 +1,6 @@
 """Composition: attach, detach, rename, references between models, options, keyframes, assets."""
 
+import copy
 from types import SimpleNamespace
 
 import mujoco
@@ -202,3 +203,159 @@ def test_a_wrapped_spec_can_be_edited_all_along():
     env.reset()
     assert env.physics.model.nq == 1
     assert "native/late" in arena.mjcf_model.to_xml_string()
+
+
+def child(option, kit=KIT):
+    body = '<worldbody><body name="b"><joint name="j"/><geom size=".1" mass="1"/></body></worldbody>'
+    model = kit.mjcf.from_xml_string(f'<mujoco model="arm">{option}{body}</mujoco>')
+    return kit.composer.ModelWrapperEntity(model)
+
+
+@pytest.mark.parametrize(
+    ("when", "physics", "steps"), [("before", 0.0005, 40), ("only control", 0.0005, 40), ("after", 0.002, 10)]
+)
+def test_a_task_knows_the_timestep_of_the_world(oracle, ours, when, physics, steps):
+    """The smallest timestep holds, unless one is set once all models are attached; as in dm_control."""
+    for kit in (oracle, ours):
+        arena = kit.composer.Arena()
+        task = kit.composer.NullTask(arena)
+        if when == "before":
+            task.set_timesteps(0.02, 0.002)
+        arena.attach(child('<option timestep="0.0005"/>', kit))
+        if when == "after":
+            task.set_timesteps(0.02, 0.002)
+        task.control_timestep = 0.02
+        env = kit.composer.Environment(task)
+        env.reset()
+        env.step([])
+        assert task.physics_timestep == env.physics.timestep() == physics
+        assert task.physics_steps_per_control_step == steps
+        assert env.physics.time() == pytest.approx(0.02)
+
+
+def test_what_an_arena_sets_is_never_lost_to_a_child_in_silence():
+    arena = composer.Arena()
+    arena.mjcf_model.option.flag.gravity = "enable"  # MuJoCo's default, but somebody wrote it
+    with pytest.raises(UsageError, match=r"`option.flag.gravity`: enable in model 'base', disable in model 'arm'"):
+        arena.attach(child('<option><flag gravity="disable"/></option>'))
+    arena = composer.Arena()
+    with pytest.raises(UsageError, match=r"`option.cone`"):  # elliptic in arenas
+        arena.attach(child('<option cone="pyramidal"/>'))
+    arena.attach(child('<option gravity="0 0 -9" iterations="100"><flag contact="disable"/></option>'))
+    assert arena.mjcf_model.option.gravity.tolist() == [0, 0, -9]
+    assert arena.mjcf_model.option.flag.contact == "disable"
+    with pytest.raises(ValueError, match="read-only"):
+        arena.mjcf_model.option.gravity[2] = 0.0
+
+
+def test_options_that_are_set_after_attaching_hold():
+    arena = composer.Arena()
+    arm = child('<option gravity="0 0 -9" iterations="100"><flag contact="disable"/></option>')
+    arena.attach(arm)
+    arena.mjcf_model.option.gravity = [0, 0, -1]
+    arena.mjcf_model.option.flag.contact = "enable"
+    option = arena.mjcf_model.compile().opt
+    assert (option.gravity[2], option.disableflags, option.iterations) == (-1, 0, 100)
+    arm.mjcf_model.option.gravity = [0, 0, -2]
+    assert arena.mjcf_model.compile().opt.gravity[2] == -2
+    with pytest.raises(UsageError, match=r"`option.gravity`"):  # what comes later is checked against what holds now
+        arena.attach(child('<option gravity="0 0 -1"/>'))
+    arm.detach()
+    assert arena.mjcf_model.compile().opt.gravity[2] == -1
+
+
+def test_programs_write_angles_in_the_unit_of_the_world(oracle, ours):
+    """Radians below an arena, degrees at the top; a unit of its own stays."""
+    for kit in (oracle, ours):
+        inner, outer = (kit.mjcf.RootElement(model=name) for name in ("inner", "outer"))
+        for root in (inner, outer):
+            body = root.worldbody.add("body", euler=[0, 0, 1.5])
+            body.add("joint", range=[-1, 1], limited=True)
+            body.add("geom", size=[0.1])
+        outer.attach(inner)
+        alone = kit.mjcf.Physics.from_mjcf_model(outer).model
+        np.testing.assert_allclose(alone.jnt_range, np.radians([[-1, 1]] * 2))
+        arena = kit.composer.Arena()
+        arena.attach(kit.composer.ModelWrapperEntity(outer))
+        model = kit.mjcf.Physics.from_mjcf_model(arena.mjcf_model).model
+        np.testing.assert_allclose(model.jnt_range, [[-1, 1]] * 2)
+        np.testing.assert_allclose(model.body_quat[-1], [np.cos(0.75), 0, 0, np.sin(0.75)])
+    own = mjcf.RootElement(model="own")
+    own.compiler.angle = "degree"
+    own.worldbody.add("geom", size=[0.1], euler=[0, 0, 90])
+    arena.mjcf_model.attach(own)
+    np.testing.assert_allclose(arena.mjcf_model.compile().geom_quat[-1], [2**-0.5, 0, 0, 2**-0.5])
+
+
+def test_lists_of_elements_are_alive(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement()
+        body = root.worldbody.add("body")
+        for name in "abc":
+            body.add("geom", name=name, type="sphere", size=[0.1])
+        shown = body.geom
+        del body.geom[0]
+        del body.geom["c"]
+        assert [g.name for g in shown] == ["b"]
+        body.geom.clear()
+        assert (len(shown), root.find_all("geom")) == (0, [])
+        root.worldbody.add("site", name="s")
+        root.sensor.add("gyro", site="s")
+        root.sensor.all_children()[0].remove()
+        assert root.sensor.all_children() == []
+    model = mjcf.from_xml_string(ARM)
+    model.actuator.actuator.clear()
+    assert model.compile().nu == 0
+    with pytest.raises(KeyError, match=r"no <body> 'hip'. Available: upper"):
+        _ = model.worldbody.body["hip"]
+
+
+def test_copies_are_independent():
+    """With what is attached, references across models, names of unnamed elements and their order."""
+    root, hand = mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
+    root.attach(hand)
+    root.option.gravity = [0, 0, -9.81]
+    root.worldbody.add("geom", type="box", size=[1, 1, 1])
+    root.equality.add("weld", body1="upper", body2=hand.find("body", "finger"), active="false")
+    before = root.to_xml_string()
+    for other in (copy.copy(root), copy.deepcopy(root)):
+        assert other.to_xml_string() == before
+        other.model = "other"
+        other.find("body", "upper").pos = [1, 2, 3]
+        other.find("attached_model", "hand").worldbody.add("geom", name="more", size=[0.1])
+        other.find("attached_model", "hand").find("geom", "palm").name = "back"
+        assert other.compile().geom("hand/back").id == root.compile().geom("hand/palm").id
+        assert other.worldbody.geom[-1].full_identifier == "//unnamed_geom_4"
+        assert other.compile().opt.gravity[2] == -9.81
+    assert (root.model, root.to_xml_string()) == ("arm", before)
+
+
+@pytest.mark.parametrize(
+    ("section", "tag", "attributes", "match"),
+    [
+        (
+            "actuator",
+            "motor",
+            {"joint": "nope"},
+            r"actuator 'x' of model 'arm' names the joint 'nope'.*Available: should",
+        ),
+        ("sensor", "gyro", {"site": "nope"}, "sensor 'x' of model 'arm' names the site 'nope'"),
+        ("contact", "exclude", {"body1": "nope", "body2": "upper"}, "exclude 'x' of model 'arm' names the body 'nope'"),
+    ],
+)
+@pytest.mark.parametrize("attached", [False, True])
+def test_elements_that_name_nothing_are_refused_by_name(attached, section, tag, attributes, match):
+    model = mjcf.from_xml_string(ARM)
+    getattr(model, section).add(tag, name="x", **attributes)
+    if attached:
+        mjcf.RootElement().attach(model)
+    with pytest.raises(UsageError, match=match):
+        model.root_model.compile()
+
+
+def test_references_across_models_may_have_names():
+    root, hand = mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
+    root.attach(hand)
+    root.equality.add("weld", name="w", body1="upper", body2=hand.find("body", "finger"))
+    model = root.compile()
+    assert model.equality("w").obj2id == model.body("hand/finger").id

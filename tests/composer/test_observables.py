@@ -2,8 +2,8 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.observation.base import AGGREGATORS
 from sim2real.composer.observation.observable import Generic, MJCFFeature
+from sim2real.composer.observation.observable.base import AGGREGATORS
 
 
 class Pair(composer.Observables):
@@ -100,3 +100,25 @@ def test_the_mixin_demands_its_observables():
 
     with pytest.raises(TypeError, match="colour"):
         Abstract(Part())
+
+
+def test_what_an_observable_misses_is_named_itself():
+    class Blind(composer.Observables):
+        @composer.observable
+        def speed(self):
+            return MJCFFeature("qvel", self._entity.legs)
+
+        @property
+        def total(self):
+            return self._entity.wings
+
+    class Bird(composer.ModelWrapperEntity):
+        def _build_observables(self):
+            return Blind(self)
+
+    with pytest.raises(AttributeError, match="'Bird' object has no attribute 'legs'"):
+        Bird(mjcf.RootElement())
+    bird = composer.ModelWrapperEntity(mjcf.RootElement())
+    Blind.speed = 0
+    with pytest.raises(AttributeError, match="has no attribute 'wings'"):
+        _ = Blind(bird).total

@@ -221,7 +221,7 @@ def test_a_recording_with_a_hiccup_fits_the_window_of_its_commands(nodes):
     """Commands that leave at once after a hiccup may be more than the loop expects: the window grows, nothing else."""
     sensor, _, actuator, world = nodes
     actuator.scheduling = Scheduling.PHASE
-    found = recorded_loop(sensor, actuator, world, 0.06)
+    found = recorded_loop(sensor, actuator, world, 0.06, TICK_S)
     calm = draw(found, 2.0)
     assert make_room(found, calm) == {}
     assert world.inputs["actuator"].delay_dist.burst == BURST

@@ -1,5 +1,7 @@
 """The nodes of a servo robot in simulation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +42,7 @@ def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair, monkey
     goal, before = jnp.array([0.7, -0.4]), jnp.array([0.1, 0.2])
     for resumed, tick, expected in ((True, 0, goal), (True, 1, before), (False, 0, before)):
         world = pair.make_world(resumed)
-        state = State(*[None] * 13).replace(
+        state = State(*[None] * len(dataclasses.fields(State))).replace(
             steps=jnp.int32(tick), variables={"goal": before, "reference": before, "other": before}
         )
         after, _ = world.step(StepState(state=state, inputs=heard("actuator", Goals(goal))))

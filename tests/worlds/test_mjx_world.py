@@ -68,6 +68,7 @@ def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():
     [
         (arm(), 70.0, "time steps"),
         (arm(option='noslip_iterations="3"'), 100.0, "no-slip"),
+        (arm(option='integrator="implicit"'), 100.0, "world 'world': MJX has no integrator mjINT_IMPLICIT"),
         (arm(actuator='delay="0.02" nsample="8"'), 100.0, "ignores"),
     ],
 )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import weakref
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -12,13 +14,13 @@ from flax import struct
 from mujoco import mjx
 
 from sim2real.composer.environment import ObservationPadding
-from sim2real.composer.hooks import Hooks
-from sim2real.composer.mjx import gate, stepping
-from sim2real.composer.mjx.leaks import guarded
+from sim2real.composer.mjx import gate, stepping, views
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import make_rings
+from sim2real.composer.mjx.tracing import TracedHooks
 from sim2real.composer.mjx.warp import WarpEngine
+from sim2real.composer.physics import Physics
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
 
@@ -35,6 +37,7 @@ class State:
         memory: What variations keep from draw to draw: name -> array.
         rings: Samples of the observables that may still be read.
         steps: int32: control steps since the reset.
+        dirty: Whether hooks set something after everything that follows from the state was last computed.
         observation: Name -> array.
         reward: Reward of the last step; 0 after a reset.
         discount: Discount of what comes next, in [0, 1].
@@ -50,6 +53,7 @@ class State:
     memory: Any
     rings: Any
     steps: Any
+    dirty: Any
     observation: Any
     reward: Any
     discount: Any
@@ -63,7 +67,8 @@ class MjxEnvironment:
 
     The hooks of the task and its entities are those of the C engine, called while the programs are traced: they read
     and set the physics, compute with ``physics.np``, draw from ``random_state`` and keep what they need later in
-    ``physics.variables``. ``initialize_episode_mjcf`` runs once, when the environment is made.
+    ``physics.variables``. ``initialize_episode_mjcf`` and ``after_compile`` run once, when the environment is made;
+    ``after_compile`` gets the C engine's physics, and the programs start from the model that it leaves.
 
     Args:
         task: The task.
@@ -107,25 +112,38 @@ class MjxEnvironment:
         if arena is not None:
             task._root_entity = arena  # pyright: ignore[reportAttributeAccessIssue]
         self.task, self._attempts, self._legacy = task, max_reset_attempts, legacy_step
-        self._hooks, self._registry = Hooks(task), Registry()
+        self._hooks, self._registry = TracedHooks(task), Registry()
         random_state = np.random.RandomState(seed)
         self._hooks.run("initialize_episode_mjcf", random_state)
+        self._hooks.refresh()
+        self.model = task.root_entity.mjcf_model.root_model.compile()
+        self._look_at_compiled(random_state)
         observables = task.observables
         gate.check_observables(observables)
-        self.model = task.root_entity.mjcf_model.root_model.compile()
         gate.check_model(self.model)
         gate.simplify_cone(self.model)
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
-        self._rings = make_rings(observables, self.substeps, strip_singleton_obs_buffer_dim, initial)
+        strip = strip_singleton_obs_buffer_dim
+        self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
         self._warp = self._make_warp(impl, naconmax, njmax)
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
+        self._start = _initial_data(self.model) if self._warp is None else self._warp.start
+        views.freeze(self.model)
         self._changed: tuple[str, ...] = ()
-        self._dry = False
-        self._hooks.refresh()
+        self._dry = self._stays_dirty = False
+        self._steady = True
+        self._shapes: tuple[Any, Any] = ((), ())  # of rewards and discounts
         self._discover()
+
+    def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
+        """Run ``after_compile`` on the host, and ask for the action's shape there."""
+        physics = Physics(self.model, self._legacy)
+        view: Any = weakref.proxy(physics)
+        self._hooks.run("after_compile", view, random_state)
+        self._action_spec = self.task.action_spec(view)
 
     def _make_warp(self, impl: str, naconmax: int | None, njmax: int | None) -> WarpEngine | None:
         if impl == "warp":
@@ -138,29 +156,33 @@ class MjxEnvironment:
 
     def _physics(self, state: State | None = None, model: Any = None) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
-        model = self.mjx_model if model is None else model
-        if state is None:
-            data = mjx.make_data(self.model, impl="jax") if self._warp is None else self._warp.start
-            physics = MjxPhysics(self.model, model, data, {}, self._legacy, self._warp or stepping)
-            physics.is_dirty = True
-            memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
-            random_state = JaxRandomState(None, memory, self._registry)
-        else:
-            physics = MjxPhysics(self.model, model, state.data, {}, self._legacy, self._warp or stepping)
-            random_state = JaxRandomState(state.key, {}, self._registry)
-            physics.load((state.data, state.leaves, state.variables, state.key, state.memory), random_state)
+        compiled = self.mjx_model if model is None else model
+        data = self._start if state is None else state.data
+        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp or stepping)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
+        physics.switch_on()
+        physics.start = self._start
         physics.dry = self._dry
+        if state is None:
+            # On Warp nothing was computed yet; a model of the copy's own is not the one that was computed with.
+            physics.is_dirty = self._warp is not None or model is not None
+            memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
+            return physics, JaxRandomState(None, memory, self._registry)
+        random_state = JaxRandomState(state.key, {}, self._registry)
+        physics.load((state.data, state.leaves, state.variables, state.key, state.memory), random_state)
+        physics.is_dirty = state.dirty if self._stays_dirty else False
         return physics, random_state
 
     def _discover(self) -> None:
-        """Trace a reset and a step, without physics, to find out what hooks set and keep; programs must carry it."""
-        key, action = jax.random.key(0), jnp.zeros(self.model.nu)
-        owners = (self.task, *self.task.iter_entities())
+        """Trace resets and steps, without physics, to find out what hooks set and keep; programs must carry it."""
+        key = jax.random.key(0)
+        action = jax.tree_util.tree_map(_zeros, self._action_spec)
         self._dry = True
-        with guarded(owners):
-            state = jax.eval_shape(self.reset, key)
-            after = jax.eval_shape(self.step, state, action)
+        with self._hooks.watching((self.task, *self.task.iter_entities())):
+            state, after = self._trace(key, action)
+            self._shapes = after.reward.shape, after.discount.shape
+            if self._stays_dirty:
+                state, after = self._trace(key, action)
         self._dry = False
         self._changed = tuple(sorted({*state.leaves, *after.leaves}))
         missing = sorted(set(after.variables) - set(state.variables))
@@ -169,6 +191,11 @@ class MjxEnvironment:
                 f"physics.variables {', '.join(map(repr, missing))} first appear in a step",
                 hint="set them in initialize_episode too: a compiled program carries the same variables all along",
             )
+        _check_variables(state.variables, after.variables)
+
+    def _trace(self, key: Any, action: Any) -> tuple[State, State]:
+        state = jax.eval_shape(self.reset, key)
+        return state, jax.eval_shape(self.step, state, action)
 
     def reset(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None) -> State:
         """Return a copy at the start of an episode.
@@ -183,6 +210,7 @@ class MjxEnvironment:
         if start is not None:
             physics.replace("data", "qpos", start[0])
             physics.replace("data", "qvel", start[1])
+            physics.mark_as_dirty()
 
         def attempt() -> None:
             self._hooks.run("initialize_episode", physics, random_state)
@@ -190,18 +218,21 @@ class MjxEnvironment:
         failed = physics.retry(attempt, random_state, self._attempts)
         physics.forward(actuation=False)
         rings = {r.name: r.reset(physics, random_state) for r in self._rings}
-        observation = {r.name: r.first(rings[r.name], physics, random_state) for r in self._rings}
-        data, leaves, variables, key, memory = physics.tree(random_state)
-        zero, no = jnp.zeros((), data.qpos.dtype), jnp.zeros((), bool)
         steps = jnp.zeros((), jnp.int32)
-        return State(data, leaves, variables, key, memory, rings, steps, observation, zero, zero + 1, no, no, failed)
+        observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
+        dirty = jnp.asarray(physics.is_dirty, bool)
+        data, leaves, variables, key, memory = physics.tree(random_state)
+        reward, discount = (jnp.zeros(shape, data.qpos.dtype) for shape in self._shapes)
+        no = jnp.zeros((), bool)
+        outcome = (observation, reward, discount + 1, no, no, failed)
+        return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def step(self, state: State, action: Any, model: Any = None) -> State:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
 
         Args:
             state: The copy.
-            action: Shape ``(nu,)``, or whatever the task makes of it.
+            action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
         physics, random_state = self._physics(state, model)
@@ -211,40 +242,60 @@ class MjxEnvironment:
         steps = state.steps + 1
         now = steps * self.substeps
         rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
-        dtype = state.reward.dtype
-        reward = jnp.asarray(self.task.get_reward(physics), dtype)
-        discount = jnp.asarray(self.task.get_discount(physics), dtype)
-        observation = {r.name: r.read(rings[r.name], now, physics, random_state) for r in self._rings}
+        dtype, task = state.reward.dtype, type(self.task).__name__
+        reward = jnp.asarray(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics), dtype)
+        discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
+        ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
+        observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
+        if self._dry:
+            self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
+        dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
         diverged = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all() & jnp.isfinite(data.qacc).all())
         diverged = diverged if self._warp is None else diverged | self._warp.overflowed(data)
         reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
-        ended = diverged | jnp.asarray(self.task.should_terminate_episode(physics), bool)
+        ended = diverged | jnp.asarray(ends, bool)
         late = jnp.zeros((), bool) if self.step_limit is None else steps >= self.step_limit
         outcome = (observation, reward, discount, ended | late, late & ~ended, state.failed)
-        return State(data, leaves, variables, key, memory, rings, steps, *outcome)
+        return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def _substeps(self, physics: MjxPhysics, random_state: JaxRandomState, state: State, action: Any) -> Any:
         """Take all physics steps of a control step; return the rings, without the samples of the last one."""
         buffered = [r for r in self._rings if not r.direct]
 
+        entry = physics.is_dirty
+
         def substep(carry: Any, i: Any) -> tuple[Any, None]:
-            tree, rings = carry
+            tree, rings, dirty = carry
             physics.load(tree, random_state)
+            physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
             self._hooks.run("before_substep", physics, action, random_state)
             physics.step()
             self._hooks.run("after_substep", physics, random_state)
             now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
             new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
-            return (physics.tree(random_state), {**rings, **new}), None
+            if self._dry:  # is it known, for every physics step alike, whether something is to be computed anew?
+                self._steady = physics.is_dirty is entry
+            return (physics.tree(random_state), {**rings, **new}, jnp.asarray(physics.is_dirty, bool)), None
 
-        start = (physics.tree(random_state), state.rings)
+        carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool))
         if self.substeps == 1 or self._dry:
-            (tree, rings), _ = substep(start, jnp.zeros((), jnp.int32))
+            carry, _ = substep(carry, jnp.zeros((), jnp.int32))
+            tree, rings, _ = carry
         else:
-            (tree, rings), _ = jax.lax.scan(substep, start, jnp.arange(self.substeps, dtype=jnp.int32))
+            (tree, rings, dirty), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
+            if not isinstance(physics.is_dirty, bool):  # else it is known how every physics step leaves it
+                physics.is_dirty = entry if self._steady else dirty
         physics.load(tree, random_state)
         return rings
+
+    def action_spec(self) -> Any:
+        """Return shape and bounds of an action, as the task says."""
+        return self._action_spec
+
+    def carry(self, names: Iterable[str]) -> None:
+        """Have every copy keep fields of the model that it was reset with, for the steps, such as ``body_mass``."""
+        self._changed = tuple(sorted({*self._changed, *names}))
 
     def observation_spec(self) -> dict[str, Any]:
         """Return name -> shape and dtype."""
@@ -260,3 +311,27 @@ class MjxEnvironment:
             return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
 
         return jax.tree_util.tree_map(choose, a, b)
+
+
+def _initial_data(model: Any) -> Any:
+    """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all that follows from it."""
+    physics = Physics(model)  # which computes everything, without the actuators
+    return mjx.put_data(model, physics.data.ptr, impl="jax")
+
+
+def _zeros(spec: Any) -> Any:
+    return jnp.zeros(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))
+
+
+def _check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
+    for name, value in before.items():
+        old, new = (
+            [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree_util.tree_leaves(v)] for v in (value, after[name])
+        )
+        if old != new:
+            (shape, dtype), (shape_after, dtype_after) = next(p for p in zip(old, new, strict=False) if p[0] != p[1])
+            raise UsageError(
+                f"physics.variables[{name!r}] starts as {dtype}{list(shape)} and is {dtype_after}{list(shape_after)} "
+                "after a step",
+                hint="start it with what it becomes, such as physics.np.zeros(3)",
+            )

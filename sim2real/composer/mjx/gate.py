@@ -7,12 +7,13 @@ from typing import Any
 
 from mujoco import mjx
 
-from sim2real.composer.observation.base import MujocoCamera, Observable
-from sim2real.composer.observation.mjcf import MJCFCamera
+from sim2real.composer.observation.observable.base import MujocoCamera, Observable
+from sim2real.composer.observation.observable.mjcf import MJCFCamera
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
 _INTEGRATORS = (mj.mjtIntegrator.mjINT_EULER, mj.mjtIntegrator.mjINT_RK4, mj.mjtIntegrator.mjINT_IMPLICITFAST)
+_PASSIVE = (mj.mjtDisableBit.mjDSBL_SPRING, mj.mjtDisableBit.mjDSBL_DAMPER)
 
 
 def check_model(model: Any) -> None:
@@ -26,6 +27,12 @@ def check_model(model: Any) -> None:
             f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",
             hint="set it to 0 in the model that sets it",
         )
+    passive = [int(model.opt.disableflags) & int(flag) != 0 for flag in _PASSIVE]
+    if any(passive) and not all(passive):
+        raise UsageError(
+            "MJX leaves out springs and dampers where only one of them is disabled",
+            hint="disable both, or neither and set stiffness or damping to 0",
+        )
     for kind, count in (("actuator", model.nactuator), ("sensor", model.nsensor)):
         object_type = getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}")
         adr = getattr(model, f"{kind}_historyadr", None)
@@ -33,7 +40,7 @@ def check_model(model: Any) -> None:
         if late:
             raise UsageError(
                 f"MJX ignores MuJoCo's own delays and intervals: {kind} {', '.join(map(repr, late))}",
-                hint="take delay, nsample and interval out of the MJCF; delay the observable instead",
+                hint="take delay, nsample and interval out of the MJCF; delay the observable or the connection instead",
             )
     if model.opt.integrator not in _INTEGRATORS:
         raise UsageError(

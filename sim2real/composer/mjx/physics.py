@@ -3,98 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 from sim2real.composer import layout
 from sim2real.composer.element import as_elements
-from sim2real.composer.mjx import stepping, warp
+from sim2real.composer.mjx import constants, stepping, warp
 from sim2real.composer.mjx.random import JaxRandomState
+from sim2real.composer.mjx.views import DataView, MjxBinding, ModelView, constant
 from sim2real.composer.named import Named
+from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
-_MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
-"""MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
-
-
-class DataView:
-    """``physics.data``: fields of the state, in MuJoCo's shapes."""
-
-    def __init__(self, physics: MjxPhysics) -> None:
-        object.__setattr__(self, "_physics", physics)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        data = self._physics.mjx_data
-        value = getattr(data, name) if name in data.__dataclass_fields__ else getattr(data._impl, name)
-        if value is None:  # what all copies have in common on Warp
-            raise AttributeError(f"a copy has no {name!r} of its own")
-        return jnp.reshape(value, (-1, 9)) if name in _MATRICES else value
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        self._physics.replace("data", name, value)
-
-
-class ModelView:
-    """``physics.model``: what differs from copy to copy comes from MJX, the rest from ``ptr``, the ``MjModel``."""
-
-    def __init__(self, physics: MjxPhysics) -> None:
-        object.__setattr__(self, "_physics", physics)
-
-    @property
-    def ptr(self) -> Any:
-        """The compiled ``mujoco.MjModel``."""
-        return self._physics.host
-
-    def name2id(self, name: str, kind: str) -> int:
-        """Return the number of an element; UsageError when there is none of that name."""
-        return layout.resolve(self.ptr, kind, (name,))[0]
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        model = self._physics.mjx_model
-        value = getattr(model, name) if name in model.__dataclass_fields__ else None
-        return value if isinstance(value, jax.Array) else getattr(self.ptr, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        self._physics.replace("model", name, value)
-
-
-class MjxBinding:
-    """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model."""
-
-    __slots__ = ("_fields", "_ids", "_kind", "_physics", "_single", "element_id")
-
-    def __init__(self, physics: MjxPhysics, kind: str, ids: tuple[int, ...], single: bool) -> None:
-        numbers = ids[0] if single else np.array(ids, int)
-        values = (layout.attributes(kind), ids, kind, physics, single, numbers)
-        for name, value in zip(self.__slots__, values, strict=True):
-            object.__setattr__(self, name, value)
-
-    def place(self, name: str) -> tuple[layout.Field, Any]:
-        """Return the field that holds an attribute and the index of the bound rows in it."""
-        field = self._fields.get(name)
-        if field is None:
-            known = ", ".join(sorted(self._fields))
-            raise AttributeError(f"bound element <{self._kind}> does not have attribute {name!r}. Available: {known}")
-        return field, layout.index(self._physics.host, field, self._ids, self._single)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        field, index = self.place(name)
-        return self._physics.read(field)[index]
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        field, index = self.place(name)
-        array = jnp.asarray(self._physics.read(field))
-        self._physics.replace(field.struct, field.name, array.at[index].set(jnp.asarray(value, array.dtype)))
+_FLUID = ("opt.density", "opt.viscosity", "opt.wind")
+_SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
+"""What MJX leaves out of a program because it was 0 when the model was compiled; set, it has to be in."""
 
 
 class MjxPhysics:
@@ -113,6 +41,7 @@ class MjxPhysics:
     Attributes:
         np: The module that computes with this engine's arrays: ``jax.numpy``.
         changed: Names of the model's fields that were set.
+        start: The ``mjx.Data`` that ``reset`` returns to.
         dry: Whether steps compute nothing: for finding out what hooks set and keep.
         failed: Whether no acceptable initial state was found, a boolean array.
     """
@@ -130,49 +59,120 @@ class MjxPhysics:
     ) -> None:
         self._engine = engine
         self.host, self.mjx_model, self.mjx_data = host, model, data
-        self.variables = variables
+        self.variables, self.start = variables, data
         self.legacy_step = legacy
         self.changed: set[str] = set()
         self.failed: Any = jnp.zeros((), bool)
-        self.is_dirty = self.dry = False
+        self.is_dirty: Any = False
+        self.dry = False
+        self._where: Any = None
         self._compiled = model
         self.data, self.model = DataView(self), ModelView(self)
         self.named = Named(host, self.model, self.data)
 
     def read(self, field: layout.Field) -> Any:
         """Return a whole field; computes everything anew first when an earlier write makes it out of date."""
+        if not field.triggers:
+            self._settle()
         if field.struct == "model":
             return getattr(self.model, field.name)
-        if self.is_dirty and not field.triggers:
-            self.forward()
         try:
             return getattr(self.data, field.name)
         except AttributeError:
             raise AttributeError(f"MJX has no field {field.name!r} in its data") from None
 
+    def mark_as_dirty(self) -> None:
+        """Have everything computed again before the next computed attribute is read through a binding."""
+        self.is_dirty = True
+
+    def _settle(self) -> None:
+        """Compute everything that follows from the state where something was written since that was last done.
+
+        Whether it was is known while the program is made, as a rule. Where it is not, because it depends on the step
+        before, it belongs to the state, and the program decides.
+        """
+        dirty, where = self.is_dirty, self._where
+        if dirty is False:
+            return
+        if dirty is True and where is None:
+            self.forward()
+            return
+        here = dirty if where is None else where & dirty
+        if not self.dry:
+            model, engine = self.mjx_model, self._engine
+            self.mjx_data = jax.lax.cond(here, lambda d: engine.forward(model, d), lambda d: d, self.mjx_data)
+        self.is_dirty = False if where is None else ~where & dirty
+
+    @contextlib.contextmanager
+    def only_where(self, condition: Any) -> Iterator[None]:
+        """Let what is read inside a ``with`` block change nothing where a condition, a boolean array, does not hold."""
+        self._where = condition
+        try:
+            yield
+        finally:
+            self._where = None
+
+    def check(self, struct: str, name: str, rows: Any = slice(None)) -> None:
+        """Refuse to set rows of a field where MJX would not see it.
+
+        Raises:
+            UsageError: With the field.
+        """
+        if struct != "model" or warp.is_warp(self.mjx_model):
+            return
+        if name.endswith("_frictionloss") and not np.all(np.asarray(getattr(self.host, name))[rows] > 0):
+            raise UsageError(
+                f"MJX leaves out {name!r} where it is 0 in the compiled model, and it is set there",
+                hint="compile the model with a small friction, such as 1e-6",
+            )
+        if name == "geom_size" and np.any(self.host.geom_type == mj.mjtGeom.mjGEOM_HFIELD):
+            raise UsageError(
+                "MJX looks for contacts with height fields within the compiled sizes of geoms: 'geom_size' cannot vary",
+                hint="set it in initialize_episode_mjcf, or use the C engine",
+            )
+
     def replace(self, struct: str, name: str, value: Any) -> None:
-        """Set a whole field of the model or the state.
+        """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
 
         Raises:
             UsageError: When the field is a constant of compiled programs.
         """
         holder = self.mjx_model if struct == "model" else self.mjx_data
-        current = getattr(holder, name) if name in holder.__dataclass_fields__ else None
+        current = _get(holder, name)
         if not isinstance(current, jax.Array):
-            raise UsageError(
-                f"MJX cannot change {name!r} inside a compiled program: it is one of its constants",
-                hint="set it in the model before it is compiled, or use the C engine",
-            )
+            raise constant(name)
         if struct == "model" and warp.is_warp(holder):
             warp.check_field(name)
-        value = jnp.reshape(jnp.asarray(value, current.dtype), current.shape)
-        if struct == "model":
-            self.mjx_model = self.mjx_model.replace(**{name: value})
-            self.changed.add(name)
-            self.is_dirty = True
-        else:
+        try:
+            value = jnp.broadcast_to(jnp.asarray(value, current.dtype), current.shape)
+        except ValueError:
+            value = jnp.reshape(jnp.asarray(value, current.dtype), current.shape)
+        if struct == "data":
             self.mjx_data = self.mjx_data.replace(**{name: value})
-            self.is_dirty = self.is_dirty or name in layout.TRIGGERS
+            return
+        self.mjx_model = self.mjx_model.tree_replace({name: value})
+        self.changed.add(name)
+        self.switch_on()
+
+    def switch_on(self) -> None:
+        """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
+        if warp.is_warp(self.mjx_model):
+            return
+        for path in {_SWITCHES[name] for name in self.changed if name in _SWITCHES}:
+            if not _get(self.mjx_model, path):
+                self.mjx_model = self.mjx_model.tree_replace({path: True})
+        if self.changed.intersection(_FLUID) and self.mjx_model.opt.integrator == mjx.IntegratorType.IMPLICITFAST:
+            raise UsageError("MJX has no fluid forces with the integrator implicitfast", hint="use Euler or RK4")
+
+    def recompute_constants(self) -> None:
+        """Compute what MuJoCo derives from masses and lengths anew, after they were changed.
+
+        Raises:
+            UsageError: On Warp.
+        """
+        for name, value in constants.derive(self.host, self.mjx_model).items():
+            self.replace("model", name, value)
+        self.mark_as_dirty()
 
     def initial(self, elements: Any, name: str) -> Any:
         """Return an attribute of elements as it was compiled."""
@@ -195,8 +195,19 @@ class MjxPhysics:
         return self.mjx_data.ctrl
 
     def set_control(self, control: Any) -> None:
-        """Set the controls, shape ``(nu,)`` [the actuators' units]."""
-        self.mjx_data = self.mjx_data.replace(ctrl=jnp.asarray(control, self.mjx_data.ctrl.dtype))
+        """Set the controls, shape ``(nu,)`` [the actuators' units].
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        old = self.mjx_data.ctrl
+        if jnp.size(control) not in (1, old.size):
+            raise UsageError(
+                f"there are {old.size} controls, and set_control was given an array of shape {jnp.shape(control)}",
+                hint="a task whose actions are something else overrides action_spec and before_step",
+            )
+        control = jnp.ravel(jnp.asarray(control, old.dtype))
+        self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(control, old.shape))
 
     def position(self) -> Any:
         """Return qpos, shape ``(nq,)``."""
@@ -205,6 +216,47 @@ class MjxPhysics:
     def velocity(self) -> Any:
         """Return qvel, shape ``(nv,)``."""
         return self.mjx_data.qvel
+
+    def activation(self) -> Any:
+        """Return act, shape ``(na,)``."""
+        return self.mjx_data.act
+
+    def get_state(self) -> Any:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
+        data = self.mjx_data
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    state = get_state
+
+    def set_state(self, state: Any) -> None:
+        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        nq, nv, na = self.host.nq, self.host.nv, self.host.na
+        if jnp.shape(state) != (nq + nv + na,):
+            raise UsageError(f"Input physics state has shape {jnp.shape(state)}. Expected {(nq + nv + na,)}.")
+        for name, part in zip(("qpos", "qvel", "act"), jnp.split(jnp.asarray(state), [nq, nq + nv]), strict=True):
+            self.replace("data", name, part)
+
+    def reset(self, keyframe_id: int | None = None) -> None:
+        """Return to the initial state, or to a keyframe; variables are forgotten.
+
+        Raises:
+            UsageError: When there is no such keyframe.
+        """
+        self.mjx_data = self.start
+        if keyframe_id is not None:
+            if not 0 <= keyframe_id < self.host.nkey:
+                raise UsageError(
+                    f"`keyframe_id` must be between 0 and {self.host.nkey - 1} inclusive, got: {keyframe_id}"
+                )
+            names = {"qpos": "qpos", "qvel": "qvel", "act": "act", "ctrl": "ctrl", "time": "time"}
+            for name, key in {**names, "mocap_pos": "mpos", "mocap_quat": "mquat"}.items():
+                self.replace("data", name, getattr(self.host, f"key_{key}")[keyframe_id])
+        self.variables.clear()
+        self.forward(actuation=False)
 
     def step(self) -> None:
         """Advance by a time step."""
@@ -259,14 +311,15 @@ class MjxPhysics:
 
     def tree(self, random_state: JaxRandomState) -> Any:
         """Return all that changes, as a tree."""
-        leaves = {name: getattr(self.mjx_model, name) for name in sorted(self.changed)}
-        return self.mjx_data, leaves, dict(self.variables), random_state.key, dict(random_state.memory)
+        leaves = {name: _get(self.mjx_model, name) for name in sorted(self.changed)}
+        variables = {name: jax.tree_util.tree_map(jnp.asarray, value) for name, value in self.variables.items()}
+        return self.mjx_data, leaves, variables, random_state.key, dict(random_state.memory)
 
     def load(self, tree: Any, random_state: JaxRandomState) -> None:
         """Take over what ``tree`` returned."""
         self.mjx_data, leaves, variables, random_state.key, memory = tree
         if leaves:
-            self.mjx_model = self.mjx_model.replace(**leaves)
+            self.mjx_model = self.mjx_model.tree_replace(leaves)
         self.changed |= set(leaves)
         for mine, theirs in ((self.variables, variables), (random_state.memory, memory)):
             mine.clear()
@@ -293,3 +346,10 @@ class MjxPhysics:
         self.mjx_model, self.failed, self.is_dirty = model, outer, True
         self.load(carry[1], random_state)
         return carry[0]
+
+
+def _get(holder: Any, path: str) -> Any:
+    """Return a field of a model or a state by its path, None when there is none."""
+    for step in path.split("."):
+        holder = getattr(holder, step, None)
+    return holder

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
+
 
 class Registry:
     """Which variations keep something from draw to draw, such as the position of a random walk.
@@ -97,14 +99,44 @@ class JaxRandomState:
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
 
-    def choice(self, a: Any, size: Any = None) -> Any:
-        """Return items of ``a``, or integers below it."""
+    def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
+        """Return items of ``a``, or integers below it, with probabilities ``p``."""
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
-        return jax.random.choice(self.next_key(), values, _shape(size))
+        return jax.random.choice(self.next_key(), values, _shape(size), replace, None if p is None else jnp.asarray(p))
 
     def permutation(self, x: Any) -> Any:
         """Return ``x``, or the integers below it, in random order."""
         return jax.random.permutation(self.next_key(), x)
+
+    def random_sample(self, size: Any = None) -> Any:
+        """Return floats in [0, 1)."""
+        return self.uniform(size=size)
+
+    def standard_normal(self, size: Any = None) -> Any:
+        """Return floats of mean 0 and standard deviation 1."""
+        return self.normal(size=size)
+
+    def beta(self, a: Any, b: Any, size: Any = None) -> Any:
+        """Return Beta distributed floats."""
+        return jax.random.beta(self.next_key(), a, b, _shape(size, a, b))
+
+    def gamma(self, shape: Any, scale: Any = 1.0, size: Any = None) -> Any:
+        """Return Gamma distributed floats."""
+        return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
+
+    def shuffle(self, x: Any) -> None:
+        """Refuse to work in place.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise UsageError("random_state.shuffle works in place", hint="use x = random_state.permutation(x)")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = ", ".join(n for n in dir(type(self)) if not n.startswith("_"))
+        raise AttributeError(f"on MJX random_state has no {name!r}. Available: {known}")
 
     def rand(self, *shape: int) -> Any:
         """Return floats in [0, 1)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -11,10 +11,18 @@ import numpy as np
 
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState
-from sim2real.composer.observation.base import Observable
+from sim2real.composer.observation.observable.base import Observable
 from sim2real.composer.variation import deterministic, distributions
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
+
+Call = Callable[..., Any]
+
+
+def _call(label: str, function: Call, *args: Any) -> Any:
+    del label
+    return function(*args)
+
 
 _NEVER = np.iinfo(np.int32).max
 
@@ -28,13 +36,17 @@ class Ring:
         steps: Physics steps in a control step.
         strip: Leave the buffer's axis out when it holds one sample.
         pad_initial: Pad with the first sample rather than with zeros.
+        call: Calls the observable, given what it is called and its arguments.
 
     Raises:
         UsageError: When a delay or an interval has no bound that a compiled program could reserve space for.
     """
 
-    def __init__(self, name: str, observable: Observable, steps: int, strip: bool, pad_initial: bool) -> None:
+    def __init__(
+        self, name: str, observable: Observable, steps: int, strip: bool, pad_initial: bool, call: Call = _call
+    ) -> None:
         self.name, self.observable, self.steps, self.pad_initial = name, observable, steps, pad_initial
+        self._call = call
         size: Any = observable.buffer_size or 1
         if callable(size):
             raise UsageError(f"observable {name!r}: on MJX the buffer size is a number, got {size!r}")
@@ -66,13 +78,13 @@ class Ring:
 
     def sample(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
         """Return the corrupted value as it is now."""
-        return jnp.asarray(self.observable(physics, random_state))
+        return jnp.asarray(self._call(f"observable {self.name!r}", self.observable, physics, random_state))
 
     def reset(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
         """Return the ring at the start of an episode: the first sample is in it."""
         value = self.sample(physics, random_state)
         if self.direct:
-            return {"first": value}
+            return {"value": value}
         ring = {
             "arrival": jnp.full(self.capacity, _NEVER, jnp.int32),
             "value": jnp.zeros((self.capacity, *value.shape), value.dtype),
@@ -86,13 +98,24 @@ class Ring:
     def update(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState, counts: Any) -> Any:
         """Return the ring after a physics step; ``counts`` is False for a step that is observed later."""
         if self.direct:
-            return ring
+            return {"value": self.sample(physics, random_state)}
         due = (now == ring["next"]) & counts
+        taken = due & self._can_be_read(now)
         before = dict(random_state.memory)
-        new = self._insert(ring, now, self.sample(physics, random_state), random_state)
-        for name, value in before.items():  # a draw that did not happen leaves no trace
-            random_state.memory[name] = jnp.where(due, random_state.memory[name], value)
+        with physics.only_where(taken):
+            value = self.sample(physics, random_state)
+        new = self._insert(ring, now, value, random_state)
+        for name, kept in before.items():  # a draw that did not happen leaves no trace
+            random_state.memory[name] = jnp.where(taken, random_state.memory[name], kept)
         return jax.tree_util.tree_map(lambda a, b: jnp.where(due, a, b), new, ring)
+
+    def _can_be_read(self, now: Any) -> Any:
+        """Return whether an observation can hold a sample taken now; the C engine does not take others either."""
+        if callable(self._interval) or callable(self._delay):
+            return True
+        arrival = now + int(self._delay)
+        read = -(-arrival // self.steps) * self.steps
+        return (read - arrival) // int(self._interval) < self.size
 
     def _insert(self, ring: Any, now: Any, value: Any, random_state: JaxRandomState) -> Any:
         slot = ring["count"] % self.capacity
@@ -104,11 +127,10 @@ class Ring:
             "next": now + _draw(self._interval, random_state),
         }
 
-    def read(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+    def read(self, ring: Any, now: Any) -> Any:
         """Return the last samples that have arrived, in the order of arrival, or what the aggregator makes of them."""
         if self.direct:
-            value = self.sample(physics, random_state)
-            return self._shaped(value[None])
+            return self._shaped(ring["value"][None])
         order = ring["count"] - 1 - jnp.arange(self.capacity)
         slots = order % self.capacity
         there = (order >= 0) & (ring["arrival"][slots] <= now)
@@ -119,20 +141,16 @@ class Ring:
         shown = jnp.reshape(there[last], (self.size, *(1,) * (values.ndim - 1)))
         return self._shaped(jnp.where(shown, values, pad))
 
-    def first(self, ring: Any, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
-        """Return the observation at the start of an episode."""
-        if self.direct:
-            return self._shaped(ring["first"][None])
-        return self.read(ring, jnp.zeros((), jnp.int32), physics, random_state)
-
     def _shaped(self, buffer: Any) -> Any:
         values = buffer[0] if self.strip else buffer
         return values if self.observable.aggregator is None else self.observable.aggregator(values)
 
 
-def make_rings(observables: Mapping[str, Observable], steps: int, strip: bool, pad_initial: bool) -> list[Ring]:
+def make_rings(
+    observables: Mapping[str, Observable], steps: int, strip: bool, pad_initial: bool, call: Call = _call
+) -> list[Ring]:
     """Return the rings of the enabled ones of some observables."""
-    return [Ring(name, o, steps, strip, pad_initial) for name, o in observables.items() if o.enabled]
+    return [Ring(name, o, steps, strip, pad_initial, call) for name, o in observables.items() if o.enabled]
 
 
 def _draw(value: Any, random_state: JaxRandomState) -> Any:

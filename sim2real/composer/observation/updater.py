@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.observation.base import Observable
+from sim2real.composer.observation.observable.base import Observable
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
 
@@ -32,11 +32,22 @@ def _drawer(value: Any, default: int, random_state: Any) -> int | Callable[[], A
     return int(value or default)
 
 
+def _order(sample: tuple[int, int, np.ndarray]) -> tuple[int, int]:
+    return sample[:2]
+
+
 class Channel:
     """One enabled observable: its schedule and the samples that may still be read."""
 
     def __init__(
-        self, name: str, observable: Observable, physics: Any, random_state: Any, strip: bool, pad_initial: bool
+        self,
+        name: str,
+        observable: Observable,
+        physics: Any,
+        random_state: Any,
+        steps_per_read: int,
+        strip: bool,
+        pad_initial: bool,
     ) -> None:
         self.name, self.observable = name, observable
         self._sample = observable.observation_callable(physics, random_state)
@@ -46,30 +57,55 @@ class Channel:
         self.size = int(size() if callable(size) else size)
         self._strip = strip and self.size == 1
         self._pad_initial = pad_initial
-        # Samples that no observation can hold are left out, unless taking them may have a side effect.
-        self._skips = observable.corruptor is None and not callable(self._interval) and not callable(self._delay)
+        # Samples that no observation can hold are left out, as in dm_control and on MJX: reading one may compute the
+        # physics anew, which other observables would show.
+        self._is_regular = not callable(self._interval) and not callable(self._delay)
+        self._gaps: dict[int, tuple[int, int]] = {}
+        self._steps_per_read = steps_per_read
         self._arrivals: list[tuple[int, int, np.ndarray]] = []
         self._count = 0
-        self._next = 0
+        self.due = 0
         self.spec = observable.array_spec
         with physics.suppress_physics_errors():
             first = np.array(self._sample())
         if self.spec is None:
             self.spec = specs.Array(first.shape, first.dtype)
-        self._first = first.astype(self.spec.dtype, copy=False)
+        self._dtype = self.spec.dtype
+        self._first = first.astype(self._dtype, copy=False)
         self._insert(0, self._first)
 
     def _insert(self, now: int, value: np.ndarray) -> None:
         """Note a sample taken now, and draw when the next one is taken."""
         self._arrivals.append((now + self._draw_delay(), self._count, value))
-        self._advance(now)
+        if self._is_regular:
+            taken, step = self._until_read(now)
+            self._count += taken
+            self.due = now + step
+            return
+        self._count += 1
+        self.due = now + self._draw_interval()
 
-    def _advance(self, now: int) -> None:
+    def _until_read(self, now: int) -> tuple[int, int]:
+        """Return how many samples later the next one comes that an observation holds, and how many steps later."""
+        found = self._gaps.get(now % self._steps_per_read)
+        if found is None:
+            interval, taken = self._draw_interval(), 1
+            while self._is_unread(now + taken * interval, interval):
+                taken += 1
+            found = self._gaps[now % self._steps_per_read] = taken, taken * interval
+        return found
+
+    def _is_unread(self, taken: int, interval: int) -> bool:
+        """Return whether so many samples arrive after one, before the next read, that no observation holds it."""
+        arrival = taken + self._draw_delay()
+        read = -(-arrival // self._steps_per_read) * self._steps_per_read
+        return (read - arrival) // interval >= self.size
+
+    def _draw_interval(self) -> int:
         interval = int(self._interval() if callable(self._interval) else self._interval)
         if interval < 1:
             raise UsageError(f"observable {self.name!r}: the update interval must be at least 1 step, got {interval}")
-        self._count += 1
-        self._next = now + interval
+        return interval
 
     def _draw_delay(self) -> int:
         delay = int(self._delay() if callable(self._delay) else self._delay)
@@ -77,36 +113,40 @@ class Channel:
             raise UsageError(f"observable {self.name!r}: the delay must be at least 0 steps, got {delay}")
         return delay
 
-    def update(self, now: int, steps_per_read: int) -> None:
-        """Sample, if it is time."""
-        if now != self._next:
-            return
-        if self._skips:
-            arrival = now + self._draw_delay()
-            read = -(-arrival // steps_per_read) * steps_per_read
-            if (read - arrival) // int(self._interval) >= self.size:  # pyright: ignore[reportArgumentType]
-                self._advance(now)
-                return
-        self._insert(now, np.array(self._sample(), dtype=self.spec.dtype))  # pyright: ignore[reportOptionalMemberAccess]
+    def update(self, now: int) -> None:
+        """Take the sample that is due now."""
+        self._insert(now, np.array(self._sample(), dtype=self._dtype))
 
     def read(self, now: int) -> np.ndarray:
         """Return the buffer, or what the aggregator makes of it."""
-        arrived = sorted((s for s in self._arrivals if s[0] <= now), key=lambda s: s[:2])[-self.size :]
-        self._arrivals = arrived + [s for s in self._arrivals if s[0] > now]
-        shape, dtype = self._first.shape, self._first.dtype
+        arrived = self._arrived(now)
         if self._strip and not self.observable.aggregator:
             if arrived:
                 return arrived[0][2].copy()
-            return self._first.copy() if self._pad_initial else np.zeros(shape, dtype)
-        buffer = np.zeros((self.size, *shape), dtype)
-        if self._pad_initial:
-            buffer[:] = self._first
-        for row, sample in enumerate(arrived, start=self.size - len(arrived)):
-            buffer[row] = sample[2]
+            return self._first.copy() if self._pad_initial else np.zeros(self._first.shape, self._dtype)
+        if len(arrived) == self.size == 1:
+            buffer = arrived[0][2][np.newaxis].copy()
+        else:
+            buffer = np.zeros((self.size, *self._first.shape), self._dtype)
+            if self._pad_initial:
+                buffer[:] = self._first
+            for row, sample in enumerate(arrived, start=self.size - len(arrived)):
+                buffer[row] = sample[2]
         aggregator = self.observable.aggregator
         if aggregator is None:
             return buffer
         return np.asarray(aggregator(buffer[0] if self._strip else buffer))
+
+    def _arrived(self, now: int) -> list[tuple[int, int, np.ndarray]]:
+        """Return the samples that an observation holds now, in the order of their arrival; forget those before."""
+        samples = self._arrivals
+        if not self._is_regular:
+            samples.sort(key=_order)
+        there = len(samples)
+        while there and samples[there - 1][0] > now:
+            there -= 1
+        del samples[: max(0, there - self.size)]
+        return samples[: min(there, self.size)]
 
     def observation_spec(self) -> specs.Array:
         """Return what ``read`` returns: shape, dtype, and bounds where they are known."""
@@ -165,7 +205,8 @@ class Updater:
             made = type(observables)()
             for name, value in observables.items():
                 if value.enabled:
-                    made[name] = Channel(name, value, physics, random_state, self._strip, self._pad_initial)
+                    options = (self._steps_per_read, self._strip, self._pad_initial)
+                    made[name] = Channel(name, value, physics, random_state, *options)
             return made
 
         self._channels = self._map(channels, self._observables)
@@ -177,10 +218,13 @@ class Updater:
 
     def update(self) -> None:
         """Count a step of the physics, and take the samples that are due."""
-        self._require_reset()
+        if self._channels is None:
+            self._require_reset()
         self._now += 1
+        now = self._now
         for channel in self._flat:
-            channel.update(self._now, self._steps_per_read)
+            if channel.due == now:
+                channel.update(now)
 
     def get_observation(self) -> Any:
         """Return name -> array, in the structure of the observables."""

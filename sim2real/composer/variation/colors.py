@@ -41,7 +41,12 @@ class HsvVariation(Variation):
     def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
         """Return a colour."""
         h, s, v, alpha = evaluate(self._channels, initial_value, current_value, random_state)
-        return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
+        xp = namespace(h, s, v, alpha)
+        if xp is np:
+            return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
+        # The same without branches: a channel falls from v to v (1 - s) with the hue's distance from it.
+        places = (xp.asarray([5.0, 3.0, 1.0]) + 6.0 * h) % 6.0
+        return xp.append(v - v * s * xp.clip(xp.minimum(places, 4.0 - places), 0.0, 1.0), alpha)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, HsvVariation) and self._channels == other._channels

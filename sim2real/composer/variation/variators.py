@@ -10,7 +10,7 @@ import numpy as np
 from sim2real.composer.arrays import is_jax
 from sim2real.composer.variation.base import evaluate
 
-_CONSTANTS = frozenset(
+CONSTANTS = frozenset(
     {"mass", "inertia", "ipos", "iquat", "pos", "quat", "armature", "qpos0", "qpos_spring", "gear", "stiffness", "size"}
 )
 """Attributes that MuJoCo computes constants from, such as the inertia seen at a joint."""
@@ -64,7 +64,7 @@ class PhysicsVariator:
     """Varies attributes of the compiled model and of the state; for ``initialize_episode`` and the steps.
 
     On MJX the initial value is that of the compiled model, and only numeric fields of the model can vary from copy to
-    copy. Constants that MuJoCo derives from masses and lengths are computed anew on the C engine.
+    copy. Constants that MuJoCo derives from masses and lengths are computed anew.
     """
 
     def __init__(self) -> None:
@@ -91,9 +91,10 @@ class PhysicsVariator:
                 else:
                     if bound.initial is None:
                         bound.initial = np.copy(current)
-                    initial, derived = bound.initial, derived or name in _CONSTANTS
+                    initial = bound.initial
+                derived = derived or name in CONSTANTS
                 setattr(binding, name, evaluate(bound.variation, initial, current, random_state))
-        if derived and hasattr(physics, "recompute_constants"):
+        if derived:
             physics.recompute_constants()
 
     def clear(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from dm_env import specs
 
 from sim2real.composer.element import Element
-from sim2real.composer.observation.base import Observable
+from sim2real.composer.observation.observable.base import Observable
 from sim2real.errors import UsageError
 
 

@@ -1,0 +1,203 @@
+"""Classes of defaults. Elements follow them at any time, as in MJCF; in an ``MjSpec`` only when they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer import schema, translate
+from sim2real.composer.element import KIND_OF_TAG, Element
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.model import Model
+
+
+class Defaults:
+    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another.
+
+    Args:
+        model: The model.
+        name: The class; ``main`` is the one that holds for everything.
+    """
+
+    __slots__ = ("_model", "name")
+    tag = "default"
+
+    def __init__(self, model: Model, name: str) -> None:
+        self._model, self.name = model, name
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Defaults) and self._model is other._model and self.name == other.name
+
+    def __hash__(self) -> int:
+        return hash((id(self._model), self.name))
+
+    def __repr__(self) -> str:
+        return f"<default class {self.name!r} of model {self._model.model!r}>"
+
+    @property
+    def native(self) -> Any:
+        """The ``MjsDefault``."""
+        return self._model._spec.find_default(self.name)
+
+    @property
+    def dclass(self) -> str | None:
+        """The name of the class; None for the one that holds for everything."""
+        return None if self.name == "main" else self.name
+
+    @property
+    def root(self) -> Model:
+        """The model."""
+        return self._model
+
+    @property
+    def parent(self) -> Any:
+        """The class that this one takes its values from; the model for the one that holds for everything."""
+        above = self._model.records.class_parent(self.name)
+        return self._model if above is None else Defaults(self._model, above)
+
+    @property
+    def default(self) -> list[Defaults]:
+        """The classes that take their values from this one."""
+        return [Defaults(self._model, name) for name in self._model.records.classes_below(self.name)]
+
+    def all_children(self) -> list[Any]:
+        """Return the classes below."""
+        return list(self.default)
+
+    def add(self, tag: str, dclass: str) -> Defaults:
+        """Add a class below this one."""
+        if tag != "default":
+            raise UsageError(f"a <{tag}> cannot be added to <default>", hint="set default.<tag>.<attribute>")
+        self._model._spec.add_default(dclass, self.native)
+        self._model.records.add_class(dclass, self.name)
+        self._model.touch()
+        return Defaults(self._model, dclass)
+
+    def find(self, kind: str, identifier: str) -> Defaults | None:
+        """Return the class of a name, or None; the kind is ``default``."""
+        if kind != "default" or self._model._spec.find_default(identifier) is None:
+            return None
+        return Defaults(self._model, identifier)
+
+    def __getattr__(self, tag: str) -> DefaultElement:
+        if tag.startswith("__"):
+            raise AttributeError(tag)
+        native = getattr(self.native, KIND_OF_TAG.get(tag, tag), None)
+        if native is None:
+            raise AttributeError(f"<default> has no elements {tag!r}")
+        return DefaultElement(self, KIND_OF_TAG.get(tag, tag), native, tag)
+
+
+class _Shown(np.ndarray):
+    """An attribute of a class of defaults: writing an item sets it there, and so in the elements that follow it."""
+
+    _write: Callable[[np.ndarray], None] | None = None
+
+    def __array_finalize__(self, obj: Any) -> None:
+        """Let arrays that are computed from this one be plain."""
+        self._write = None
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        whole = np.array(self)
+        whole[key] = value
+        if self._write is None:
+            raise UsageError("this is a part of an attribute of defaults: write into the attribute itself")
+        self._write(whole)
+
+
+class DefaultElement(Element):
+    """The defaults of one kind of element in a class.
+
+    What is set here also reaches the elements of the class, and those of the classes below it, that do not say it
+    themselves.
+    """
+
+    __slots__ = ("_owner", "_tag")
+    _owner: Defaults
+    _tag: str
+
+    def __init__(self, owner: Defaults, kind: str, native: Any, tag: str) -> None:
+        super().__init__(owner.root, kind, native)
+        object.__setattr__(self, "_owner", owner)
+        object.__setattr__(self, "_tag", tag)
+
+    def __repr__(self) -> str:
+        return f"<defaults of {self._tag} in {self._owner!r}>"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DefaultElement) and (self._owner, self._tag) == (other._owner, other._tag)
+
+    def __hash__(self) -> int:
+        return hash((self._owner, self._tag))
+
+    @property
+    def tag(self) -> str:
+        """The tag in MJCF."""
+        return self._tag
+
+    @property
+    def parent(self) -> Defaults:
+        """The class."""
+        return self._owner
+
+    @property
+    def class_defaults(self) -> Any:
+        """MuJoCo's own defaults; asking a class for its class ends the process."""
+        return translate.blank(self.kind)
+
+    @property
+    def full_identifier(self) -> None:
+        """Defaults have no name."""
+        return None
+
+    def __getattr__(self, name: str) -> Any:
+        value = super().__getattr__(name)
+        if isinstance(value, np.ndarray):
+            value = value.copy().view(_Shown)
+            value._write = lambda whole: setattr(self, name, whole)
+            value.flags.writeable = False
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if value is None:
+            raise UsageError(
+                f"{name} of {self!r} cannot be taken back", hint="set it to the value that is to hold instead"
+            )
+        value = value.name if isinstance(value, Element) else value
+        fixed: Any = None
+        if not translate.is_plain(self._native, self.kind, name, value):
+            known = schema.attributes(self.kind, self._tag)
+            if name not in known:
+                available = ", ".join(sorted(known))
+                raise AttributeError(f"{name!r} is not a valid attribute for <{self._tag}>. Available: {available}")
+            fixed, _ = translate.from_xml(self.kind, self._tag, {name: value}, ())
+        self.root.records.note_default(self, self._tag, name, value)
+        for follower in self._followers(name):
+            if follower.kind == "actuator" and follower.tag != "general" and not isinstance(follower, DefaultElement):
+                self.root.builder.rebuild(self.root, follower)
+            elif fixed is None:
+                translate.assign(follower._native, self.kind, name, value)
+            else:
+                for key, item in fixed.items():
+                    setattr(follower._native, key, item)
+        self.root.touch()
+
+    def _followers(self, name: str) -> Iterator[Element]:
+        """Yield the elements whose value of an attribute comes from here: classes first, this one included."""
+        classes, found = [self._owner], set()
+        while classes:
+            one = classes.pop()
+            below = DefaultElement(one, self.kind, getattr(one.native, self.kind), self._tag)
+            if one != self._owner and name in self.root.given(below).values:
+                continue
+            found.add(one.name)
+            classes += one.default
+            yield below
+        for element in self.root.find_all(self.kind, exclude_attachments=True):
+            owner = element._native.classname
+            if (owner.name if owner else "main") in found and name not in self.root.given(element).values:
+                yield element

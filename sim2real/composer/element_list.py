@@ -1,0 +1,59 @@
+"""Lists of elements, such as ``body.geom`` and ``sensor.gyro``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim2real.composer.element import Element
+
+
+class ElementList(Sequence[Any]):
+    """Elements of one kind or tag in a body or a section; always those that are there now.
+
+    Args:
+        find: Returns them.
+        tag: What they are.
+    """
+
+    def __init__(self, find: Callable[[], list[Element]], tag: str) -> None:
+        self._find, self._tag = find, tag
+
+    def __len__(self) -> int:
+        return len(self._find())
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return an element by its number or its name, or a list of them for a slice."""
+        found = self._find()
+        if not isinstance(key, str):
+            return found[key]
+        named = [e for e in found if e.name == key]
+        if not named:
+            raise KeyError(
+                f"there is no <{self._tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in found)))}"
+            )
+        return named[0]
+
+    def __delitem__(self, key: Any) -> None:
+        for element in self[key] if isinstance(key, slice) else [self[key]]:
+            element.remove()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __add__(self, other: Iterable[Any]) -> list[Any]:
+        return [*self, *other]
+
+    def __radd__(self, other: Iterable[Any]) -> list[Any]:
+        return [*other, *self]
+
+    def __repr__(self) -> str:
+        return repr(self._find())
+
+    def clear(self) -> None:
+        """Delete them all."""
+        for element in self._find():
+            element.remove()

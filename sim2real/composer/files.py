@@ -1,0 +1,146 @@
+"""Files of meshes, textures and height fields: given as contents, collected, and written beside a model."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.model import Model
+
+KINDS = ("mesh", "hfield", "texture", "skin")
+"""Elements that may come from files."""
+_LISTS = {"meshes": "meshdir", "hfields": "meshdir", "skins": "meshdir", "textures": "texturedir"}
+
+
+@dataclass(frozen=True)
+class Asset:
+    """The contents of a file: ``asset.add('texture', file=mjcf.Asset(png, '.png'))``.
+
+    Args:
+        contents: The bytes.
+        extension: How the file's name ends, such as ``.stl``.
+        prefix: How it begins.
+    """
+
+    contents: bytes
+    extension: str
+    prefix: str = ""
+
+    def get_vfs_filename(self) -> str:
+        """Return a name that no file with other contents has."""
+        digest = hashlib.sha1(self.contents, usedforsecurity=False).hexdigest()
+        return "-".join(filter(None, (self.prefix, digest))) + self.extension
+
+
+def adopt(model: Model, asset: Asset) -> str:
+    """Give a model the contents of a file; return the name under which it has them."""
+    name = asset.get_vfs_filename()
+    model._spec.assets[name] = asset.contents
+    return name
+
+
+def asset_of(model: Model, kind: str, file: Asset | str) -> Asset:
+    """Return a file that a model names.
+
+    Raises:
+        UsageError: When there is no such file.
+    """
+    if isinstance(file, Asset):
+        return file
+    spec = model._spec
+    folder = spec.texturedir if kind == "texture" else spec.meshdir
+    path = Path(file)
+    for name in (file, str(Path(folder) / path), path.name):
+        if name in spec.assets:
+            return Asset(spec.assets[name], path.suffix, path.stem)
+    full = Path(spec.modelfiledir or ".") / (folder or "") / path
+    if not full.is_file():
+        raise UsageError(f"model {model.model!r} has no file {file!r}: it is neither among its assets nor at {full}")
+    return Asset(full.read_bytes(), path.suffix, path.stem)
+
+
+def collect(model: Model) -> dict[str, bytes]:
+    """Return the contents of all files of a model and of what is attached to it, by the names in its MJCF."""
+    found = {}
+    for one in model.all_models():
+        for _, asset in _named(one):
+            found[asset.get_vfs_filename()] = asset.contents
+    return found
+
+
+def _named(model: Model) -> Iterator[tuple[Any, Asset]]:
+    for plural in _LISTS:
+        for native in getattr(model._spec, plural):
+            if native.file:
+                yield native, asset_of(model, "texture" if plural == "textures" else "mesh", native.file)
+
+
+@contextlib.contextmanager
+def renamed(model: Model) -> Iterator[None]:
+    """Call every file of a model, and of what is attached to it, as ``collect`` does, in a ``with`` block."""
+    undo: list[tuple[Any, str, str]] = []
+    added: list[tuple[Any, str]] = []
+    try:
+        for one in model.all_models():
+            for native, asset in list(_named(one)):
+                name = asset.get_vfs_filename()
+                undo.append((native, "file", native.file))
+                if name not in one._spec.assets:
+                    added.append((one._spec, name))
+                    one._spec.assets[name] = asset.contents
+                native.file = name
+            for key in ("meshdir", "texturedir", "modelfiledir"):
+                undo.append((one._spec, key, getattr(one._spec, key)))
+                setattr(one._spec, key, "")
+        yield
+    finally:
+        for owner, key, value in undo:
+            setattr(owner, key, value)
+        for spec, name in added:
+            del spec.assets[name]
+
+
+def is_mixed(model: Model) -> bool:
+    """Return whether a model has files in memory and others on disk: attached, MuJoCo looks for all in one place."""
+    assets = model._spec.assets
+    if not assets:
+        return False
+    return any(n.file and n.file not in assets for plural in _LISTS for n in getattr(model._spec, plural))
+
+
+def flatten(spec: Any) -> None:
+    """Take the folders off the names of a composed spec's files: MuJoCo puts those of attached models into some."""
+    for plural in _LISTS:
+        for native in getattr(spec, plural):
+            name = native.file.rsplit("/", 1)[-1]
+            if name != native.file and native.file in spec.assets:
+                spec.assets[name] = spec.assets[native.file]
+                native.file = name
+
+
+def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | None = None) -> None:
+    """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
+
+    Args:
+        mjcf_model: The model.
+        out_dir: The folder.
+        out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
+
+    Raises:
+        UsageError: When the name does not end with ``.xml``.
+    """
+    name = out_file_name or f"{mjcf_model.model}.xml"
+    if not name.lower().endswith(".xml"):
+        raise UsageError(f"out_file_name must end with '.xml': got {name!r}")
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, contents in collect(mjcf_model).items():
+        (folder / file).write_bytes(contents)
+    (folder / name).write_text(mjcf_model.to_xml_string(), encoding="utf-8")

@@ -1,0 +1,240 @@
+"""What was said of an element, in MJCF's spelling: an ``MjSpec`` holds values, but not which of them are defaults."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+from xml.sax.saxutils import unescape
+
+import numpy as np
+
+from sim2real.composer import schema, translate
+from sim2real.composer.translate import mj
+
+if TYPE_CHECKING:
+    from sim2real.composer.element import Element
+
+_ATTRIBUTES = r"""(?:\s+[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*'))*"""
+_TAG = re.compile(rf"<!--.*?-->|<([A-Za-z]\w*)({_ATTRIBUTES})|\n", re.DOTALL)
+_PAIR = re.compile(r"""([\w:.-]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_QUOTES = {"&quot;": '"', "&apos;": "'"}
+_SENSORS = {kind: name.removeprefix("mjSENS_").lower() for name, kind in mj.mjtSensor.__members__.items()}
+_EQUALITIES = {kind: name.removeprefix("mjEQ_").lower() for name, kind in mj.mjtEq.__members__.items()}
+
+
+@dataclass(slots=True)
+class Given:
+    """The tag of an element, and the attributes that were given to it: name -> value, as it was written."""
+
+    tag: str
+    values: dict[str, Any] = field(default_factory=dict)
+
+    def note(self, name: str, value: Any) -> None:
+        """Note that an attribute was set; None takes it back."""
+        if value is None:
+            self.values.pop(name, None)
+        else:
+            self.values[name] = value
+
+
+class Document:
+    """The text of a model, from which the tags and attributes of its elements are read when somebody asks.
+
+    Args:
+        text: MJCF, no two elements of which stand on one line.
+
+    Attributes:
+        says_angle: Whether it says in which unit its angles are.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self.says_angle = re.search(r"<compiler[^>]*\sangle\s*=", text) is not None
+
+    @functools.cached_property
+    def lines(self) -> dict[int, Given]:
+        """Number of a line, from 1 -> what is given of the element that begins there."""
+        found, line = {}, 1
+        for match in _TAG.finditer(self._text):
+            if match[1]:
+                pairs = _PAIR.findall(match[2])
+                found[line] = Given(match[1], {_name(k): unescape(a or b, _QUOTES) for k, a, b in pairs})
+            line += match[0].count("\n")
+        return found
+
+    @functools.cached_property
+    def classes(self) -> dict[str, str | None]:
+        """Class of defaults -> the class above it, None for the one that holds for everything."""
+        found: dict[str, str | None] = {}
+
+        def visit(node: Any, above: str | None) -> None:
+            name = node.get("class", "main") if above is None else node.get("class")
+            found[name] = above
+            for below in node.findall("default"):
+                visit(below, name)
+
+        for top in ElementTree.fromstring(self._text).findall("default"):
+            visit(top, None)
+        return found
+
+
+def _name(key: str) -> str:
+    return "dclass" if key == "class" else key
+
+
+class Records:
+    """What was given of every element of a model.
+
+    Args:
+        document: What the model was made from, where it is known.
+        is_blank: Whether it was made from nothing: then nothing is given but what is noted.
+    """
+
+    def __init__(self, document: Document | None = None, is_blank: bool = False) -> None:
+        self._document, self.is_blank = document, is_blank
+        self._has_defaults = False
+        self._of: dict[Any, Given] = {}
+
+    @property
+    def has_defaults(self) -> bool:
+        """Whether there may be a class of defaults that says something."""
+        return self._has_defaults or not self.is_blank
+
+    def note_default(self, element: Element, tag: str, name: str, value: Any) -> None:
+        """Note that an attribute of a class of defaults was set."""
+        self._has_defaults = True
+        said = self.of(element)
+        said.tag = tag
+        said.note(name, value)
+
+    @property
+    def is_silent_on_angles(self) -> bool:
+        """Whether nobody said if angles are in degrees: neither the document that there is, nor a program."""
+        return self._document is not None and not self._document.says_angle
+
+    def say_angle(self) -> None:
+        """Note that a program said it."""
+        if self._document is not None:
+            self._document.says_angle = True
+
+    def note(self, native: Any, tag: str, values: dict[str, Any]) -> None:
+        """Note that an element was added."""
+        self._of[native] = Given(tag, values)
+
+    def class_parent(self, name: str) -> str | None:
+        """Return the class of defaults above another one, or None."""
+        return self._classes.get(name, None if name == "main" else "main")
+
+    def classes_below(self, name: str) -> list[str]:
+        """Return the classes of defaults directly below another one."""
+        return [below for below, above in self._classes.items() if above == name]
+
+    def add_class(self, name: str, above: str) -> None:
+        """Note a class of defaults."""
+        self._classes[name] = above
+
+    @functools.cached_property
+    def _classes(self) -> dict[str, str | None]:
+        return {} if self._document is None else dict(self._document.classes)
+
+    def forget(self, native: Any) -> None:
+        """Note that an element was deleted."""
+        self._of.pop(native, None)
+
+    def among(self, natives: Mapping[Any, Any]) -> Records:
+        """Return the same of a copied model: element -> its copy."""
+        made = Records(self._document, self.is_blank)
+        made._has_defaults = self._has_defaults
+        made._of = {natives[n]: Given(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
+        return made
+
+    def of(self, element: Element) -> Given:
+        """Return what was given of an element."""
+        native, kind = element._native, element.kind
+        key = (native, kind) if kind == "inertial" else native
+        found = self._of.get(key)
+        if found is None:
+            found = self._of[key] = self._found(element)
+        return found
+
+    def _found(self, element: Element) -> Given:
+        native, kind = element._native, element.kind
+        if self.is_blank and kind != "inertial":
+            return Given(_tag(native, kind))
+        return self._written(native, kind) or read(native, kind, element.class_defaults)
+
+    def _written(self, native: Any, kind: str) -> Given | None:
+        words = native.info.split()
+        if self._document is None or kind == "inertial" or len(words) != 2 or not words[1].isdigit():
+            return None
+        return self._document.lines.get(int(words[1]))
+
+
+def read(native: Any, kind: str, blank: Any) -> Given:
+    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``."""
+    tag = _tag(native, kind)
+    found = Given(tag)
+    for name in schema.attributes(kind, tag):
+        key = translate.native_name(kind, name)
+        if key in translate.attributes(native):
+            value = getattr(native, key)
+            if not translate.same(value, getattr(blank, key)):
+                found.values[name] = value
+    return found
+
+
+def _tag(native: Any, kind: str) -> str:
+    """Return the tag of an element of an ``MjSpec`` that nobody wrote down: MuJoCo forgets some of it."""
+    if kind == "sensor":
+        return _SENSORS.get(native.type, "user")
+    if kind == "equality":
+        return _EQUALITIES.get(native.type, "weld")
+    if kind == "actuator":
+        return "general"
+    if kind == "tendon":
+        return "fixed" if any(w.type == mj.mjtWrap.mjWRAP_JOINT for w in native.path) else "spatial"
+    return kind
+
+
+def show(value: Any, given: Any) -> Any:
+    """Return a native value as PyMJCF shows it: keywords as text, arrays as long as they were given.
+
+    Args:
+        value: The value that the ``MjSpec`` holds.
+        given: The value that was given.
+    """
+    if isinstance(value, np.ndarray) and value.ndim == 1:
+        size = len(given.split()) if isinstance(given, str) else np.size(given)
+        return value[:size]
+    if isinstance(value, bool | mj.mjtLimited):
+        return str(given).lower() if isinstance(given, str | bool | np.bool_) else ("false", "true", "auto")[int(value)]
+    if isinstance(value, float):  # materials are kept in single precision
+        exact = _number(given)
+        return exact if exact is not None and np.float32(exact) == np.float32(value) else value
+    if isinstance(value, int | str) and not hasattr(value, "name"):
+        return value
+    if type(value).__name__ in ("MjDoubleVec", "MjFloatVec", "MjIntVec"):
+        shown = np.array(value)
+        shown.flags.writeable = False
+        return shown
+    return given
+
+
+def _number(given: Any) -> float | None:
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        return None
+
+
+def parse(value: Any) -> Any:
+    """Return a value that no ``MjSpec`` holds, such as a servo's ``kp``, as a number, an array or text."""
+    try:
+        numbers = np.array(value.split() if isinstance(value, str) else value, float)
+    except (TypeError, ValueError):
+        return value
+    return float(numbers.ravel()[0]) if numbers.size == 1 else numbers

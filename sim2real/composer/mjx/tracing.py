@@ -1,0 +1,216 @@
+"""Hooks run while a program is made, once. What that would freeze or cannot do is refused with the hook's name."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import enum
+import functools
+import random
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import jax
+import jax.errors
+import numpy as np
+from jax.core import Tracer
+
+from sim2real.composer.define import cached_property
+from sim2real.composer.hooks import Hooks
+from sim2real.errors import UsageError
+
+_KEEP = "keep what changes in physics.variables[{name!r}], which belongs to each copy; set what does not in __init__"
+_DEPTH = 6
+_LIBRARIES = ("sim2real", "mujoco", "jax", "jaxlib", "numpy", "dm_env", "brax", "builtins", "functools", "weakref")
+_UNKNOWN = "while the program is made, values of the simulation are not known"
+_WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
+    (
+        jax.errors.TracerBoolConversionError,
+        "decides in Python (if, and, or, while, assert) on a value of the simulation",
+        _UNKNOWN,
+        "use physics.np.where(condition, a, b); a start is given up with physics.fail(condition)",
+    ),
+    (
+        jax.errors.TracerArrayConversionError,
+        "calls numpy on a value of the simulation",
+        _UNKNOWN,
+        "use physics.np, which is numpy on the C engine and jax.numpy here",
+    ),
+    (
+        jax.errors.TracerIntegerConversionError,
+        "uses a value of the simulation as a Python integer, as in range(n) or items[n]",
+        _UNKNOWN,
+        "use physics.np.asarray(items)[n]",
+    ),
+    (
+        jax.errors.NonConcreteBooleanIndexError,
+        "picks items with a mask",
+        "how many those are is not known while the program is made",
+        "use physics.np.where(mask, values, 0)",
+    ),
+    (
+        jax.errors.ConcretizationTypeError,
+        "makes a Python number of a value of the simulation, as float(), int() and .item() do",
+        _UNKNOWN,
+        "leave it an array",
+    ),
+    (
+        jax.errors.UnexpectedTracerError,
+        "uses a value that only existed in an earlier program",
+        "it was left in a variable of Python's",
+        "keep values from hook to hook in physics.variables",
+    ),
+    (
+        TypeError,
+        "writes into an array in place",
+        "arrays of compiled programs cannot be written into",
+        "use physics.write(element, 'qpos', value, index), or array = array.at[index].set(value)",
+    ),
+)
+"""Error of JAX -> what the function did, why that does not work, what to do instead."""
+
+
+@contextlib.contextmanager
+def named(label: str) -> Iterator[None]:
+    """Say what a function did that a compiled program cannot do, rather than what JAX made of it.
+
+    Raises:
+        UsageError: With the function's name and line.
+    """
+    try:
+        yield
+    except Exception as error:
+        for kind, what, why, hint in _WORDS:
+            if isinstance(error, kind) and (kind is not TypeError or "item assignment" in str(error)):
+                raise UsageError(f"{label} {what}{_line(error)}: {why}", hint=hint) from error
+        raise
+
+
+def _line(error: Exception) -> str:
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "site-packages" not in f.filename]
+    own = [f for f in frames if "/sim2real/composer/" not in f.filename.replace("\\", "/")]
+    return f" (line {own[-1].lineno}: {own[-1].line})" if own else ""
+
+
+class TracedHooks(Hooks):
+    """Hooks that are called while programs are made.
+
+    Attributes:
+        watched: The objects whose attributes hooks must not change; empty: none is looked at.
+    """
+
+    watched: tuple[Any, ...] = ()
+
+    def call(self, label: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Return what a function returns.
+
+        Raises:
+            UsageError: When it does what a compiled program cannot do, or changes what only Python would know.
+        """
+        before = [_attributes(owner) for owner in self.watched]
+        drawn = _drawn() if self.watched else None
+        with named(label):
+            result = function(*args)
+        for owner, values in zip(self.watched, before, strict=True):
+            _compare(label, owner, values, _attributes(owner))
+        if self.watched and _drawn() != drawn:
+            raise UsageError(
+                f"{label} draws from a global source of randomness: every episode would get the same numbers",
+                hint="draw from random_state",
+            )
+        return result
+
+    @contextlib.contextmanager
+    def watching(self, owners: Iterable[Any]) -> Iterator[None]:
+        """Refuse changes of some objects' attributes inside a ``with`` block; if it fails, put them back."""
+        self.watched = tuple(owners)
+        before = [dict(vars(owner)) for owner in self.watched]
+        try:
+            yield
+        except Exception:
+            for owner, values in zip(self.watched, before, strict=True):
+                vars(owner).clear()
+                vars(owner).update(values)
+            raise
+        finally:
+            self.watched = ()
+
+
+def _compare(label: str, owner: Any, before: dict[str, Any], after: dict[str, Any]) -> None:
+    """Refuse changes: only what was absent or None may be filled in, with what is no value of the simulation."""
+    for name in sorted({*before, *after}):
+        old, new = before.get(name, _print(None)), after.get(name, _print(None))
+        what = f"{type(owner).__name__}.{name}"
+        if old == new:
+            continue
+        if _has_tracer(vars(owner).get(name)):
+            raise UsageError(
+                f"{what} was set by a hook, {label}, to a value that only exists in the program",
+                hint=f"keep it in physics.variables[{name!r}]: it then belongs to each copy",
+            )
+        if old != _print(None):
+            raise UsageError(
+                f"{what} is changed by {label}. Hooks run once, while the program is made: "
+                "every copy and every step would see the same value",
+                hint=_KEEP.format(name=name),
+            )
+
+
+def _attributes(owner: Any) -> dict[str, Any]:
+    seen: set[int] = {id(owner)}
+    return {k: _print(v, seen) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
+
+
+def _is_cache(owner: type, name: str) -> bool:
+    return isinstance(getattr(owner, name, None), functools.cached_property | cached_property)
+
+
+class _Same:
+    """An object as such, whatever is in it."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.value is other.value
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+
+def _print(value: Any, seen: set[int] | None = None, depth: int = 0) -> Any:
+    """Return what tells whether a value has changed: its contents, of containers and of a program's own objects."""
+    seen = set() if seen is None else seen
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | enum.Enum | np.generic):
+        return type(value).__name__, repr(value)
+    if isinstance(value, np.ndarray):
+        return (value.shape, value.dtype.str, value.tobytes()) if value.dtype != object else _Same(value)
+    if isinstance(value, np.random.RandomState):
+        return _numbers(value.get_state())
+    if isinstance(value, np.random.Generator):
+        return repr(value.bit_generator.state)
+    if depth > _DEPTH or id(value) in seen:
+        return _Same(value)
+    seen.add(id(value))
+    if isinstance(value, dict):
+        return [(_print(k, seen, depth + 1), _print(v, seen, depth + 1)) for k, v in value.items()]
+    if isinstance(value, list | tuple | collections.deque):
+        return [_print(v, seen, depth + 1) for v in value]
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if type(value).__module__.partition(".")[0] in _LIBRARIES or isinstance(value, type) or callable(value):
+        return _Same(value)
+    return [_Same(value), *((k, _print(v, seen, depth + 1)) for k, v in getattr(value, "__dict__", {}).items())]
+
+
+def _has_tracer(value: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(value))
+
+
+def _drawn() -> Any:
+    return _numbers(np.random.get_state()), random.getstate()
+
+
+def _numbers(state: Any) -> Any:
+    _, keys, position, *rest = state
+    return keys.tobytes(), position, rest

@@ -1,0 +1,334 @@
+"""Every row of the page "Differences from dm_control": what they do, where it is cheap to see, and what we do."""
+
+import functools
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "differences.md"
+HINGE = '<mujoco model="arm">{}<worldbody>{}<body name="b"><joint name="j" {}/><geom size=".1" mass="1"/></body>'
+HINGE += "</worldbody>{}</mujoco>"
+
+
+def model(kit, compiler="", first="", joint="", last=""):
+    return kit.mjcf.from_xml_string(HINGE.format(compiler, first, joint, last))
+
+
+def below_an_arena(kit, *models):
+    """Return a compiled world, without the no-slip solver that one of both has."""
+    arena = kit.composer.Arena()
+    for one in models:
+        arena.attach(kit.composer.ModelWrapperEntity(one))
+    return kit.mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+
+
+def bodies(physics):
+    return [physics.model.id2name(i, "body") for i in range(physics.model.nbody)]
+
+
+def environment(kit, control=0.05, physics=0.005, task=None, observables=None, **options):
+    arena = kit.composer.Arena()
+    entity = kit.composer.ModelWrapperEntity(model(kit))
+    arena.attach(entity)
+    for name, observable in (observables or {}).items():
+        entity.observables.add_observable(name, observable)
+    task = (task or kit.composer.NullTask)(arena)
+    task.set_timesteps(control, physics)
+    return kit.composer.Environment(task, random_state=0, **options)
+
+
+def test_every_row_of_the_page_has_a_test():
+    rows = re.findall(r"^\| ([a-z]+_[a-z_]+|keyframes|hooks|overlays) \|", PAGE.read_text(), re.MULTILINE)
+    rows.remove("dm_control")
+    tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    assert sorted(rows) == sorted(tests - {"every_row_of_the_page_has_a_test"})
+
+
+# -- worlds
+
+
+def test_no_slip_solver(oracle, ours):
+    found = [below_an_arena(kit).model.opt.noslip_iterations for kit in (oracle, ours)]
+    assert found == [5, 0]
+    arena = ours.composer.Arena()
+    arena.mjcf_model.option.noslip_iterations = 5
+    assert ours.mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.opt.noslip_iterations == 5
+
+
+def test_degrees_of_documents(oracle, ours, caplog):
+    def ranges(kit):
+        return below_an_arena(kit, model(kit, joint='range="-1 1" limited="true"')).model.jnt_range[0, 1]
+
+    assert ranges(oracle) == 1.0
+    assert ranges(ours) == pytest.approx(np.radians(1.0))
+    assert "the document of model 'arm' does not say in which unit its angles are" in caplog.text
+    caplog.clear()
+    mine = model(ours, joint='range="-1 1" limited="true"')
+    mine.compiler.angle = "radian"
+    assert below_an_arena(ours, mine).model.jnt_range[0, 1] == 1.0
+    assert not caplog.text
+
+
+def test_compiler_settings(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root, arm = kit.mjcf.RootElement(model="root"), model(kit)
+        root.worldbody.add("body").add("geom", size=[0.1], mass=1)
+        arm.compiler.boundmass = 2.0
+        root.attach(arm)
+        found.append(np.delete(kit.mjcf.Physics.from_mjcf_model(root).model.body_mass, 2).tolist())  # the frame's
+    assert found == [[0.0, 2.0, 2.0], [0.0, 1.0, 2.0]]
+    below = below_an_arena(ours, model(ours, compiler='<compiler boundmass="0"/>', first='<body name="empty"/>'))
+    assert below.model.body_mass.tolist() == [0.0, 1e-5, 1e-5, 1.0]  # the arena's
+
+
+def test_keyframes(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        first, second = model(kit), model(kit, last='<keyframe><key name="k" qpos="0.5"/></keyframe>')
+        physics = below_an_arena(kit, first, second)
+        found.append(np.array(physics.model.key_qpos[0]))
+    assert [f.tolist() for f in found] == [[0.5, 0.0], [0.0, 0.5]]
+
+
+def test_order_at_sites(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root = model(kit, first='<site name="s"/>')
+        root.find("site", "s").attach(kit.mjcf.RootElement(model="hand"))
+        root.compiler.boundmass, root.compiler.boundinertia = 1e-5, 1e-9
+        found.append(bodies(kit.mjcf.Physics.from_mjcf_model(root)))
+    assert found == [["world", "hand/", "b"], ["world", "b", "hand/"]]
+
+
+def test_free_joints(oracle, ours):
+    floating = HINGE.format("", "", 'type="free"', "")
+    with pytest.raises(ValueError, match="free joint"):
+        below_an_arena(oracle, oracle.mjcf.from_xml_string(floating))
+    assert below_an_arena(ours, ours.mjcf.from_xml_string(floating)).model.nq == 7
+
+
+def test_unnamed_composites(oracle, ours):
+    cable = '<body><composite type="cable" curve="s" count="4 1 1" size="1" initial="none">'
+    cable += '<geom type="capsule" size=".01"/><joint kind="main"/></composite></body>'
+    found = [bodies(below_an_arena(kit, model(kit, first=cable)))[3] for kit in (oracle, ours)]
+    assert found == ["arm//unnamed_composite_0B_first", "arm/B_first"]
+
+
+# -- models in Python
+
+
+def test_unset_options(oracle, ours):
+    assert [model(kit).option.density for kit in (oracle, ours)] == [None, 0.0]
+    assert [model(kit).find("geom", "g") for kit in (oracle, ours)] == [None, None]
+    assert [model(kit).worldbody.body[0].pos for kit in (oracle, ours)] == [None, None]
+
+
+def test_references_by_name(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement()
+        root.asset.add("material", name="steel")
+        found.append(root.worldbody.add("geom", size=[1], material="steel").material)
+    assert found[0] == "steel"
+    assert found[1].name == "steel"
+
+
+def test_programs_and_parsers(oracle, ours):
+    for kit in (oracle, ours):
+        body = kit.mjcf.RootElement().worldbody.add("body")
+        if kit is oracle:
+            body.add("composite", type="cable", count=[4, 1, 1])
+        else:
+            with pytest.raises(UsageError, match=r"a <composite> cannot be added(.|\n)*from_xml_string"):
+                body.add("composite", type="cable", count=[4, 1, 1])
+
+
+def test_defaults_taken_back(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement()
+        root.default.geom.rgba = [1, 0, 0, 1]
+        if kit is oracle:
+            del root.default.geom.rgba
+        else:
+            with pytest.raises(UsageError, match="set it to the value that is to hold"):
+                del root.default.geom.rgba
+
+
+def test_folders_of_assets(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.composer.Arena().mjcf_model
+        root.compiler.texturedir = "../locomotion/arenas/assets/outdoor_natural"
+        root.asset.add("texture", name="grass", type="2d", file="OutdoorGrassFloorD.png")
+        if kit is oracle:
+            assert kit.mjcf.Physics.from_mjcf_model(root).model.ntex == 1
+        else:
+            with pytest.raises(ValueError, match="Error opening file"):
+                kit.mjcf.Physics.from_mjcf_model(root)
+
+
+@pytest.mark.parametrize("name", ["insert", "include_copy", "is_same_as", "to_xml", "namescope"])
+def test_tree_surgery(oracle, ours, name):
+    assert [hasattr(model(kit), name) for kit in (oracle, ours)] == [True, False]
+    assert [hasattr(kit.mjcf, "from_zip") for kit in (oracle, ours)] == [True, False]
+
+
+# -- episodes
+
+
+def test_time_limit(oracle, ours):
+    steps = []
+    for kit in (oracle, ours):
+        env = environment(kit, time_limit=5.0)
+        env.reset()
+        steps.append(next(i for i in range(1, 200) if env.step([]).last()))
+    assert steps == [101, 100]
+
+
+def test_failed_resets(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+
+        class Moody(kit.composer.NullTask):
+            fails = False
+
+            def initialize_episode(self, physics, random_state):
+                if self.fails:
+                    raise RuntimeError("not today")
+
+        env = environment(kit, task=Moody, recompile_mjcf_every_episode=False)
+        env.task.fails = True
+        with pytest.raises(RuntimeError, match="not today"):
+            env.step([])
+        env.task.fails = False
+        found.append(env.step([]).first())
+    assert found == [False, True]
+
+
+def test_hooks(oracle, ours):
+    calls = []
+    for kit in (oracle, ours):
+        arena = kit.composer.Arena()
+        arena.after_step = functools.partial(lambda physics, random_state: calls.append(1))
+        if kit is oracle:
+            with pytest.raises(AttributeError, match="__code__"):
+                kit.composer.Environment(kit.composer.NullTask(arena))
+            continue
+        env = kit.composer.Environment(kit.composer.NullTask(arena))
+        env.reset()
+        env.step([])
+    assert calls == [1]
+
+
+def test_control_steps(oracle, ours):
+    assert environment(oracle, control=1e-9, physics=0.005)._n_sub_steps == 0
+    with pytest.raises(UsageError, match="shorter than a physics step"):
+        environment(ours, control=1e-9, physics=0.005)
+
+
+def test_derived_constants(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        arm = model(kit)
+        physics = below_an_arena(kit, arm)
+        variator = kit.variation.PhysicsVariator()
+        variator.bind_attributes(arm.find("body", "b"), mass=2.0)
+        variator.apply_variations(physics, np.random.RandomState(0))
+        found.append(physics.model.body_subtreemass[0])
+    assert found == pytest.approx([1.0, 2.0], abs=1e-4)
+
+
+# -- observables
+
+
+def test_functions_as_observables(oracle, ours):
+    with pytest.raises(AttributeError, match=r"observation_callable|enabled"):
+        environment(oracle, observables={"time": lambda physics: physics.time()})
+    env = environment(ours, observables={"time": lambda physics: physics.time()})
+    assert env.reset().observation["arm/time"].tolist() == [0.0]
+
+
+def test_bounds_of_aggregators(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        camera = kit.observable.Generic(lambda physics: np.ones(2), buffer_size=3, aggregator="max")
+        bounded = type("Bounded", (type(camera),), {"array_spec": bounds()})
+        camera.__class__ = bounded
+        with warnings.catch_warnings(action="ignore"):
+            spec = environment(kit, observables={"x": camera}).observation_spec()["arm/x"]
+        found.append(hasattr(spec, "minimum"))
+    assert found == [False, True]
+
+
+def bounds():
+    from dm_env import specs
+
+    return specs.BoundedArray((2,), float, 0.0, 1.0)
+
+
+def test_delays_that_vary(oracle, ours):
+    """Samples show when they were taken; theirs stray from the nominal schedule, ours never do."""
+    strayed = []
+    for kit in (oracle, ours):
+        rng, count = np.random.RandomState(3), 0
+        for _ in range(30):
+            delays = rng.randint(0, 9, 200)
+            interval, steps = rng.randint(1, 5), rng.randint(2, 7)
+            count += stray(kit, list(delays), int(interval), int(steps))
+        strayed.append(count)
+    assert strayed[0] > 0
+    assert strayed[1] == 0
+
+
+def stray(kit, delays, interval, steps):
+    """Return how many reads differ from the schedule written down: sampled every interval, late by its delay."""
+    clock = type("Clock", (), {"now": 0, "suppress_physics_errors": lambda self: warnings.catch_warnings()})()
+    draw = iter(delays)
+    late = kit.observable.Generic(lambda physics: float(clock.now), interval, 2, lambda: int(next(draw)))
+    late.enabled = True
+    updater = kit.updater.Updater({"x": late}, steps)
+    updater.reset(clock, np.random.RandomState(0))
+    wrong = 0
+    for read in range(1, 7):
+        updater.prepare_for_next_control_step()
+        for _ in range(steps):
+            clock.now += 1
+            updater.update()
+        arrivals = sorted((k * interval + delays[k], k) for k in range(read * steps // interval + 1))
+        seen = [k * interval for at, k in arrivals if at <= read * steps][-2:]
+        wrong += updater.get_observation()["x"].ravel().tolist() != [0.0] * (2 - len(seen)) + [float(s) for s in seen]
+    return wrong
+
+
+def test_intervals_of_zero(ours):
+    never = ours.observable.Generic(lambda physics: 1.0, update_interval=lambda: 0)
+    with pytest.raises(UsageError, match="the update interval must be at least 1 step, got 0"):
+        environment(ours, observables={"x": never}).reset()
+
+
+# -- images
+
+
+def test_rendering_contexts(ours):
+    assert below_an_arena(ours, model(ours)).contexts is None
+
+
+def test_overlays(ours):
+    with pytest.raises(TypeError, match="overlays"):
+        below_an_arena(ours, model(ours)).render(overlays=())
+
+
+@pytest.mark.usefixtures("opengl")
+def test_depth_images(oracle, ours):
+    depths = []
+    for kit in (oracle, ours):
+        physics = kit.mjcf.Physics.from_mjcf_model(model(kit, first='<camera name="eye" pos="0 0 1"/>'))
+        depths.append(physics.render(20, 20, "eye", depth=True))
+        physics.free()
+    assert depths[0].min() == pytest.approx(depths[1].min(), rel=1e-2)
+    assert not np.array_equal(*depths)

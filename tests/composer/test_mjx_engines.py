@@ -1,0 +1,161 @@
+"""What hooks write, on MJX as on C: options, masses, controls, places, and what is computed anew because of it."""
+
+import copy
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.mjx import constants
+from sim2real.composer.observation.observable import Generic, MJCFFeature
+from sim2real.composer.variation import PhysicsVariator, deterministic
+
+CHAIN = """
+<mujoco model="chain"><compiler angle="radian"/><default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
+      <body name="lower" pos=".3 0 0"><joint name="elbow" axis="0 1 0" damping=".1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/><site name="tip" pos=".2 0 0"/></body></body>
+  </worldbody>
+  <actuator><motor name="shoulder" joint="shoulder" gear="2"/><motor name="elbow" joint="elbow"/></actuator>
+  <sensor><accelerometer name="felt" site="tip"/></sensor>
+</mujoco>
+"""
+
+
+class Chain(composer.NullTask):
+    """Writes in every hook, some of which are read at once, some steps later, some never."""
+
+    def __init__(self):
+        arena = composer.Arena()
+        model = mjcf.from_xml_string(CHAIN)
+        arena.attach(composer.ModelWrapperEntity(model))
+        super().__init__(arena)
+        self.set_timesteps(0.02, 0.005)
+        self.joints, self.tip = model.find_all("joint"), model.find("site", "tip")
+        self.felt, self.actuators = model.find("sensor", "felt"), model.find_all("actuator")
+        self.vary = PhysicsVariator()
+        inertia = deterministic.Constant(np.array([0.003, 0.0035, 0.001]))
+        self.vary.bind_attributes(model.find("body", "lower"), mass=deterministic.Constant(0.6), inertia=inertia)
+
+    @property
+    def task_observables(self):
+        found = {
+            "q": MJCFFeature("qpos", self.joints),
+            "late": MJCFFeature("xpos", self.tip, delay=1, buffer_size=2),
+            "noisy": MJCFFeature("xpos", self.tip, corruptor=lambda value, random_state: value),
+            "felt": MJCFFeature("sensordata", self.felt),
+            "sum": Generic(lambda physics: physics.variables["sum"]),
+        }
+        for value in found.values():
+            value.enabled = True
+        return found
+
+    def initialize_episode(self, physics, random_state):
+        self.vary.apply_variations(physics, random_state)
+        physics.model.opt.gravity = np.array([0.5, 0.0, -6.0])
+        physics.model.opt.density, physics.model.opt.wind = 50.0, np.array([0.0, 0.0, 1.0])  # MJX has no air at first
+        physics.variables["sum"] = physics.np.zeros(2)
+        physics.bind(self.joints[0]).qpos = 0.2
+
+    def before_step(self, physics, action, random_state):
+        physics.bind(self.actuators).ctrl = action
+
+    def before_substep(self, physics, action, random_state):
+        height = physics.bind(self.tip).xpos[2]
+        physics.variables["sum"] = physics.variables["sum"] + height * physics.np.array([1.0, 0.0])
+
+    def after_substep(self, physics, random_state):
+        felt = physics.bind(self.felt).sensordata[2]
+        physics.variables["sum"] = physics.variables["sum"] + felt * physics.np.array([0.0, 1.0])
+
+    def after_step(self, physics, random_state):
+        physics.bind(self.joints[1]).qvel = physics.bind(self.joints[1]).qvel * 0.9
+
+    def get_reward(self, physics):
+        return physics.bind(self.tip).xpos[0]
+
+
+@pytest.fixture(scope="module")
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def actions():
+    return np.random.RandomState(0).uniform(-1, 1, (20, 2))
+
+
+@pytest.fixture(scope="module")
+def played(double, actions):
+    """The start, and all states that follow."""
+    environment = composer.MjxEnvironment(Chain())
+
+    def play(key, actions):
+        start = environment.reset(key)
+        return start, jax.lax.scan(lambda s, a: (environment.step(s, a),) * 2, start, actions)[1]
+
+    return jax.jit(play)(jax.random.key(0), actions)
+
+
+def test_streams_are_those_of_the_c_engine(played, actions):
+    start, states = played
+    env = composer.Environment(Chain())
+    step = env.reset()
+    for name, value in step.observation.items():
+        np.testing.assert_allclose(start.observation[name], value, atol=1e-9, err_msg=name)
+    for i, action in enumerate(actions):
+        step = env.step(action)
+        for name, value in step.observation.items():
+            np.testing.assert_allclose(
+                states.observation[name][i], value, rtol=1e-9, atol=1e-9, err_msg=f"{name} at {i}"
+            )
+        np.testing.assert_allclose(states.data.qpos[i], env.physics.data.qpos, atol=1e-9)
+        np.testing.assert_allclose(states.reward[i], step.reward, atol=1e-9)
+
+
+BODIES = """
+<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <body pos="0 0 1"><freejoint/><geom type="box" size=".1 .2 .3" pos=".05 0 0"/><site name="one" pos=".1 0 0"/>
+    <body name="ball" pos=".3 0 0"><joint type="ball"/><geom type="capsule" fromto="0 0 0 .2 .1 0" size=".02"/>
+      <body name="hand" pos=".2 .1 0"><joint name="hinge" axis="0 1 1" armature=".01"/>
+        <geom type="ellipsoid" size=".05 .03 .02"/><site name="two"/></body></body></body>
+  <body name="cart" pos="1 0 0"><joint name="slide" type="slide" axis="0 0 1"/><geom type="cylinder" size=".05 .1"/>
+    <camera pos="0 0 .3"/><camera mode="targetbody" target="hand" pos="0 .1 .3"/></body>
+  <body pos="2 0 0"><geom size=".1"/></body></worldbody>
+  <tendon><spatial name="rope" range="0 2" limited="true"><site site="one"/><site site="two"/></spatial>
+    <fixed frictionloss=".1"><joint joint="hinge" coef="2"/><joint joint="slide" coef="-1"/></fixed></tendon>
+  <equality><connect body1="hand" body2="cart" anchor=".1 0 0"/><weld body1="hand" body2="cart" anchor=".1 .2 .3"/>
+    <weld body1="hand" body2="ball" relpose="0 0 1 .7 .7 0 0"/></equality>
+  <actuator><motor joint="hinge" gear="3"/><motor tendon="rope" gear="2"/></actuator>
+</mujoco>
+"""
+UNUSED = {"dof_length", "geom_aabb", "actuator_length0"}  # by MJX
+
+
+def test_derived_constants_are_those_of_mj_set_const(double):
+    model = mujoco.MjModel.from_xml_string(BODIES)
+    varied, random = copy.copy(model), np.random.RandomState(0)
+    for name in ("body_mass", "body_inertia", "geom_size", "actuator_gear"):
+        field = getattr(varied, name)
+        field[1:] *= random.uniform(0.5, 2.0, field[1:].shape)
+    varied.dof_armature[:] += 0.1
+    varied.body_pos[1:] += random.uniform(-0.1, 0.1, varied.body_pos[1:].shape)
+    varied.body_quat[1:] += random.uniform(-0.2, 0.2, varied.body_quat[1:].shape)
+    varied.body_quat /= np.linalg.norm(varied.body_quat, axis=1, keepdims=True)
+    given = mjx.put_model(varied)
+    before = copy.copy(varied)
+    mujoco.mj_setConst(varied, mujoco.MjData(varied))
+    found = jax.jit(lambda m: constants.derive(model, m))(given)
+    changed = {f for f in vars(type(varied)) if not np.array_equal(getattr(before, f), getattr(varied, f))}
+    floats = {f for f in changed if np.asarray(getattr(varied, f)).dtype == float}
+    assert "body_invweight0" in floats
+    assert floats - UNUSED <= set(found)
+    for name, value in found.items():
+        expected = getattr(varied, name)
+        np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)

@@ -1,0 +1,261 @@
+"""What hooks cannot do in a compiled program, refused with the hook's name; and actions of a task's own."""
+
+import collections
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dm_env import specs
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.variation.colors import HsvVariation
+from sim2real.errors import UsageError
+
+ROD = """
+<mujoco model="rod"><option timestep="0.01"/><default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="rod"><joint name="hinge" axis="0 1 0"/><geom name="rod" type="capsule" fromto="0 0 0 .3 0 0"
+    size=".02"/><site name="tip" pos=".3 0 0"/></body></worldbody>
+  <actuator><motor joint="hinge" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+  <keyframe><key name="up" qpos=".7" qvel=".2" time="1.5"/></keyframe>
+</mujoco>
+"""
+
+
+class Rod(composer.Task):
+    def __init__(self, **hooks):
+        self._root_entity = composer.ModelWrapperEntity(mjcf.from_xml_string(ROD))
+        model = self._root_entity.mjcf_model
+        self.hinge, self.tip, self.geom = (
+            model.find("joint", "hinge"),
+            model.find("site", "tip"),
+            model.find("geom", "rod"),
+        )
+        self.n, self.mode, self.memory, self.counts = 0, None, {"before": np.zeros(3)}, collections.deque([0])
+        self.random = np.random.RandomState(0)
+        self.control_timestep = 0.02
+        for name, hook in hooks.items():
+            setattr(type(self), name, hook)
+
+    def get_reward(self, physics):
+        return physics.bind(self.tip).xpos[2]
+
+
+def made(**hooks):
+    """Return an environment of a rod with some hooks; nothing is compiled."""
+    return composer.MjxEnvironment(type("Rod", (Rod,), hooks)())
+
+
+def start(function):
+    return {"initialize_episode": lambda self, physics, random_state: function(self, physics)}
+
+
+def after(function):
+    return {"after_step": lambda self, physics, random_state: function(self, physics)}
+
+
+def count(task, physics):
+    task.n += 1
+
+
+def remember(task, physics):
+    task.memory["before"] = physics.bind(task.tip).xpos
+
+
+def append(task, physics):
+    task.counts.append(1)
+
+
+@pytest.mark.parametrize(
+    ("hooks", "match"),
+    [
+        (after(count), r"Rod.n is changed by Rod.after_step.*same value\s+hint: keep .* physics.variables\['n'\]"),
+        (start(count), "Rod.n is changed by Rod.initialize_episode"),
+        (after(append), "Rod.counts is changed by Rod.after_step"),
+        (after(remember), r"Rod.memory was set by a hook, Rod.after_step, to a value that only exists"),
+        (start(lambda task, _: task.random.uniform()), "Rod.random is changed by Rod.initialize_episode"),
+        (start(lambda task, _: np.random.uniform()), "Rod.initialize_episode draws from a global source of randomness"),
+    ],
+)
+def test_what_only_python_would_keep_is_refused(hooks, match):
+    with pytest.raises(UsageError, match=f"(?s){match}"):
+        made(**hooks)
+
+
+def test_what_is_the_same_for_all_may_be_kept():
+    def look_up(task, physics):
+        task.mode = int(physics.bind(task.geom).element_id)
+        task.found = [task.mode]
+
+    task = made(**start(look_up)).task
+    assert (task.mode, task.found, task.n) == (0, [0], 0)
+
+
+@pytest.mark.parametrize(
+    ("function", "match"),
+    [
+        (lambda task, p: 1.0 if p.bind(task.tip).xpos[2] > 1 else 0.0, r"decides in Python .*physics.np.where"),
+        (lambda task, p: np.linalg.norm(p.bind(task.tip).xpos), "calls numpy on .*use physics.np"),
+        (lambda task, p: float(p.bind(task.tip).xpos[2]), "makes a Python number of .*leave it an array"),
+        (lambda task, p: [0.0, 1.0][p.np.argmax(p.bind(task.tip).xpos)], "uses .* as a Python integer"),
+        (lambda task, p: p.bind(task.tip).xpos[p.bind(task.tip).xpos > 0].sum(), "picks items with a mask"),
+    ],
+)
+def test_what_needs_a_number_is_refused_with_the_way_to_do_it(function, match):
+    with pytest.raises(UsageError, match=rf"(?s)Rod.get_reward {match}"):
+        made(get_reward=function)
+
+
+def test_the_line_and_the_observable_are_named():
+    def should_terminate_episode(self, physics):
+        return bool(physics.bind(self.hinge).qpos[0] > 1)
+
+    with pytest.raises(UsageError, match=r"Rod.should_terminate_episode .*\(line \d+: return bool\("):
+        made(should_terminate_episode=should_terminate_episode)
+    task = Rod()
+    task.root_entity.observables.add_observable("far", lambda physics: np.linalg.norm(physics.bind(task.tip).xpos))
+    with pytest.raises(UsageError, match="observable 'far' calls numpy"):
+        composer.MjxEnvironment(task)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda task, p: p.bind(task.hinge).qpos.__setitem__(0, 0.3),
+        lambda task, p: p.data.qpos.__setitem__(0, 0.3),
+        lambda task, p: p.model.body_mass.__setitem__(1, 2.0),
+    ],
+)
+def test_writes_into_arrays_are_refused_with_the_way_to_do_it(write):
+    with pytest.raises(UsageError, match=r"(?s)Rod.initialize_episode writes into an array in place.*physics.write\("):
+        made(**start(write))
+
+
+def test_writes_by_name_and_column_work():
+    def write(task, physics):
+        physics.named.data.qpos["hinge"] = 0.3
+        physics.bind(task.hinge)["qvel"] = 0.5
+        physics.bind([task.tip])["pos", ["x", "z"]] = physics.np.array([0.1, 0.2])
+
+    state = jax.jit(made(**start(write)).reset)(jax.random.key(0))
+    np.testing.assert_allclose([*state.data.qpos, *state.data.qvel], [0.3, 0.5])
+    np.testing.assert_allclose(state.leaves["site_pos"], [[0.1, 0.0, 0.2]])
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda task, p: setattr(p.bind(task.geom), "contype", 1), "geom_contype"),
+        (lambda task, p: p.bind([task.geom]).contype.__setitem__(slice(None), 1), "geom_contype"),
+        (lambda task, p: p.model.geom_contype.__setitem__(slice(None), 1), "geom_contype"),
+        (lambda task, p: p.named.model.geom_contype.__setitem__("rod", 1), "geom_contype"),
+        (lambda task, p: setattr(p.model.opt, "iterations", 1), "opt.iterations"),
+        (lambda task, p: setattr(p.model.opt, "disableflags", 16), "opt.disableflags"),
+        (lambda task, p: setattr(p.model.stat, "extent", 1.0), "stat.extent"),
+        (lambda task, p: p.model.vis.headlight.ambient.__setitem__(0, 1.0), "vis.headlight.ambient"),
+        (lambda task, p: setattr(p.bind(task.hinge), "frictionloss", 1.0), "dof_frictionloss"),
+    ],
+)
+def test_constants_of_a_program_are_read_only(write, name):
+    with pytest.raises(UsageError, match=name):
+        made(**start(write))
+
+
+def test_options_belong_to_each_copy():
+    def initialize_episode(self, physics, random_state):
+        physics.model.opt.gravity = random_state.uniform(-1, 1, 3)
+
+    environment = made(initialize_episode=initialize_episode)
+    states = jax.eval_shape(jax.vmap(environment.reset), jax.random.split(jax.random.key(0), 4))
+    assert states.leaves["opt.gravity"].shape == (4, 3)
+
+
+def test_the_compiled_model_is_read_only():
+    environment = made()
+    with pytest.raises(ValueError, match="read-only"):
+        environment.model.geom_contype[:] = 1
+
+
+def test_a_variable_that_changes_its_type_is_named():
+    def begin(self, physics, random_state):
+        physics.variables["n"] = 0
+
+    def go_on(self, physics, random_state):
+        physics.variables["n"] = physics.variables["n"] + 0.5
+
+    with pytest.raises(
+        UsageError, match=r"physics.variables\['n'\] starts as int32\[\] and is float32\[\] after a step"
+    ):
+        made(initialize_episode=begin, after_substep=go_on)
+
+
+class Steered(Rod):
+    """Three numbers make one torque; where they act is looked up when the model is compiled."""
+
+    def action_spec(self, physics):
+        return specs.BoundedArray((3,), float, [-1, -2, -1e10], 1.0)
+
+    def after_compile(self, physics, random_state):
+        self.number = physics.bind(self.tip).element_id
+        physics.model.opt.gravity = [0, 0, -1]
+
+    def before_step(self, physics, action, random_state):
+        physics.set_control(action @ physics.np.array([0.1, 0.2, 0.3]))
+
+    def get_reward(self, physics):
+        return physics.data.site_xpos[self.number][2]
+
+
+def test_actions_of_a_task_s_own_and_after_compile():
+    environment = composer.MjxEnvironment(Steered())
+    assert environment.action_spec().shape == (3,)
+    assert environment.mjx_model.opt.gravity.tolist() == [0, 0, -1]
+    after = jax.eval_shape(environment.step, jax.eval_shape(environment.reset, jax.random.key(0)), jnp.zeros(3))
+    assert after.data.ctrl.shape == (1,)
+    assert composer.BraxEnv(environment).action_size == 3
+    pytest.importorskip("gymnasium", reason="the vector environment: pip install gymnasium")
+    space = composer.MjxVectorEnv(environment, 2).single_action_space
+    assert (space.low.tolist(), space.high.tolist()) == ([-1, -2, -np.inf], [1, 1, 1])
+
+
+def test_controls_of_another_size_are_refused():
+    environment = made()
+    state = jax.eval_shape(environment.reset, jax.random.key(0))
+    with pytest.raises(UsageError, match=r"there are 1 controls, and set_control was given an array of shape \(3,\)"):
+        jax.eval_shape(environment.step, state, jnp.zeros(3))
+
+
+def test_rewards_may_be_arrays():
+    environment = made(get_reward=lambda task, physics: physics.bind(task.tip).xpos[:2])
+    state = jax.eval_shape(environment.reset, jax.random.key(0))
+    after = jax.eval_shape(environment.step, state, jnp.zeros(1))
+    assert state.reward.shape == after.reward.shape == (2,)
+
+
+def test_states_keyframes_colours_and_choices():
+    """What hooks of dm_control's call; the same numbers as on C where nothing is drawn."""
+
+    def begin(self, physics, random_state):
+        physics.reset(0)
+        physics.set_state(0.5 * physics.get_state())
+        hue = 0.6 + 0.0 * physics.bind(self.hinge).qpos[0]
+        physics.bind(self.geom).rgba = HsvVariation(hue, 0.5, 0.8)(random_state=random_state)
+        drawn = physics.np.asarray(random_state.choice(3, size=4, p=[0, 0, 1]))
+        physics.variables["drawn"] = drawn + 0.0 * random_state.standard_normal(4)
+
+    state = jax.jit(made(initialize_episode=begin).reset)(jax.random.key(0))
+    env = composer.Environment(type("Rod", (Rod,), {"initialize_episode": begin})())
+    env.reset()
+    data = env.physics.data
+    np.testing.assert_allclose([state.data.qpos[0], state.data.qvel[0], state.data.time], [0.35, 0.1, 1.5])
+    np.testing.assert_allclose([data.qpos[0], data.qvel[0], data.time], [0.35, 0.1, 1.5])
+    np.testing.assert_allclose(state.leaves["geom_rgba"], env.physics.model.geom_rgba, rtol=1e-6)
+    np.testing.assert_array_equal(state.variables["drawn"], [2, 2, 2, 2])
+
+    with pytest.raises(UsageError, match=r"hint: use x = random_state.permutation\(x\)"):
+        made(initialize_episode=lambda self, physics, random_state: random_state.shuffle(np.arange(3)))
+    with pytest.raises(AttributeError, match="on MJX random_state has no 'vonmises'"):
+        made(initialize_episode=lambda self, physics, random_state: random_state.vonmises(0, 1))
+    with pytest.raises(UsageError, match="must be between 0 and 0 inclusive, got: 3"):
+        made(**start(lambda task, physics: physics.reset(3)))

@@ -1,0 +1,97 @@
+"""Composed tasks in PPO: directly, and as the world of a graph."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.composer.observation.observable import MJCFFeature
+from sim2real.errors import UsageError
+from sim2real.train.composed import TaskEnvironment
+from sim2real.train.env import GraphEnvironment
+from sim2real.train.protocol import check_environment
+
+CART = """
+<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1" mass="0.5"/></body></worldbody>
+  <actuator><motor joint="rail" {limits}/></actuator></mujoco>
+"""
+
+
+def cart(limits):
+    task = composer.NullTask(composer.ModelWrapperEntity(mjcf.from_xml_string(CART.format(limits=limits))))
+    rail = task.root_entity.mjcf_model.find("joint", "rail")
+    for name in ("qpos", "qvel"):
+        task.root_entity.observables.add_observable(name, MJCFFeature(name, rail))
+    return composer.MjxEnvironment(task, time_limit=0.1)
+
+
+def test_a_task_keeps_the_protocol():
+    env = TaskEnvironment(cart('ctrlrange="-2 1" ctrllimited="true"'))
+    check_environment(env)
+    assert (env.observation_size, env.action_low.tolist(), env.action_high.tolist()) == (2, [-2], [1])
+    with pytest.raises(UsageError, match="PPO's actions are vectors with bounds"):
+        TaskEnvironment(cart(""))
+
+
+@struct.dataclass
+class State:
+    done: jax.Array
+    truncated: jax.Array
+    reward: jax.Array
+    observation: dict
+
+
+@pytest.mark.parametrize(("done", "truncated"), [(True, True), (True, False), (False, False)])
+def test_a_time_limit_is_no_end(done, truncated):
+    state = State(jnp.array(done), jnp.array(truncated), jnp.float32(3), {"b": jnp.ones((1, 2)), "a": jnp.zeros(())})
+    spec = SimpleNamespace(shape=(1,), minimum=-1.0, maximum=1.0)
+    env = TaskEnvironment(
+        SimpleNamespace(observation_spec=lambda: state.observation, action_spec=lambda: spec, step=lambda *_: state)
+    )
+    step = env.step(state, jnp.zeros(1), jax.random.key(0))
+    assert (bool(step.terminated), bool(step.truncated)) == (done and not truncated, truncated)
+    assert step.observation.tolist() == [1, 1, 0]
+
+
+@pytest.mark.parametrize("ends", [(False, False), (True, False), (False, True)])
+def test_a_composed_task_ends_the_episode_of_its_graph(ends):
+    state = SimpleNamespace(step=jnp.int32(1), state={"world": None, "other": None})
+    heard = SimpleNamespace(seq=jnp.int32(0))
+    nodes = {"world": SimpleNamespace(ends=lambda state: tuple(map(jnp.bool_, ends))), "other": SimpleNamespace()}
+    graph = SimpleNamespace(
+        nodes=nodes, rows=9, advance=lambda *_, **__: state, observe=lambda gs, **_: (gs, heard, None)
+    )
+    task = SimpleNamespace(
+        observation_size=1,
+        action_low=np.zeros(1),
+        action_high=np.ones(1),
+        act=lambda step_state, action: (step_state, None),
+        observe=lambda step_state: jnp.zeros(1),
+        reward=lambda gs, action: jnp.float32(0),
+        success=lambda gs: jnp.bool_(False),
+    )
+    env = GraphEnvironment(graph, task)
+    before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0)
+    step = env._step(before, jnp.zeros(1), jax.random.key(0))
+    assert (bool(step.terminated), bool(step.truncated)) == ends
+
+
+def test_what_is_over_stays_over(monkeypatch):
+    world = composer.ComposedWorld.__new__(composer.ComposedWorld)
+    after = State(jnp.array(False), jnp.array(False), jnp.float32(0), {})
+    world.environment = SimpleNamespace(step=lambda *_: after)
+    world.input_name, world.field = "actuator", "action"
+    monkeypatch.setattr(world, "_model", lambda params: None)
+    given = {"actuator": SimpleNamespace(data=SimpleNamespace(action=jnp.zeros((1, 1))))}
+    for truncated in (False, True):
+        state = State(jnp.array(True), jnp.array(truncated), jnp.float32(0), {})
+        made = SimpleNamespace(
+            state=state, inputs=given, params=None, replace=lambda state: SimpleNamespace(state=state)
+        )
+        new, _ = world.step(made)
+        assert tuple(map(bool, world.ends(new.state))) == (not truncated, truncated)
