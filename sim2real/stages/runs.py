@@ -137,8 +137,7 @@ def open_stage(
         run_dir: Run folder to add to; None makes a new one.
 
     Yields:
-        The running stage. When the block ends the manifest says 'finished', 'failed' or 'interrupted' (Ctrl-C, a
-        signal), with the exit code that the command ends with.
+        The running stage; at its end the manifest says 'finished', 'failed' or 'interrupted' and the exit code.
 
     Raises:
         UsageError: When there is no such stage, or the pipeline's name is none for a folder.
