@@ -86,7 +86,7 @@ def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
     """Return the table of the arm: the first seed of the run on a CPU, and training on an accelerator."""
     seed = cpu["seeds"][0]
     trained = {r["name"].removeprefix("arm/train/"): r["value"] for r in reversed(gpu["rows"])}
-    device = gpu["rows"][0]["yardstick"].partition(" --")[0]
+    device = gpu["rows"][0]["yardstick"].partition("--")[0].strip()
 
     def reached(key: str) -> str:
         distances = seed[key]
