@@ -1,12 +1,15 @@
 """One JAX configuration for all tests; set in the environment, before anything imports JAX."""
 
+import functools
 import gc
 import os
+import re
 import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling
 
 # A runner in the background ignores SIGINT, one under nohup SIGHUP; so would every command that a test interrupts.
 for _number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
@@ -37,23 +40,36 @@ settings.load_profile("sim2real")
 
 
 # Rooms that take longest go to the workers first, so that neither is left with a long one at the end.
-LONGEST = ("real time", "identify", "composer", "integration", "train", "robots", "runtime", "pipelines")
+LONGEST = ("real time", "identify", "composer", "train", "robots", "runtime", "integration", "pipelines")
 
 
-@pytest.hookimpl(tryfirst=True)  # xdist reads the groups after that
-def pytest_collection_modifyitems(items):
-    """Give each room to one worker, which so compiles its programs once; all tests in real time to the same one.
+@functools.cache
+def room(path):
+    """The folder under tests/ that a module is in; of modules whose tests keep real time: "real time"."""
+    if re.search(r"^pytestmark = .*\brealtime\b", (REPOSITORY / path).read_text(), re.MULTILINE):
+        return "real time"
+    return Path(path).parts[1]
 
-    Two of those at a time would keep each other from their deadlines.
+
+class RoomScheduling(LoadScopeScheduling):
+    """Give each room to one worker, which so builds its fixtures and compiles its programs once.
+
+    All tests in real time go to the same one: two at a time would keep each other from their deadlines.
     """
-    groups = {}
-    for item in items:
-        room = item.path.relative_to(REPOSITORY / "tests").parts[0]
-        groups[item] = "real time" if item.get_closest_marker("realtime") else room
-        item.add_marker(pytest.mark.xdist_group(groups[item]))
+
+    def _split_scope(self, nodeid):
+        return room(nodeid.split("::")[0])
+
+
+def pytest_xdist_make_scheduler(config, log):
+    config.option.loadscopereorder = False  # The order is that of collection below, not by number of tests
+    return RoomScheduling(config, log)
+
+
+def pytest_collection_modifyitems(items):
     if "PYTEST_XDIST_WORKER" in os.environ:
-        rank = {room: i for i, room in enumerate(LONGEST)}
-        items.sort(key=lambda item: (rank.get(groups[item], len(rank)), groups[item]))
+        rank = {name: i for i, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: rank.get(room(item.nodeid.split("::")[0]), len(rank)))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from live_robots import PATIENT
 
 from sim2real import cli
 from sim2real.hardware.truth import read_truth
@@ -22,7 +23,7 @@ TINY = [
     "--deploy.gate.servo-watchdog-s=0.4",
 ]
 """Budgets, and patience with a busy machine."""
-RECORDING = ["--duration-s", "12", "--seed", "1", "--gate.servo-watchdog-s", "0.4"]
+RECORDING = ["--duration-s", "12", "--seed", "1", *PATIENT]
 
 FAULTY = """
 import time

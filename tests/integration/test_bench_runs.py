@@ -14,6 +14,8 @@ from benches import arm, stages
 
 from sim2real import cli
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def commands(monkeypatch, completed):

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from live_robots import assert_torque_ends_off, manifest_of, motor, wait_until_running
+from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor, wait_until_running
 
 from sim2real.errors import SAFETY_STOP
 from sim2real.hardware.registers import OperatingMode
@@ -92,7 +92,7 @@ def test_kill_9_of_deploy(tmp_path, lone_robot, start_cli, completed):
 
 @pytest.mark.parametrize(("number", "code", "twice"), [(signal.SIGINT, 130, True), (signal.SIGTERM, 143, False)])
 def test_signals_end_a_recording_in_order(tmp_path, start_cli, number, code, twice):
-    process = start_cli("record", "pendulum", "--duration-s", 20, "--runs", tmp_path)
+    process = start_cli("record", "pendulum", "--duration-s", 20, "--runs", tmp_path, *PATIENT)
     log = wait_until_running(tmp_path, "pendulum/*/record/session.mcap", process)
     process.send_signal(number)
     if twice:

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from live_robots import manifest_of
+from live_robots import PATIENT, manifest_of
 
 from sim2real import cli
 from sim2real.log.reader import read_log
@@ -54,6 +54,7 @@ def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
     shutil.copytree(completed, run_dir)
     first = manifest_of(run_dir / "deploy")["started"]
     flags = ["--episodes", "2", "--duration-s", "1", "--runs", str(tmp_path / "runs"), "--strict-timing"]
+    flags += PATIENT
     assert cli.main(["deploy", "pendulum", *flags]) in (0, 5)  # a busy machine may miss deadlines; all is written
     assert manifest_of(run_dir / "deploy")["started"] == first
     again = run_dir / "deploy.2"
@@ -64,7 +65,7 @@ def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
 
 def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):
     shutil.copytree(root, tmp_path, dirs_exist_ok=True)
-    assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path)]) == 0
+    assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path), *PATIENT]) == 0
     latest = newest(tmp_path, "pendulum", "record")
     assert latest.run_dir.name != completed.name
     # Too short to identify from: the stage says so instead of falling back to the older one.

@@ -64,7 +64,7 @@ def test_a_signal_inside_a_finaliser_is_not_lost(tmp_path, number, code, by_coll
     assert process.stdout is not None
     assert process.stdout.readline() == "finalising\n"
     process.send_signal(number)
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=30)
     assert process.returncode == code
     assert "torque off" in out
     assert "Traceback" not in err
