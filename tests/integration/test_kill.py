@@ -15,7 +15,6 @@ from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
 pytestmark = pytest.mark.realtime
-PATIENT = ["--gate.servo-watchdog-s", 0.4]  # a busy machine is not what is tested
 
 
 def check_death(log, killed_ns, truth):
