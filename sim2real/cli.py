@@ -295,6 +295,11 @@ def _run_all(pipeline: Pipeline, flags: Any) -> None:
     """Run the four stages in one run folder; from the first one on that is not finished there."""
     from sim2real.stages import console, runs
 
+    if flags.record.dry_run:
+        raise UsageError(
+            "a run cannot go on from a dry recording: there is nothing in it to identify",
+            hint=f"`sim2real record {pipeline.name} --dry-run` by itself; of a run, deploy alone may be dry",
+        )
     run_dir = runs.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
     redo = run_dir is None
     for number, stage in enumerate(runs.STAGES, 1):

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-from dynamixel_sdk.group_sync_write import GroupSyncWrite
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware import registers as reg
@@ -119,6 +118,16 @@ class ServoBus:
         return np.array(self._link.late_us, np.float64) * 1e-6
 
     @property
+    def torque_withheld(self) -> bool:
+        """Whether nothing can move a motor; see `withhold_torque`."""
+        return self._link.torque_withheld
+
+    @property
+    def withheld(self) -> int:
+        """Instructions so far that were not sent, as they could have moved a motor."""
+        return self._link.withheld
+
+    @property
     def guardian_pid(self) -> int | None:
         """The guardian's process, once there is one."""
         return None if self._link.guardian is None else self._link.guardian.pid
@@ -172,6 +181,20 @@ class ServoBus:
             for register, value in ((reg.RETURN_DELAY_TIME, 0), (reg.OPERATING_MODE, int(mode))):
                 if self.read(servo_id, register) != value:
                     self.write(servo_id, register, value)
+
+    def withhold_torque(self) -> None:
+        """Let nothing pass from now on that could move a motor, for a dry run: neither "torque on" nor any goal.
+
+        There is no way back but to open the bus again. Everything else goes on as it would: watchdog and guardian are
+        armed, goals are checked, and a goal that was withheld is what its register seems to hold. In the place of an
+        instruction that is withheld its register is read, which takes the bus about as long.
+
+        Raises:
+            UsageError: Torque is on.
+        """
+        if self._armed:
+            raise UsageError("torque cannot be withheld: it is on", hint="call withhold_torque before torque(True)")
+        self._link.torque_withheld = True
 
     def torque(self, on: bool) -> None:
         """Switch the torque of all servos; on: with goals at rest (no PWM, no speed, or the present position).
@@ -335,13 +358,11 @@ class ServoBus:
         for servo_id, goal in goals.items():
             if not math.isfinite(goal) or abs(goal) > limit:
                 raise SafetyStop(f"{register.name} of servo {servo_id}: {goal} is outside [-{limit:.6g}, {limit:.6g}]")
-        if len(goals) == 1:
-            ((servo_id, goal),) = goals.items()
-            return self.write(servo_id, register, to_count(goal))
-        group = GroupSyncWrite(self._link.port, self._link.packets, register.address, register.size)
-        for servo_id, goal in goals.items():
-            group.addParam(servo_id, list(register.encode(to_count(goal))))
-        return self._link.exchange(lambda: ((), group.txPacket(), 0), f"write of {register.name}")[2]
+        counts = {servo_id: to_count(goal) for servo_id, goal in goals.items()}
+        if len(counts) == 1:
+            ((servo_id, count),) = counts.items()
+            return self.write(servo_id, register, count)
+        return self._link.write_each(register, counts)
 
     def _read_each(self, ids: tuple[int, ...], address: int, length: int, what: str) -> tuple[bytes, Transaction]:
         """Return blocks of the servos' control tables, one behind the other."""

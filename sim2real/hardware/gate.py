@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -74,12 +74,27 @@ class GateCounts:
         clamped: Calls with a value outside the limit.
         slewed: Calls with a change that was too fast.
         stale: Calls with a command that was too old.
+        cut: For each actuator, calls in which a limit changed its command.
+        low: For each actuator, the lowest command that was returned.
+        high: The highest.
+        total: The sum of all.
     """
 
     passed: int = 0
     clamped: int = 0
     slewed: int = 0
     stale: int = 0
+    cut: list[int] = field(default_factory=list)
+    low: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+    total: list[float] = field(default_factory=list)
+
+    def add(self, allowed: np.ndarray, cut: np.ndarray) -> None:
+        """Count a command that was returned ``(n,)``, and for which actuators a limit had changed it."""
+        before = (self.low, self.high, self.total, self.cut) if self.passed else (allowed, allowed, 0.0, 0)
+        self.low, self.high = np.minimum(before[0], allowed).tolist(), np.maximum(before[1], allowed).tolist()
+        self.total, self.cut = np.add(before[2], allowed).tolist(), np.add(before[3], cut).tolist()
+        self.passed += 1
 
 
 class SafetyGate:
@@ -154,11 +169,12 @@ class SafetyGate:
         self._require_shape(wanted)
         if not age_s <= self.config.command_timeout_s:
             self.counts.stale += 1
-            allowed = fallback
+            allowed, cut = fallback, np.zeros(wanted.shape, bool)
         else:
             allowed = self._slew(self._clamp(wanted), now_s)
+            cut = allowed != wanted
         self._last, self._last_s = allowed, now_s
-        self.counts.passed += 1
+        self.counts.add(allowed, cut)
         return allowed.copy()
 
     def _clamp(self, wanted: np.ndarray) -> np.ndarray:

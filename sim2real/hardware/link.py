@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final, NoReturn, TypeVar
 
+from dynamixel_sdk.group_sync_write import GroupSyncWrite
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
@@ -98,6 +99,8 @@ class Transaction:
 class BusLink:
     """Owner of port and lock. Every method may be called from any thread.
 
+    Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
+
     Args:
         config: Port and limits.
 
@@ -116,13 +119,17 @@ class BusLink:
         self.late_us = array("i")
         self.guardian: Guardian | None = None
         self.closed = False
+        self.torque_withheld = False
+        self.withheld = 0
+        self._withheld_goals: dict[tuple[int, Register], int] = {}
         self._lock = threading.Lock()
         self._pad = 0
 
     def read(self, servo_id: int, register: Register) -> int:
-        """Return a register's value in counts."""
+        """Return a register's value in counts; of a goal that was withheld, that goal."""
         what = f"read of {register.name}"
-        return register.decode(self.read_bytes(servo_id, register.address, register.size, what)[0])
+        found = register.decode(self.read_bytes(servo_id, register.address, register.size, what)[0])
+        return self._withheld_goals.get((servo_id, register), found)
 
     def read_bytes(self, servo_id: int, address: int, length: int, what: str) -> tuple[bytes, Transaction]:
         """Return `length` bytes of a servo's control table."""
@@ -159,6 +166,8 @@ class BusLink:
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
         """Write a value in counts to a register, and wait for the servo to confirm it."""
+        if self._withholds(register, (value,)):
+            return self._withhold(register, {servo_id: value})
         data = list(register.encode(value))
         what = f"write of {value} to {register.name}"
 
@@ -173,6 +182,15 @@ class BusLink:
         if error:
             self._refused(error, servo_id, what)
         return transaction
+
+    def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
+        """Write a register of several servos, each a value in counts by id, in one instruction that none confirms."""
+        if self._withholds(register, values.values()):
+            return self._withhold(register, values)
+        group = GroupSyncWrite(self.port, self.packets, register.address, register.size)
+        for servo_id, value in values.items():
+            group.addParam(servo_id, list(register.encode(value)))
+        return self.exchange(lambda: ((), group.txPacket(), 0), f"write of {register.name}")[2]
 
     def force(self, servo_id: int, register: Register, value: int) -> bool:
         """Write a register whatever stands in the way: a stuck lock, missed answers, errors. Never raises.
@@ -245,6 +263,19 @@ class BusLink:
                 self._pad = (self._pad + 1) % _PADS
                 self._judge(losses, (now_ns - began_ns) * 1e-9, what)
                 self.retries += 1
+
+    def _withholds(self, register: Register, values: Iterable[int]) -> bool:
+        """Whether a write could move a motor, and nothing may."""
+        moves = register in reg.GOALS or (register == reg.TORQUE_ENABLE and any(values))
+        return self.torque_withheld and moves
+
+    def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
+        """Keep a write to oneself, and read the register in its place: the bus is as busy, and its loss is noticed."""
+        self.withheld += 1
+        if register in reg.GOALS:
+            self._withheld_goals |= {(servo_id, register): value for servo_id, value in values.items()}
+        first = next(iter(values))
+        return self.read_bytes(first, register.address, register.size, f"read of {register.name}")[1]
 
     def _receive(self, servo_id: int, length: int) -> tuple[bytes, int, int]:
         """Wait for the status packet of a servo with so many bytes of data, or with an error and none.

@@ -69,6 +69,21 @@ class ServoRig:
         self.close()
 
     @property
+    def torque_withheld(self) -> bool:
+        """Whether this is a dry run; see `withhold_torque`."""
+        return self.bus.torque_withheld
+
+    def withhold_torque(self) -> None:
+        """Move nothing from now on, for a dry run: all goes on as it would, but no torque and no goal is ever sent.
+
+        Commands pass the gate, and `command` returns what would have been sent.
+
+        Raises:
+            UsageError: Torque is on.
+        """
+        self.bus.withhold_torque()
+
+    @property
     def suspects(self) -> list[str]:
         """What was odd about the measurements since `start`, but not sure enough to stop."""
         return self._plausibility.suspects
@@ -114,7 +129,8 @@ class ServoRig:
         sent = self._sent
         reading = self._drive.reading(self.bus.read_state(self.ids))
         position, asked = reading.position_rad, reading.transaction
-        effort = np.zeros(len(self.ids)) if sent is None else self._drive.effort(sent, position)
+        free = sent is None or self.torque_withheld
+        effort = np.zeros(len(self.ids)) if free else self._drive.effort(sent, position)
         self._plausibility.check(position, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
         self._speed_rad_s = reading.velocity_rad_s
         return reading

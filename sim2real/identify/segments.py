@@ -116,8 +116,22 @@ def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
     return Timeline({**timeline.vertices, node: moved}, timeline.edges)
 
 
+def require_moved(episode: Episode, name: str = "the log") -> None:
+    """Raise if a log is of a dry run: its commands never reached the motors.
+
+    Raises:
+        Sim2RealError: It is.
+    """
+    if episode.metadata.get("dry_run") is True:
+        raise Sim2RealError(
+            f"{name} is of a dry run: torque was off, and none of its commands was sent",
+            hint="record without --dry-run",
+        )
+
+
 def check_log(episode: Episode, model: IdentifiableModel) -> None:
-    """Raise unless the log holds the sensor's channels and the commands, as numbers."""
+    """Raise unless the log holds the sensor's channels and the commands, as numbers, and those were sent."""
+    require_moved(episode)
     hint = "identify from a log of this pipeline's record stage, or one imported with its mapping"
     for name in (model.sensor, *model.given):
         if name not in episode.steps or not len(episode.steps[name]):

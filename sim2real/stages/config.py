@@ -33,6 +33,8 @@ class RecordConfig:
     """Highest frequency of the excitation [Hz]."""
     seed: int = 0
     """Seed of the excitation, and of the embedded robot."""
+    dry_run: bool = False
+    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     gate: GateLimits = field(default_factory=GateLimits)
@@ -148,6 +150,8 @@ class DeployConfig:
     """Longest wait for the robot to come to rest before a deployment [s]."""
     seed: int = 0
     """Seed of the embedded robot."""
+    dry_run: bool = False
+    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     gate: GateLimits = field(default_factory=GateLimits)

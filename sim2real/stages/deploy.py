@@ -22,16 +22,15 @@ from sim2real.log.ages import input_ages
 from sim2real.log.reader import read_log
 from sim2real.policy.bundle import load_bundle, read_weights
 from sim2real.runtime.bursts import make_room
-from sim2real.runtime.clock import realtime
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.interruption import patiently
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import TRUTH
-from sim2real.stages.rig import announce, warn
+from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import Robot, Session, moving_robot
-from sim2real.stages.runs import StageFolder, finished, newest, open_stage
+from sim2real.stages.runs import OpenStage, StageFolder, finished, newest, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 from sim2real.stages.train import computation_delays, load_parameters
 from sim2real.train.networks import Policy
@@ -40,7 +39,7 @@ _SIMULATIONS = 32
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Deploy the policy and write logs, scores and the gap to simulation.
+    """Deploy the policy and write logs, scores and the gap to simulation; in a dry run the logs alone.
 
     Args:
         pipeline: The robot.
@@ -51,37 +50,28 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     robot = moving_robot(pipeline)
     bundle, run_dir = _find_bundle(pipeline, config, root, run_dir)
     policy = _load_policy(robot, bundle)
-    with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir) as stage:
+    with open_stage(root, pipeline.name, "deploy", config, {"bundle": bundle}, run_dir, config.dry_run) as stage:
         values = _identified(pipeline, stage.run_dir)
         logs = [stage.output(f"log_{i}", f"episode_{i}.mcap") for i in range(config.episodes)]
-        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
-            announce(session)
+        with opened(robot, config, stage.folder / TRUTH) as session:
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
             timing = [_deploy(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
         print(table(*timing_rows(timing[-1])))
         for summary in timing:
             warn(summary)
-        episodes, truth = [read_log(log) for log in logs], stage.folder / TRUTH
-        real = [_states(truth, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)]
-        # What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
-        seen = "world" if truth.is_file() else "sensor"
-        with progress(None, "simulate the same"):
-            simulated, timeline = patiently(
-                lambda: _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs), seen)
-            )
-        result = _compare(robot, real, simulated)
-        result["gap"] += _age_rows(robot, episodes, timeline)
+        if config.dry_run:
+            show_withheld(timing)
+            note("dry run: there is no gap report, for nothing was moved that a simulation could be compared with")
+            result: dict[str, Any] = {"dry_run": True, "episodes": [], "gap": []}
+        else:
+            result = _report(robot, stage, policy, values, logs, timing, config)
         stage.output("result", "result.json").write_text(
             json.dumps({**result, "timing": timing, "units": dict(robot.UNITS)}, indent=1)
         )
-        columns: dict[str, Any] = _first_episodes(simulated, len(logs))
-        np.savez_compressed(stage.output("simulation", "simulation.npz"), **columns)
         from sim2real.view.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
 
         stage.output("page", deploy_page(stage.folder).name)
-        headers = ["quantity", "robot", "simulation", "gap"]
-        print(table([[g["quantity"], g["real"], g["simulation"], g["gap"]] for g in result["gap"]], headers))
         stage.summary(
             {
                 **{
@@ -99,11 +89,43 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
+def _report(
+    robot: Robot,
+    stage: OpenStage,
+    policy: Policy,
+    values: Mapping[str, float] | None,
+    logs: Sequence[Path],
+    timing: Sequence[Mapping[str, Any]],
+    config: DeployConfig,
+) -> dict[str, Any]:
+    """Simulate the same, write it, print the gap, and return scores and gap."""
+    episodes, truth = [read_log(log) for log in logs], stage.folder / TRUTH
+    real = [_states(truth, s, episode, robot) for episode, s in zip(episodes, timing, strict=True)]
+    # What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
+    seen = "world" if truth.is_file() else "sensor"
+    with progress(None, "simulate the same"):
+        simulated, timeline = patiently(
+            lambda: _simulate(robot, policy, values, episodes[0], config.duration_s, len(logs), seen)
+        )
+    result = _compare(robot, real, simulated)
+    result["gap"] += _age_rows(robot, episodes, timeline)
+    columns: dict[str, Any] = _first_episodes(simulated, len(logs))
+    np.savez_compressed(stage.output("simulation", "simulation.npz"), **columns)
+    headers = ["quantity", "robot", "simulation", "gap"]
+    print(table([[g["quantity"], g["real"], g["simulation"], g["gap"]] for g in result["gap"]], headers))
+    return result
+
+
 def _deploy(
     pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, trial: int, log: Path, config: DeployConfig
 ) -> dict[str, Any]:
-    note(f"waiting for the robot to come to rest, then {config.duration_s:g} s on {config.port}")
-    robot.prepare(session, config.settle_s)
+    if config.dry_run:  # to bring it to its start would move it
+        note(
+            f"dry run: the robot stays where it is, not brought to its start; {config.duration_s:g} s on {config.port}"
+        )
+    else:
+        note(f"waiting for the robot to come to rest, then {config.duration_s:g} s on {config.port}")
+        robot.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy, trial)
     return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy")
 

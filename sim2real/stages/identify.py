@@ -23,7 +23,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.posterior import Posterior
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import round_trip
-from sim2real.identify.segments import Span, beyond
+from sim2real.identify.segments import Span, beyond, require_moved
 from sim2real.identify.verdict import NO_DELAY, judge, scores
 from sim2real.log.importer import import_file, load_mapping
 from sim2real.log.reader import TruncatedLogWarning, read_log
@@ -167,7 +167,7 @@ def load_log(path: Path, pipeline: Pipeline) -> Episode:
     A file of another recorder is imported in memory, where the pipeline has a mapping for it.
 
     Raises:
-        Sim2RealError: When it is no log, of another pipeline, or has holes.
+        Sim2RealError: When it is no log, of another pipeline, or of a dry run, or has holes.
     """
     if path.suffix != ".mcap" and path.is_file() and (mapping := pipeline.folder / "import.toml").is_file():
         return import_file(path, load_mapping(mapping))
@@ -185,6 +185,7 @@ def load_log(path: Path, pipeline: Pipeline) -> Episode:
         raise Sim2RealError(
             f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
         )
+    require_moved(episode, str(path))
     holes = {n: m for n, m in (episode.metadata["log"].get("missing_steps") or {}).items() if m}
     if holes:
         raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")

@@ -80,6 +80,7 @@ def log(path: Path) -> str:
         "size": f"{facts['bytes'] / 1e6:.3f} MB in {facts['chunks']} chunks",
         "duration": f"{facts['duration_s']:.3f} s",
         "complete": facts["complete"],
+        **({"dry run": "no command in it was sent"} if (facts["session"] or {}).get("dry_run") is True else {}),
         "unreadable": facts["skipped"],
         "attachments": {name: f"{size} B" for name, size in facts["attachments"].items()},
     }

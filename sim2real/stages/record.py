@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from sim2real.runtime.clock import realtime
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.rig import announce, warn
+from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.runs import StageFolder, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -30,11 +29,10 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
     """
     robot = moving_robot(pipeline)
     signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
-    with open_stage(root, pipeline.name, "record", config, run_dir=run_dir) as stage:
+    with open_stage(root, pipeline.name, "record", config, run_dir=run_dir, dry_run=config.dry_run) as stage:
         log = stage.output("log", LOG)
         note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
-        with robot.connect(config.port, config.gate, stage.folder / TRUTH, config.seed) as session, realtime():
-            announce(session)
+        with opened(robot, config, stage.folder / TRUTH) as session:
             nodes = robot.recording_nodes(session, signal)
             if session.embedded is not None:
                 stage.output("truth", TRUTH)
@@ -42,6 +40,8 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         stage.output("timing", "timing.json").write_text(json.dumps(summary, indent=1))
         print(table(*timing_rows(summary)))
         warn(summary)
+        if config.dry_run:
+            show_withheld([summary])
         stage.summary(
             {
                 "seconds": config.duration_s,

@@ -1,18 +1,56 @@
-"""What a stage that moves a robot says about its rig: when it opens, and afterwards."""
+"""Opening the robot for a stage that moves it, and what that stage says about its rig."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sim2real.errors import UsageError
+from sim2real.hardware.gate import SafetyGate
 from sim2real.hardware.rig import ServoRig
-from sim2real.stages.console import note
-from sim2real.stages.robot import Session
+from sim2real.runtime.clock import realtime
+from sim2real.stages.config import DeployConfig, RecordConfig
+from sim2real.stages.console import note, table
+from sim2real.stages.robot import Robot, Session
 
 LATE_SHARE = 0.01
 """Share of late answers above which the stage warns."""
+
+
+@contextmanager
+def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) -> Iterator[Session]:
+    """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
+
+    Raises:
+        UsageError: The robot's device cannot do a dry run.
+    """
+    if config.dry_run:
+        note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
+    with robot.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+        if config.dry_run:
+            _withhold_torque(session.rig)
+        announce(session)
+        yield session
+
+
+def _withhold_torque(rig: Any) -> None:
+    """Have the device move nothing, or say that it cannot: one that is not of ours may not know how."""
+    if callable(withhold := getattr(rig, "withhold_torque", None)):
+        withhold()
+    if not is_dry(rig):
+        raise UsageError(
+            f"this robot's device, {type(rig).__name__}, cannot do a dry run: it cannot withhold its torque",
+            hint="give it `withhold_torque()` and `torque_withheld`, as sim2real.hardware.rig.ServoRig has them",
+        )
+
+
+def is_dry(rig: Any) -> bool:
+    """Return whether a rig moves nothing: what it says itself counts, not what was asked for."""
+    return getattr(rig, "torque_withheld", False) is True
 
 
 def announce(session: Session) -> None:
@@ -53,3 +91,45 @@ def warn(summary: Mapping[str, Any]) -> None:
         )
     for suspect in summary["suspects"]:
         note(f"warning: {suspect}\nhint: does it lie on something, or does its encoder stand still?")
+
+
+def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
+    """Return for each actuator what the gate let through since the robot started, as JSON takes it.
+
+    Args:
+        gate: The gate.
+        field: Field of the command, the name of what has none.
+        unit: The command's.
+
+    Returns:
+        ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of what was sent, or would have been; and
+        ``cut``: commands that a limit of the gate had changed.
+    """
+    counts, names = gate.counts, gate.config.joints
+    several = len(counts.total) > 1
+    return [
+        {
+            "name": names[i] if i < len(names) else f"{field}[{i}]" if several else field,
+            "unit": unit,
+            "commands": counts.passed,
+            "low": counts.low[i],
+            "mean": total / counts.passed,
+            "high": counts.high[i],
+            "cut": counts.cut[i],
+        }
+        for i, total in enumerate(counts.total)
+    ]
+
+
+def show_withheld(summaries: Sequence[Mapping[str, Any]]) -> None:
+    """Print what the episodes of a dry run would have sent."""
+    several = len(summaries) > 1
+    rows = []
+    for number, summary in enumerate(summaries):
+        for s in summary["sent"]:
+            share = f"{s['cut'] / max(1, s['commands']):.1%}"
+            own = [s["unit"], s["commands"], s["low"], s["mean"], s["high"], s["cut"], share]
+            rows.append([*([number] if several else []), s["name"], *own])
+    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max", "cut by the gate", "share"]
+    print(table(rows, [*(["episode"] if several else []), *heads]))
+    note("dry run: nothing was moved; no later stage takes this for a recording")

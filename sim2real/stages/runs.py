@@ -25,6 +25,8 @@ from sim2real.stages.manifest import git_state, plain, read_manifest, reserve, s
 from sim2real.stages.pipeline import available
 
 STAGES = ("record", "identify", "train", "deploy")
+DRY = "dry run"
+"""Status of a stage that came to its end without moving anything: no later one takes it for a finished one."""
 INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NAME = re.compile(r"\w[\w.-]*")
@@ -51,6 +53,11 @@ class StageFolder:
     def finished(self) -> bool:
         """Whether the stage came to its end."""
         return self.manifest.get("status") == "finished"
+
+    @property
+    def dry(self) -> bool:
+        """Whether it moved nothing: what it holds as commands was never sent."""
+        return self.manifest.get("dry_run") is True
 
     @property
     def outputs(self) -> dict[str, Path]:
@@ -125,6 +132,7 @@ def open_stage(
     config: Any,
     inputs: Mapping[str, Path] | None = None,
     run_dir: Path | None = None,
+    dry_run: bool = False,
 ) -> Iterator[OpenStage]:
     """Run a stage in a folder of its own, with a manifest from the first moment to the last.
 
@@ -135,9 +143,11 @@ def open_stage(
         config: The resolved configuration, a dataclass.
         inputs: Name -> file or folder that the stage reads; hashed before it starts.
         run_dir: Run folder to add to; None makes a new one.
+        dry_run: Whether the stage only does as if.
 
     Yields:
-        The running stage; at its end the manifest says 'finished', 'failed' or 'interrupted' and the exit code.
+        The running stage; at its end the manifest says 'finished', 'dry run', 'failed' or 'interrupted', and the exit
+        code.
 
     Raises:
         UsageError: When there is no such stage, or the pipeline's name is none for a folder.
@@ -153,6 +163,7 @@ def open_stage(
         "pipeline": pipeline,
         "stage": stage,
         "status": "running",
+        "dry_run": dry_run,
         "exit_code": None,
         "started": datetime.now(UTC).isoformat(timespec="microseconds"),
         "duration_s": None,
@@ -169,7 +180,7 @@ def open_stage(
         write_manifest(folder, manifest)
         reserve(folder)
         yield running
-        _close(running, manifest, start, "finished", OK)
+        _close(running, manifest, start, DRY if dry_run else "finished", OK)
     except BaseException as error:
         told = _in_words(error, folder)
         try:
@@ -255,8 +266,11 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
         return own
     candidates = [done for folder in run_folders(root, pipeline) if (done := finished(folder, stage)) is not None]
     if not candidates:
-        unfinished = sum(len(attempts(folder, stage)) for folder in run_folders(root, pipeline))
-        also = f" ({unfinished} unfinished)" if unfinished else ""
+        others = [attempt for folder in run_folders(root, pipeline) for attempt in attempts(folder, stage)]
+        dry = sum(attempt.dry for attempt in others)
+        kinds = [(len(others) - dry, "unfinished"), (dry, "dry run" if dry == 1 else "dry runs")]
+        also = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+        also = f" ({also})" if also else ""
         raise Sim2RealError(
             f"no finished {stage!r} of pipeline {pipeline!r} in {root}{also}",
             hint=f"make one with `sim2real {stage} {pipeline}`, or name another folder with --runs DIR",

@@ -22,7 +22,7 @@ from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
 from sim2real.stages.manifest import git_state, plain, versions
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.rig import answer_rows, rig_summary
+from sim2real.stages.rig import answer_rows, is_dry, rig_summary, sent_rows
 from sim2real.stages.robot import Robot, Session
 
 LATE_SHARE = 0.01
@@ -97,7 +97,7 @@ def run_episode(
     graph = AsyncGraph(nodes, nodes[robot.SUPERVISOR])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
-    recorder = _recorder(pipeline, robot, graph, state, log, config)
+    recorder = _recorder(pipeline, robot, graph, state, log, config, is_dry(session.rig))
     watch = Watch(recorder)
     graph.recorder = watch
     try:
@@ -112,9 +112,9 @@ def run_episode(
         with noted(error):
             recorder.write_event("stop", status)
         with noted(error):
-            recorder.close(status, _exit_code(error), _summary(graph, session, watch))
+            recorder.close(status, _exit_code(error), _summary(robot, graph, session, watch))
         raise
-    summary = _summary(graph, session, watch)
+    summary = _summary(robot, graph, session, watch)
     recorder.close("finished", OK, summary)
     return summary
 
@@ -162,8 +162,9 @@ def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str) 
 
 
 def _recorder(
-    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any
+    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, dry: bool
 ) -> McapRecorder:
+    """Return the log's writer, whose metadata says what the session is, and, first of all, whether it is a dry run."""
     topology = {
         name: {
             "rate_hz": node.rate,
@@ -179,6 +180,7 @@ def _recorder(
     }
     metadata = {
         "pipeline": pipeline.name,
+        "dry_run": dry,
         "config": plain(asdict(config)),
         "graph": topology,
         "units": dict(robot.UNITS),
@@ -188,11 +190,14 @@ def _recorder(
         "port": config.port,
     }
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-    return McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, robot.JOINTS)
+    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, robot.JOINTS)
+    if dry:
+        recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
+    return recorder
 
 
-def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
-    rig = session.rig
+def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
+    rig, command = session.rig, robot.COMMAND[1]
     timing = {
         n: {
             "steps": s.steps,
@@ -212,6 +217,7 @@ def _summary(graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any
         "command_timeouts": rig.timeouts,
         **rig_summary(rig),
         "gate": asdict(rig.gate.counts),
+        "sent": sent_rows(rig.gate, command, robot.UNITS.get(command, "")),
     }
 
 

@@ -67,7 +67,7 @@ def read_training(artifact: Artifact) -> Training:
 
 
 def read_deployment(artifact: Artifact) -> Deployment:
-    """Read the logs, ``simulation.npz`` and ``result.json``.
+    """Read the logs, ``simulation.npz`` and ``result.json``; of a dry run there is no simulation.
 
     Raises:
         Sim2RealError: When one is missing or not as it should be.
@@ -75,16 +75,20 @@ def read_deployment(artifact: Artifact) -> Deployment:
     path = artifact.need("result", "result.json")
     with blaming(path, artifact):
         data = read_json(path)
+        if artifact.dry:  # nothing was moved: there is nothing to judge or to compare
+            data = {**data, "episodes": [{"real": {}, "simulation": None} for _ in data["timing"]]}
         scores = [{"real": dict(e["real"]), "simulation": dict(e["simulation"] or {})} for e in data["episodes"]]
         check(bool(scores), "no episode")
         gap = [
             {"quantity": str(r["quantity"]), **{k: read_number(r[k]) for k in _GAP}, **_unit(r)} for r in data["gap"]
         ]
         units = {str(k): str(v) for k, v in data.get("units", {}).items()}
-    path = artifact.need("simulation", "simulation.npz")
-    with blaming(path, artifact):
-        arrays = read_arrays(path)
-        simulated = [_of_episode(arrays, i) for i in range(len(scores))]
+    simulated: list[list[Series]] = [[] for _ in scores]
+    if not artifact.dry:
+        path = artifact.need("simulation", "simulation.npz")
+        with blaming(path, artifact):
+            arrays = read_arrays(path)
+            simulated = [_of_episode(arrays, i) for i in range(len(scores))]
     # The embedded robot may run on from one episode to the next: then one account holds the truth of all.
     truths = [artifact.output(f"truth_{i}", f"truth_{i}.bin") for i in range(len(scores))]
     common = artifact.output("truth", "truth.bin")

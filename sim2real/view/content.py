@@ -74,7 +74,7 @@ def tabs_of(artifacts: Mapping[str, Artifact]) -> list[Tab]:
     if "record" in artifacts:
         artifact = artifacts["record"]
         log = read_recording(artifact.need("log", "session.mcap"), artifact.output("truth", "truth.bin"))
-        tabs.append(_episode_tab("Record", "record", log, []))
+        tabs.append(_episode_tab(_dry("Record", log), "record", log, []))
     if "identify" in artifacts:
         found = read_identification(artifacts["identify"])
         several = len(found.recordings) > 1
@@ -82,8 +82,12 @@ def tabs_of(artifacts: Mapping[str, Artifact]) -> list[Tab]:
     if "deploy" in artifacts:
         deployed = read_deployment(artifacts["deploy"])
         for i, (log, simulated) in enumerate(zip(deployed.episodes, deployed.simulated, strict=True)):
-            tabs.append(_episode_tab(f"Deploy {i}", f"deploy/{i}", log, simulated))
+            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, simulated))
     return [tab for tab in tabs if tab.plots]
+
+
+def _dry(title: str, log: Recording) -> str:
+    return f"{title} (dry run)" if log.dry else title
 
 
 def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series]) -> Tab:
@@ -100,7 +104,8 @@ def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series
     last = log.last_command()
     commands = [n for n in models if n.partition("[")[0] == "command"]
     for index, series in enumerate(last):
-        curves = [_curve(f"{entity}/{series.source}", series, "command", f"sent by {series.source}")]
+        said = "not sent (dry run): of" if log.dry else "sent by"
+        curves = [_curve(f"{entity}/{series.source}", series, "command", f"{said} {series.source}")]
         if index < len(commands):
             curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
         plots.setdefault(_titled(series.name, log.units), []).extend(curves)

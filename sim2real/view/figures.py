@@ -26,9 +26,10 @@ def recording(log: Recording, name: str) -> str:
             true = log.truth[series.name]
             lines.append(Line(true.t_s, true.values, "true state", "truth"))
         panels.append(Panel(with_unit(series.name, log.units), lines, zoom=zoom))
+    commanded = "would have been commanded" if log.dry else "commanded"
     for series in log.last_command():
         label = with_unit(f"{series.source}.{series.name}", log.units, series.name)
-        panels.append(Panel(label, [Line(series.t_s, series.values, "commanded", "command", held=True)], zoom=zoom))
+        panels.append(Panel(label, [Line(series.t_s, series.values, commanded, "command", held=True)], zoom=zoom))
     return over_time(panels, name, f"Measured and commanded signals over {log.episode.duration_s:.1f} s")
 
 

@@ -94,6 +94,7 @@ def _about_others(run_dir: Path, artifacts: dict[str, Artifact]) -> list[NoteBlo
         tried = attempts(run_dir, stage)
         if tried and (stage not in artifacts or tried[0].folder != artifacts[stage].folder):
             status = tried[0].manifest.get("status", "without a manifest")
+            status = "a dry run" if status == "dry run" else status
             error = tried[0].manifest.get("error")
             shown = f"this page shows {artifacts[stage].folder.name}" if stage in artifacts else "it is left out"
             notes.append(

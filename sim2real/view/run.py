@@ -11,6 +11,8 @@ from typing import Any
 from sim2real.errors import Sim2RealError
 
 STAGES = ("record", "identify", "train", "deploy")
+_ENDED = ("finished", "dry run")
+"""Status of what is shown, the better first."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,11 @@ class Artifact:
         return path
 
     @property
+    def dry(self) -> bool:
+        """Whether it moved nothing."""
+        return self.manifest.get("dry_run") is True
+
+    @property
     def again(self) -> str:
         """How to make the artifact anew."""
         return f"run `sim2real {self.stage} {self.manifest.get('pipeline', 'PIPELINE')}` again"
@@ -82,14 +89,14 @@ def attempts(run_dir: Path, stage: str) -> list[Artifact]:
 
 
 def finished(run_dir: Path) -> dict[str, Artifact]:
-    """Return stage -> its newest finished attempt, in the order of the stages.
+    """Return stage -> its newest finished attempt, in the order of the stages; a dry run where there is no other.
 
     Raises:
         Sim2RealError: When there is none at all.
     """
     found = {}
     for stage in STAGES:
-        done = [a for a in attempts(run_dir, stage) if a.manifest.get("status") == "finished"]
+        done = [a for kind in _ENDED for a in attempts(run_dir, stage) if a.manifest.get("status") == kind]
         if done:
             found[stage] = done[0]
     if not found:

@@ -11,7 +11,7 @@ from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
 from sim2real.view import figures, timing
 from sim2real.view.about import about
-from sim2real.view.artifacts import read_deployment, read_training
+from sim2real.view.artifacts import Deployment, read_deployment, read_training
 from sim2real.view.blocks import (
     MISSING,
     Block,
@@ -26,6 +26,7 @@ from sim2real.view.blocks import (
 )
 from sim2real.view.identify_section import identify_section
 from sim2real.view.run import Artifact
+from sim2real.view.servos import DRY, servo_blocks
 from sim2real.view.signals import read_recording, unit_of
 
 
@@ -34,17 +35,20 @@ def record_section(artifact: Artifact) -> Section:
     log = read_recording(artifact.need("log", "session.mcap"), artifact.output("truth", "truth.bin"))
     blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
     truth = " The true state is what the embedded robot knew of itself." if log.truth else ""
+    commanded = "what would have been commanded" if log.dry else "what was commanded"
     blocks.append(
         FigureBlock(
             figures.recording(log, "record-signals"),
-            f"What was measured, at the time of each sample, and what was commanded.{truth} Right: a closer look.",
+            f"What was measured, at the time of each sample, and {commanded}.{truth} Right: a closer look.",
         )
     )
-    blocks += _timing_blocks(log.episode, "record")
+    blocks += [*_timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
     steps = max((len(s) for s in log.episode.steps.values()), default=0)
     tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *_timing_tiles([log.episode])]
-    lead = "The robot under an excitation; the log is what everything after it rests on."
-    return Section("record", "Record", lead, tiles, [*blocks, *about(artifact)])
+    lead = "The robot under an excitation" + (
+        ", with torque withheld." if log.dry else "; the log is what everything after it rests on."
+    )
+    return Section("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
 
 
 def train_section(artifact: Artifact) -> Section:
@@ -70,6 +74,8 @@ def train_section(artifact: Artifact) -> Section:
 def deploy_section(artifact: Artifact) -> Section:
     """Return the gap between robot and simulation, and each episode."""
     deployed = read_deployment(artifact)
+    if artifact.dry:
+        return _dry_section(artifact, deployed)
     blocks: list[Block] = [NoteBlock(text) for log in deployed.episodes for text in log.warnings]
     rows = [
         [
@@ -87,6 +93,7 @@ def deploy_section(artifact: Artifact) -> Section:
         blocks.append(FigureBlock(figures.deployment(deployed, index, f"deploy-{index}"), caption))
     for index, log in enumerate(deployed.episodes):
         blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    blocks += servo_blocks([log.episode for log in deployed.episodes])
     real, simulated = (
         [float(s[kind]["success"]) for s in deployed.scores if s[kind].get("success") is not None]
         for kind in ("real", "simulation")
@@ -98,6 +105,21 @@ def deploy_section(artifact: Artifact) -> Section:
     tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in deployed.episodes])]
     lead = "The policy on the robot, beside the same policy in simulation."
     return Section("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
+
+
+def _dry_section(artifact: Artifact, deployed: Deployment) -> Section:
+    """Return what a policy would have done; there is no gap, as nothing was moved."""
+    blocks: list[Block] = [NoteBlock(text) for log in deployed.episodes for text in log.warnings]
+    blocks.append(NoteBlock("There is no gap report: a simulation has nothing to be compared with."))
+    for index, log in enumerate(deployed.episodes):
+        caption = f"Episode {index}: what was measured, and what the policy would have sent."
+        blocks.append(FigureBlock(figures.recording(log, f"deploy-{index}"), caption))
+    episodes = [log.episode for log in deployed.episodes]
+    for index, episode in enumerate(episodes):
+        blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
+    lead = "The policy on the robot, with torque withheld."
+    return Section("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
 
 
 SECTIONS = {

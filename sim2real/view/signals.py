@@ -53,12 +53,22 @@ class Recording:
     units: Mapping[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def dry(self) -> bool:
+        """Whether nothing was moved: what was commanded was not sent."""
+        return is_dry(self.episode)
+
     def last_command(self) -> list[Series]:
         """Return the outputs of the nodes that no other node reads: what reaches the motors."""
         graph = self.episode.metadata.get("graph", {})
         read = {i.get("from") for node in graph.values() for i in node.get("inputs", {}).values()}
         last = [s for s in self.commanded if s.source not in read]
         return last or self.commanded
+
+
+def is_dry(episode: Episode) -> bool:
+    """Return whether a log is of a dry run."""
+    return episode.metadata.get("dry_run") is True
 
 
 def read_recording(log: Path, truth: Path | None = None) -> Recording:

@@ -1,0 +1,120 @@
+"""Torque withheld: the rig does all that it does, and the servos get neither torque nor a goal."""
+
+import time
+
+import numpy as np
+import pytest
+
+from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware import registers as reg
+from sim2real.hardware.bus import BusConfig
+from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.truth import Kind
+
+pytestmark = pytest.mark.realtime
+
+START_RAD = np.array([0.5, -0.8, 0.3])
+
+
+@pytest.fixture
+def open_rig(start_robot):
+    rigs = []
+
+    def open_(drive, plant, ids, withhold=True, **gate):
+        robot = start_robot(plant)
+        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
+        rigs.append(ServoRig(bus, GateConfig(command_timeout_s=0.1, **gate), ids, drive))
+        if withhold:
+            rigs[-1].withhold_torque()
+        return rigs[-1], robot
+
+    yield open_
+    for rig in rigs:
+        rig.close()
+
+
+def assert_untouched(robot, register, bus, ids):
+    """The servos' own goals are as at power-up, and their motors were told nothing."""
+    for servo_id in ids:
+        held = bus._link.read_bytes(servo_id, register.address, register.size, "read")[0]
+        assert register.decode(held) == register.default
+        assert bus.read(servo_id, reg.TORQUE_ENABLE) == 0
+    assert robot.truth().of(Kind.EFFECT).size == 0
+
+
+def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
+    drive = PositionDrive(p_gain=800, profile_velocity_rad_s=20.0)
+    rig, robot = open_rig(drive, "Joints", (1, 2, 3), limit=1.0, slew_per_s=2.0, stale="hold")
+    rig.start()
+    assert rig.gate.fallback == pytest.approx(START_RAD, abs=reg.RAD_PER_COUNT)
+    time.sleep(0.6)  # the looks for servos that have lost their settings must find them as they should be
+    rig.measure()
+    begin = time.monotonic()
+    sent = [rig.command(np.array([0.5, -3.0, 0.3]), 0.0, begin + 0.02 * k) for k in range(20)]
+    rig.measure()
+    np.testing.assert_allclose(sent[-1], [0.5, -1.0, 0.3], atol=1e-2)
+    counts = rig.gate.counts
+    assert (counts.passed, counts.clamped) == (20, 20)
+    assert counts.cut[1] == 20
+    np.testing.assert_allclose(counts.low, np.min(sent, axis=0))
+    np.testing.assert_allclose(counts.high, np.max(sent, axis=0))
+    np.testing.assert_allclose(counts.total, np.sum(sent, axis=0))
+    assert rig.bus.withheld >= 20 + 2 * 3
+    rig.stop()
+    assert_untouched(robot, reg.GOAL_POSITION, rig.bus, (1, 2, 3))
+
+
+def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
+    """With torque, volts both ways and not one count of motion would be a stuck encoder."""
+    rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0, stuck_s=0.05)
+    rig.start()
+    for k in range(40):
+        assert rig.command(np.array([4.0 if k % 20 < 10 else -4.0]), 0.0, time.monotonic()).tolist()[0] != 0.0
+        rig.measure()
+        time.sleep(0.01)
+    assert rig.suspects == []
+    assert rig.measure().velocity_rad_s[0] == 0.0
+    rig.stop()
+    assert_untouched(robot, reg.GOAL_PWM, rig.bus, (1,))
+
+
+def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
+    rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0)
+    rig.start()
+    rig.command(np.array([2.0]), 0.0, time.monotonic())
+    time.sleep(0.3)
+    assert rig.timeouts >= 1
+    rig.stop()
+    assert_untouched(robot, reg.GOAL_PWM, rig.bus, (1,))
+
+
+def test_the_guardian_watches_as_well(start_robot, open_bus):
+    """A process that is silent for too long is told so, as it would be with torque on."""
+    robot = start_robot("FirstOrder")
+    bus = open_bus(robot, watchdog_s=0.2)
+    bus.setup(OperatingMode.PWM)
+    bus.withhold_torque()
+    bus.torque(True)
+    assert bus.guardian_pid is not None
+    time.sleep(0.6)
+    with pytest.raises(SafetyStop, match="the guardian has taken the torque off"):
+        bus.read_state()
+    assert robot.truth().of(Kind.EFFECT).size == 0
+
+
+def test_it_is_for_good_and_before_torque(open_rig):
+    rig, _ = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), withhold=False, limit=4.0)
+    assert not rig.torque_withheld
+    rig.start()
+    with pytest.raises(
+        UsageError, match=r"torque cannot be withheld: it is on(.|\n)*hint: call withhold_torque before"
+    ):
+        rig.withhold_torque()
+    rig.stop()
+    rig.withhold_torque()
+    rig.start()
+    rig.stop()
+    assert rig.torque_withheld
