@@ -129,8 +129,7 @@ class ServoRig:
         sent = self._sent
         reading = self._drive.reading(self.bus.read_state(self.ids))
         position, asked = reading.position_rad, reading.transaction
-        free = sent is None or self.torque_withheld
-        effort = np.zeros(len(self.ids)) if free else self._drive.effort(sent, position)
+        effort = np.zeros(len(self.ids)) if sent is None or self.torque_withheld else self._drive.effort(sent, position)
         self._plausibility.check(position, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
         self._speed_rad_s = reading.velocity_rad_s
         return reading

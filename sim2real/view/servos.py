@@ -45,7 +45,7 @@ def _answers(end: Mapping[str, Any]) -> list[str]:
     share = late / count
     told = "no answer came so late" if not late else f"{number(late)} answers ({share:.1%}) came so late"
     advice = ": set the adapter's latency timer to 1 ms, and close what else runs" if share > _LATE_SHARE else ""
-    items.append(f"{told} that it is not sure when their samples were taken{advice}.".capitalize())
+    items.append(f"{told} that it is not sure when its sample was taken{advice}.".capitalize())
     if all(isinstance(q, int | float) for q in end.get("late_s") or [None]):
         half, most, last = (fixed(1e3 * q, 2) for q in end["late_s"])
         items.append(
