@@ -191,6 +191,13 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
     return Timeline(vertices, derived.edges)
 
 
+def at_delay(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex, delay: int) -> Edge:
+    """Return an edge whose delay is trainable as it is at another delay [ticks]; what is lost stays lost."""
+    sent = sender.end[:, : edge.received.shape[1]]
+    received = np.where(edge.received >= NEVER, NEVER, np.maximum.accumulate(sent + delay, axis=1))
+    return Edge(received, consumer(connection, received, reader, sender), edge.sender)
+
+
 def consumer(connection: Connection, received: np.ndarray, reader: Vertex, sender: Vertex) -> np.ndarray:
     """Return which step consumes each message, shape ``(E, M)`` (rule 6); -1 where none does."""
     count = received.shape[1]

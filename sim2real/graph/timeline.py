@@ -12,8 +12,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, Messages
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, Connection, to_ticks
 
 _FORMAT = 2
 NEVER = np.int64(2**60)
@@ -86,6 +87,9 @@ class Timeline:
     def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
         """Return the timeline of one recorded episode (E = 1): of those ``nodes`` that the record holds.
 
+        Messages whose delay is trainable arrive at its least value, as in a timeline that is drawn: the record has them
+        at the delay of that time, and windows need them for any.
+
         Raises:
             UsageError: When it holds none of them, or messages of a connection that the nodes do not have.
         """
@@ -102,7 +106,8 @@ class Timeline:
                 continue
             sender = nodes[name].inputs[input_name].output_node.name
             if sender in vertices:
-                edges[name, input_name] = _edge(m, len(episode.steps[sender]), len(episode.steps[name]), sender)
+                edge = _edge(m, len(episode.steps[sender]), len(episode.steps[name]), sender)
+                edges[name, input_name] = _at_least_delay(nodes[name].inputs[input_name], edge, episode, vertices)
         return Timeline(vertices, edges)
 
     @staticmethod
@@ -225,6 +230,17 @@ def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
     # In order, always: what comes behind a message that is lost, or that no recorded step consumed, counts as lost too.
     lost = np.logical_or.accumulate((seq_in < 0) | (seq_in >= steps))
     return Edge(received[None], np.where(lost, -1, seq_in)[None], sender)
+
+
+def _at_least_delay(connection: Connection, edge: Edge, episode: Episode, vertices: Mapping[str, Vertex]) -> Edge:
+    """Return an edge as drawn timelines have it: at the least value of a delay that is trainable."""
+    from sim2real.graph.schedule import at_delay  # the rules, which are about timelines
+
+    if not isinstance(connection.delay_dist, TrainableDist):
+        return edge
+    steps, reader = episode.steps[connection.input_node.name], vertices[connection.input_node.name]
+    reader = Vertex(steps.start[None], reader.end, reader.count)  # not where a step has moved its start to
+    return at_delay(connection, edge, reader, vertices[edge.sender], to_ticks(connection.delay_dist.min))
 
 
 def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "right"] = "left") -> np.ndarray:

@@ -10,9 +10,10 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
-from sim2real.graph.schedule import next_drift, slot, topological
+from sim2real.graph.schedule import at_delay, next_drift, slot, topological
 from sim2real.graph.timeline import Edge, Timeline
 from sim2real.runtime.data import Message, NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout, named
@@ -24,10 +25,24 @@ _NEVER = 2**62
 
 
 class _Link:
-    """One connection of the timeline: which messages each step consumes."""
+    """One connection of the timeline: which messages each step consumes, and what the record says of them.
 
-    def __init__(self, edge: Edge, episode: int, steps: int) -> None:
+    The two differ for a trainable delay: the window takes messages in at the least delay, so that the step can pick
+    those that have arrived at the delay that it has. The record has the arrivals at that delay.
+
+    Args:
+        edge: The timeline's.
+        told: The record's.
+        episode: Which episode of both.
+        steps: Steps of the reader in it.
+    """
+
+    def __init__(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
         self.sender = edge.sender
+        self.told_received: list[int] = told.received[episode].tolist()
+        self.told_seq_in: list[int] = told.seq_in[episode].tolist()
+        self._told = np.flatnonzero(told.seq_in[episode] >= 0)
+        self._told_bounds = np.searchsorted(told.seq_in[episode][self._told], np.arange(steps + 1)).tolist()
         self.received: list[int] = edge.received[episode].tolist()
         self.seq_in: list[int] = edge.seq_in[episode].tolist()
         self.used = np.flatnonzero(edge.seq_in[episode] >= 0)
@@ -37,6 +52,10 @@ class _Link:
     def consumed(self, k: int) -> list[int]:
         """Return the messages that step ``k`` consumes, oldest first."""
         return self.used[self.bounds[k] : self.bounds[k + 1]].tolist()
+
+    def told(self, k: int) -> list[int]:
+        """Return the messages that step ``k`` was the first to see, oldest first."""
+        return self._told[self._told_bounds[k] : self._told_bounds[k + 1]].tolist()
 
     def put(self, m: int, leaves: list[np.ndarray]) -> None:
         """Keep message ``m`` if a step will consume it."""
@@ -55,7 +74,9 @@ class _Player:
         self.begins: list[int] = [*vertex.start[episode, :steps].tolist(), _NEVER]
         self.ends: list[int] = vertex.end[episode, :steps].tolist()
         self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
-        self.links = {i: _Link(timeline.edges[node.name, i], episode, steps) for i in node.inputs}
+        self.links = {
+            i: _Link(timeline.edges[node.name, i], _told(data, i, timeline), episode, steps) for i in node.inputs
+        }
         self.outputs: list[_Link] = []
         self.k = 0
         self.drift = 0
@@ -74,6 +95,16 @@ class _Player:
             if last and link.used[last - 1] >= players[link.sender].k:
                 return False
         return True
+
+
+def _told(data: NodeData, name: str, timeline: Timeline) -> Edge:
+    """Return an input's messages as they arrive at the delay that it has: of a trainable one not the timeline's."""
+    node = data.node
+    edge, dist = timeline.edges[node.name, name], data.windows[name].state.delay_dist
+    if not isinstance(dist, TrainableDist):
+        return edge
+    reader, sender = timeline.vertices[node.name], timeline.vertices[edge.sender]
+    return at_delay(node.inputs[name], edge, reader, sender, to_ticks(float(dist.delay)))
 
 
 class SimulatedRun:
@@ -197,7 +228,7 @@ class SimulatedRun:
             for player in self._players.values():
                 for name, link in player.links.items():
                     for m in range(self._players[link.sender].k):
-                        if not 0 <= link.seq_in[m] < player.k:
+                        if not 0 <= link.told_seq_in[m] < player.k:
                             self._recorder.message(self._message_record(player, name, m, -1))
 
     def snapshot(self) -> GraphState:
@@ -278,7 +309,7 @@ class SimulatedRun:
         record = StepRecord(name, k, player.slots[k], begin, begin, moved, player.ends[k], player.drift)
         self._recorder.step(record, player.data.form.unpack(result.leaves))
         for input_name, link in player.links.items():
-            for m in link.consumed(k):
+            for m in link.told(k):
                 self._recorder.message(self._message_record(player, input_name, m, k))
 
     def _message(self, link: _Link, m: int) -> Message:
@@ -288,4 +319,4 @@ class SimulatedRun:
     def _message_record(self, player: _Player, name: str, m: int, seq_in: int) -> MessageRecord:
         link = player.links[name]
         sent = self._players[link.sender].ends[m]
-        return MessageRecord(player.data.node.name, name, m, seq_in, sent, link.received[m])
+        return MessageRecord(player.data.node.name, name, m, seq_in, sent, link.told_received[m])

@@ -210,6 +210,10 @@ def test_trainable_delays_are_applied(interp):
     episode, final = record(nodes, "world", duration_s=0.5)
     assert float(final.delays["world"]["command"].delay) == pytest.approx(0.025)
     steps, sent = episode.steps["world"], episode.steps["command"].end
+    messages, drawn = episode.messages["world", "command"], draw(nodes, 0.5).edges["world", "command"]
+    np.testing.assert_array_equal(messages.received - messages.sent, 25_000)
+    again = Timeline.from_episode(episode, nodes).edges["world", "command"]
+    np.testing.assert_array_equal([again.received, again.seq_in], [drawn.received, drawn.seq_in])
     for k, t in enumerate(steps.start):
         newest = np.searchsorted(sent + 25_000, t, side="right") - 1
         if interp == "zoh_mean":  # the command that arrives halfway through the tick counts for its half
@@ -220,6 +224,39 @@ def test_trainable_delays_are_applied(interp):
             expected = newest
         if newest >= 1:
             assert float(episode.outputs["world"]["x"][k]) == pytest.approx(float(expected), abs=0.01)
+
+
+class Newest(BaseNode):
+    """Tells which message is the newest that it sees."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Value(x=jnp.int32(-1))
+
+    def step(self, step_state):
+        return step_state, Value(x=step_state.inputs["sender"][-1].seq)
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_a_record_says_when_messages_arrived_at_the_delay_that_they_had(skip):
+    """And which step was the first to see them: ages and arrows are worked out from it."""
+    sender, reader = Jitted("sender", 50.0, delay_dist=0.001), Newest("reader", 50.0)
+    reader.connect(sender, delay_dist=TrainableDist.create(0.039, 0.0, 0.1), skip=skip)
+    nodes = {"sender": sender, "reader": reader}
+    timeline = draw(nodes, 1.0, rng=0)
+    episode, _ = record(nodes, "reader", timeline=timeline)
+    messages, starts = episode.messages["reader", "sender"], episode.steps["reader"].start
+    np.testing.assert_array_equal(messages.received - messages.sent, 39_000)
+    seen = episode.outputs["reader"]["x"]
+    for seq_out, seq_in, received in zip(messages.seq_out, messages.seq_in, messages.received, strict=True):
+        sees = np.flatnonzero(seen >= seq_out)
+        assert seq_in == (sees[0] if sees.size else -1)
+        assert seq_in == -1 or starts[seq_in] >= received + skip
+    ages = input_ages(episode, "reader")["sender"]
+    assert np.nanmin(ages) == pytest.approx(0.039 if not skip else 0.059)
+    again = Timeline.from_episode(episode, nodes).edges["reader", "sender"]
+    drawn = timeline.edges["reader", "sender"]  # as windows need it: at the least delay
+    np.testing.assert_array_equal(again.received, drawn.received)
+    np.testing.assert_array_equal(again.seq_in, drawn.seq_in)
 
 
 def test_options_that_do_not_fit_are_refused():
