@@ -9,7 +9,6 @@ import numpy as np
 from benches import sysid
 from benches.recordings import PAST
 from sim2real.graph.episode import Episode
-from sim2real.identify.segments import measured_times
 
 Row = tuple[str, float, str, str, str]
 
@@ -21,7 +20,7 @@ def rows(case: str, fitted: Mapping[str, Episode], test: Mapping[str, Episode], 
 
 def recording(episode: Episode, command: str, field: str, **constants: object) -> sysid.Recording:
     """Return an episode as the yardstick takes it; it starts at the first measured position, at rest."""
-    t = measured_times(episode, "sensor")
+    t = episode.steps["sensor"].begun_s
     commands, position = (
         np.asarray(a, np.float64) for a in (_of(episode, "actuator", command), _of(episode, "sensor", field))
     )

@@ -8,6 +8,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+TICKS_PER_S = 1_000_000
+"""All times of schedules and logs are whole ticks: microseconds."""
+
 
 class StepRecord(NamedTuple):
     """One finished step of a node; times in ticks [us] from the episode's start.
@@ -64,6 +67,19 @@ class Steps:
     def __len__(self) -> int:
         return len(self.start)
 
+    @property
+    def begun(self) -> np.ndarray:
+        """When each step began, ``(N,)`` ticks [us]: the time that the step set itself, else its start.
+
+        A sensor sets the time at which its sample was taken: of its steps, these are the samples' times.
+        """
+        return np.where(self.ts_overwrite >= 0, self.ts_overwrite, self.start)
+
+    @property
+    def begun_s(self) -> np.ndarray:
+        """When each step began, ``(N,)`` [s]; see ``begun``."""
+        return self.begun / TICKS_PER_S
+
 
 @dataclass(frozen=True)
 class Messages:
@@ -100,7 +116,7 @@ class Episode:
     def duration_s(self) -> float:
         """When the last step ended [s]."""
         ends = [int(s.end[-1]) for s in self.steps.values() if len(s)]
-        return max(ends, default=0) / 1e6
+        return max(ends, default=0) / TICKS_PER_S
 
 
 class MemoryRecorder:

@@ -12,9 +12,7 @@ from typing import Any
 from sim2real.errors import UsageError
 from sim2real.graph.base import Empty, GraphState, StepState
 from sim2real.graph.delays import DelayDistribution, StaticDist, TrainableDist
-
-TICKS_PER_S = 1_000_000
-"""Schedules are computed on integers: one tick is a microsecond."""
+from sim2real.graph.episode import TICKS_PER_S as TICKS_PER_S
 
 
 class Scheduling(Enum):

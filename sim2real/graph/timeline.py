@@ -99,8 +99,7 @@ class Timeline:
             raise UsageError(f"the record has none of {', '.join(nodes)}. Available: {', '.join(episode.steps)}")
         for name in present:
             steps = episode.steps[name]
-            begin = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start)
-            vertices[name] = Vertex(begin[None], steps.end[None], np.array([len(steps)]))
+            vertices[name] = Vertex(steps.begun[None], steps.end[None], np.array([len(steps)]))
         for (name, input_name), m in episode.messages.items():
             if name not in vertices or input_name not in nodes[name].inputs:
                 continue
