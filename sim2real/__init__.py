@@ -6,9 +6,16 @@ The public names are imported when they are first used: ``import sim2real`` itse
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sim2real.artifacts.bundle import Bundle as Bundle
+    from sim2real.artifacts.deployment import Deployment as Deployment
+    from sim2real.artifacts.identification import Identification as Identification
+    from sim2real.artifacts.recording import Recording as Recording
+    from sim2real.artifacts.timing import Timing as Timing
     from sim2real.errors import DeadlineExceeded as DeadlineExceeded
     from sim2real.errors import HardwareLost as HardwareLost
     from sim2real.errors import SafetyStop as SafetyStop
@@ -35,7 +42,12 @@ if TYPE_CHECKING:
     from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
     from sim2real.runtime.clock import Clock as Clock
     from sim2real.runtime.compiled import CompiledGraph as CompiledGraph
+    from sim2real.stages.deploy import deploy as deploy
+    from sim2real.stages.identify import identify as identify
     from sim2real.stages.pipeline import Pipeline as Pipeline
+    from sim2real.stages.pipeline import load_pipeline as load_pipeline
+    from sim2real.stages.record import record as record
+    from sim2real.stages.train import train as train
     from sim2real.train.networks import Policy as Policy
 
     __version__: str
@@ -45,33 +57,48 @@ __all__ = [
     "Base",
     "BaseNode",
     "BaseWorld",
+    "Bundle",
     "Clock",
     "CompiledGraph",
     "Connection",
     "DeadlineExceeded",
+    "Deployment",
     "EmpiricalDist",
     "Empty",
     "Episode",
     "GraphState",
     "HardwareLost",
+    "Identification",
     "InputState",
     "Jitter",
     "MemoryRecorder",
     "Pipeline",
     "Policy",
     "Recorder",
+    "Recording",
     "SafetyStop",
     "Scheduling",
     "Sim2RealError",
     "StaticDist",
     "StepState",
     "Timeline",
+    "Timing",
     "TrainableDist",
     "UsageError",
+    "deploy",
     "draw",
+    "identify",
+    "load_pipeline",
+    "record",
+    "train",
 ]
 
 _HOMES = {
+    "sim2real.artifacts.bundle": ("Bundle",),
+    "sim2real.artifacts.deployment": ("Deployment",),
+    "sim2real.artifacts.identification": ("Identification",),
+    "sim2real.artifacts.recording": ("Recording",),
+    "sim2real.artifacts.timing": ("Timing",),
     "sim2real.errors": ("DeadlineExceeded", "HardwareLost", "SafetyStop", "Sim2RealError", "UsageError"),
     "sim2real.graph": (
         "Base",
@@ -96,10 +123,30 @@ _HOMES = {
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
     "sim2real.runtime.compiled": ("CompiledGraph",),
-    "sim2real.stages.pipeline": ("Pipeline",),
+    "sim2real.stages.deploy": ("deploy",),
+    "sim2real.stages.pipeline": ("Pipeline", "load_pipeline"),
+    "sim2real.stages.record": ("record",),
     "sim2real.train.networks": ("Policy",),
 }
+_ROOMS = ("identify", "train")
+"""Rooms that are called like the stage that does their work: ``sim2real.identify(...)`` runs it, see ``room``."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+class _Room(ModuleType):
+    """A room of the package that, called, runs the stage of its name.
+
+    Importing anything from a room sets it as this package's attribute, so that a function of that name would be gone.
+    """
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        name = self.__name__.rpartition(".")[2]
+        return getattr(importlib.import_module(f"sim2real.stages.{name}"), name)(*args, **options)
+
+
+def room(name: str) -> None:
+    """Let a room's module, which calls this while it is imported, run the stage of its name when it is called."""
+    sys.modules[name].__class__ = _Room
 
 
 def __getattr__(name: str) -> Any:
@@ -108,6 +155,8 @@ def __getattr__(name: str) -> Any:
         from importlib import metadata
 
         value: Any = metadata.version("sim2real")
+    elif name in _ROOMS:
+        value = importlib.import_module(f"sim2real.{name}")
     elif name in _HOME_OF:
         value = getattr(importlib.import_module(_HOME_OF[name]), name)
     else:

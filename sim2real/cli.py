@@ -16,8 +16,8 @@ from sim2real.stages import ending
 from sim2real.stages.interruption import Signals
 
 if TYPE_CHECKING:
+    from sim2real.artifacts.run_folder import StageFolder
     from sim2real.stages.pipeline import Pipeline
-    from sim2real.stages.runs import StageFolder
 
 DEMO_PIPELINE = "pendulum"
 
@@ -117,7 +117,7 @@ def _dispatch(arguments: list[str]) -> None:
 
 def _stage(stage: str, arguments: list[str]) -> None:
     """``sim2real STAGE PIPELINE [flags]``."""
-    from sim2real.stages import flags, runs
+    from sim2real.stages import flags, targets
 
     pipeline, rest = _pipeline_first(stage, arguments)
     config = getattr(pipeline, stage)
@@ -129,16 +129,17 @@ def _stage(stage: str, arguments: list[str]) -> None:
         epilog=_epilog(f"sim2real {stage} {pipeline.name} --runs /data/runs", f"sim2real report {pipeline.name}"),
         kind=flags.StageFlags[type(config)],
     )
-    run_dir = runs.find_run(parsed.runs, parsed.run, pipeline.name) if parsed.run else None
+    run_dir = targets.find_run(parsed.runs, parsed.run, pipeline.name) if parsed.run else None
     _call_stage(stage, pipeline, parsed.config, parsed.runs, run_dir)
 
 
 def _run(command: str, arguments: list[str]) -> None:
     """``sim2real run PIPELINE [flags]``."""
-    from sim2real.stages import flags, runs
+    from sim2real.artifacts.run_folder import STAGES
+    from sim2real.stages import flags
 
     pipeline, rest = _pipeline_first(command, arguments)
-    default = flags.RunFlags(**{stage: getattr(pipeline, stage) for stage in runs.STAGES})
+    default = flags.RunFlags(**{stage: getattr(pipeline, stage) for stage in STAGES})
     texts = {
         "prog": f"sim2real run {pipeline.name}",
         "description": "Record, identify, train and deploy, one after the other.",
@@ -156,7 +157,8 @@ def _run(command: str, arguments: list[str]) -> None:
 
 def _demo(command: str, arguments: list[str]) -> None:
     """``sim2real demo [flags]``."""
-    from sim2real.stages import flags, runs
+    from sim2real.artifacts.run_folder import STAGES
+    from sim2real.stages import flags
     from sim2real.stages.pipeline import load_pipeline
 
     parsed = flags.parse(
@@ -167,14 +169,14 @@ def _demo(command: str, arguments: list[str]) -> None:
         epilog=_epilog("sim2real demo --seed 1", f"sim2real run {DEMO_PIPELINE} --help"),
     )
     pipeline = load_pipeline(DEMO_PIPELINE)
-    stages = {stage: getattr(pipeline, stage) for stage in runs.STAGES}
+    stages = {stage: getattr(pipeline, stage) for stage in STAGES}
     everything = flags.RunFlags(seed=parsed.seed, runs=parsed.runs, resume=parsed.resume, **stages)
     _run_all(pipeline, everything if parsed.seed is None else _seeded(everything, parsed.seed))
 
 
 def _view(command: str, arguments: list[str]) -> None:
     """``sim2real view RUN|PIPELINE [--save FILE.rrd]`` and ``sim2real report RUN|PIPELINE``."""
-    from sim2real.stages import console, flags, runs
+    from sim2real.stages import console, flags, targets
     from sim2real.stages.pipeline import available
 
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
@@ -194,11 +196,11 @@ def _view(command: str, arguments: list[str]) -> None:
     default, description = looks[command]
     epilog = _epilog(f"sim2real {command} {DEMO_PIPELINE}", f"sim2real {command} runs/{DEMO_PIPELINE}/TIME")
     parsed = flags.parse(default, rest, f"sim2real {command} {target}", description, epilog)
-    run_dir = runs.find_run(parsed.runs, target)
+    run_dir = targets.find_run(parsed.runs, target)
     if isinstance(parsed, flags.ViewFlags):
+        from sim2real.artifacts.run_folder import pipeline_of
         from sim2real.stages.pipeline import load_pipeline
         from sim2real.view.recording import view
-        from sim2real.view.run import pipeline_of
 
         pipeline = load_pipeline(pipeline_of(run_dir))
         view(run_dir, parsed.save, pipeline.load(pipeline.scene).log_scene if pipeline.scene else None)
@@ -212,7 +214,7 @@ def _view(command: str, arguments: list[str]) -> None:
 
 def _info(command: str, arguments: list[str]) -> None:
     """``sim2real info [PIPELINE|LOG|RUN]``."""
-    from sim2real.stages import flags, info, runs
+    from sim2real.stages import flags, info, targets
     from sim2real.stages.pipeline import available
 
     named = bool(arguments) and not arguments[0].startswith("-")
@@ -227,7 +229,7 @@ def _info(command: str, arguments: list[str]) -> None:
     elif target in available():
         print(info.pipeline(target, parsed.runs))
     else:
-        print(info.run(runs.find_run(parsed.runs, target)))
+        print(info.run(targets.find_run(parsed.runs, target)))
 
 
 def _import(command: str, arguments: list[str]) -> None:
@@ -293,22 +295,23 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
 
 def _run_all(pipeline: Pipeline, flags: Any) -> None:
     """Run the four stages in one run folder; from the first one on that is not finished there."""
-    from sim2real.stages import console, runs
+    from sim2real.artifacts.run_folder import STAGES, finished
+    from sim2real.stages import console, targets
 
     if flags.record.dry_run:
         raise UsageError(
             "a run cannot go on from a dry recording: there is nothing in it to identify",
             hint=f"`sim2real record {pipeline.name} --dry-run` by itself; of a run, deploy alone may be dry",
         )
-    run_dir = runs.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
+    run_dir = targets.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
     redo = run_dir is None
-    for number, stage in enumerate(runs.STAGES, 1):
-        done = None if redo or run_dir is None else runs.finished(run_dir, stage)
+    for number, stage in enumerate(STAGES, 1):
+        done = None if redo or run_dir is None else finished(run_dir, stage)
         if done is not None:
-            console.note(f"{stage} ({number}/{len(runs.STAGES)}): finished before, skipped")
+            console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")
             continue
         redo = True  # what comes after a stage that ran again is out of date
-        console.note(f"{stage} ({number}/{len(runs.STAGES)})")
+        console.note(f"{stage} ({number}/{len(STAGES)})")
         run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir).run_dir
 
 
@@ -340,7 +343,7 @@ def _pipeline_first(command: str, arguments: list[str]) -> tuple[Pipeline, list[
 
 def _seeded(flags: Any, seed: int) -> Any:
     """Return the flags of a run with one seed in every stage."""
-    from sim2real.stages.runs import STAGES
+    from sim2real.artifacts.run_folder import STAGES
 
     return replace(flags, **{stage: replace(getattr(flags, stage), seed=seed) for stage in STAGES})
 

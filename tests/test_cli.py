@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from sim2real import cli, errors
-from sim2real.stages import runs
+from sim2real.artifacts import run_folder
 from sim2real.stages.config import RecordConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -27,7 +27,7 @@ def calls(monkeypatch, tmp_path):
     def stand_in(stage):
         def run(pipeline, config, root, run_dir):
             seen.append((stage, config, run_dir))
-            with runs.open_stage(root, pipeline.name, stage, config, run_dir=run_dir) as folder:
+            with run_folder.open_stage(root, pipeline.name, stage, config, run_dir=run_dir) as folder:
                 folder.output("result", "result.txt").write_text(stage)
                 folder.summary({"seed": config.seed})
             return folder.result
@@ -36,7 +36,7 @@ def calls(monkeypatch, tmp_path):
         module.run = run
         return module
 
-    for stage in runs.STAGES:
+    for stage in run_folder.STAGES:
         monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}", stand_in(stage))
     return seen
 
@@ -179,7 +179,7 @@ def test_flags_reach_the_stage_and_the_result_goes_to_stdout(calls, capsys, tmp_
 
 def test_run_is_all_four_stages_in_one_folder_with_one_seed(calls, capsys):
     assert cli.main(["run", "pendulum", "--seed", "3", "--train.seed", "9", "--record.duration-s", "5"]) == 0
-    assert [stage for stage, *_ in calls] == list(runs.STAGES)
+    assert [stage for stage, *_ in calls] == list(run_folder.STAGES)
     assert [config.seed for _, config, _ in calls] == [3, 3, 9, 3]
     assert calls[0][1].duration_s == 5.0
     assert len({run_dir for *_, run_dir in calls[1:]}) == 1
@@ -193,7 +193,7 @@ def test_demo_is_a_run_of_the_embedded_pendulum(calls):
 
 
 def test_resume_skips_what_is_finished(calls, capsys):
-    with runs.open_stage(Path("runs"), "pendulum", "record", RecordConfig()) as stage:
+    with run_folder.open_stage(Path("runs"), "pendulum", "record", RecordConfig()) as stage:
         pass
     assert cli.main(["run", "pendulum", "--resume", str(stage.run_dir)]) == 0
     assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
@@ -203,7 +203,7 @@ def test_resume_skips_what_is_finished(calls, capsys):
 
 def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
     for name in ("record", "train"):
-        with runs.open_stage(Path("runs"), "pendulum", name, None, run_dir=Path("runs/pendulum/1")):
+        with run_folder.open_stage(Path("runs"), "pendulum", name, None, run_dir=Path("runs/pendulum/1")):
             pass
     assert cli.main(["run", "pendulum", "--resume", "1"]) == 0
     assert [name for name, *_ in calls] == ["identify", "train", "deploy"]
@@ -298,7 +298,7 @@ def test_recover_saves_what_is_readable_and_says_what_is_not(capsys, tmp_path):
     ],
 )
 def test_manifests_that_are_none_are_passed_over(capsys, tmp_path, change):
-    with runs.open_stage(tmp_path, "pendulum", "record", None) as stage:
+    with run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage:
         stage.output("log", "session.mcap").write_text("x")
     path = stage.folder / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
@@ -330,10 +330,10 @@ import sys, time
 from pathlib import Path
 from types import ModuleType
 from sim2real import cli
-from sim2real.stages import runs
+from sim2real.artifacts import run_folder
 
 def run(pipeline, config, root, run_dir):
-    with runs.open_stage(root, pipeline.name, "record", config) as stage:
+    with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
         try:
             print("started", flush=True)
             time.sleep(30)
@@ -394,7 +394,7 @@ def test_nothing_heavy_is_imported_for_help(code):
 def test_public_names_are_listed_where_they_come_from():
     import sim2real
 
-    assert set(sim2real.__all__) == set(sim2real._HOME_OF)
+    assert set(sim2real.__all__) == {*sim2real._HOME_OF, *sim2real._ROOMS}
     assert sim2real.Sim2RealError is errors.Sim2RealError
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = sim2real.Nothing

@@ -11,7 +11,7 @@ import numpy as np
 
 from benches import stages
 from benches.figures import row
-from sim2real.log.reader import read_log
+from sim2real.artifacts.recording import Recording
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.stages.truth import true_values
 
@@ -82,8 +82,8 @@ def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, 
     Returns:
         Ratio, RMSE of the identified model, RMSE of the true model [rad].
     """
-    episode = read_log(log)
-    true = true_values(truth, episode)
+    recording = Recording.load(log, truth)
+    episode, true = recording.episode, true_values(recording)
     samples = np.load(predictions)
     plant_class = load_pipeline("pendulum").load("plant").PendulumPlant
     ours, theirs = [], []

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benches.figures import row
-from sim2real.stages.runs import STAGES, StageFolder, finished
+from sim2real.artifacts.run_folder import STAGES, StageFolder, finished
 
 
 def sim2real(*arguments: str) -> None:

@@ -11,21 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.leaves import set_leaf
-
-Transform = Literal["linear", "log", "logit"]
-_TRANSFORMS = {
-    # to the scale, numpy; back from it, for numpy and JAX; derivative of the value on the scale, from the value
-    "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
-    "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
-    "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),
-}
-
-
-def from_scale(transform: str, x: Any, numpy: Any = np) -> Any:
-    """Return values for points on a scale, in numpy or in ``jax.numpy``."""
-    return _TRANSFORMS[transform][1](x, numpy)
 
 
 @dataclass(frozen=True)
@@ -65,9 +53,9 @@ class Parameter:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        if self.transform not in _TRANSFORMS:
+        if self.transform not in TRANSFORMS:
             raise UsageError(
-                f"parameter {self.name!r}: unknown transform {self.transform!r}. Available: {', '.join(_TRANSFORMS)}"
+                f"parameter {self.name!r}: unknown transform {self.transform!r}. Available: {', '.join(TRANSFORMS)}"
             )
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise UsageError(f"parameter {self.name!r}: bounds [{self.low}, {self.high}] {self.unit} are no interval")
@@ -90,7 +78,7 @@ class Parameter:
 
     def to_scale(self, value: float) -> float:
         """Return where a value stands on the parameter's scale."""
-        return float(_TRANSFORMS[self.transform][0](value))
+        return float(TRANSFORMS[self.transform][0](value))
 
 
 @dataclass(frozen=True)
@@ -220,6 +208,16 @@ class ParameterTable:
         share = np.clip((x - self._low) / (self._high - self._low), 1e-3, 1 - 1e-3)
         return np.log(share / (1 - share))
 
+    def posterior(self, z: np.ndarray, covariance: np.ndarray) -> Posterior:
+        """Return what training draws from.
+
+        Args:
+            z: Shape ``(P,)``: the estimate.
+            covariance: Shape ``(P, P)``, on the parameters' scales.
+        """
+        transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in self.columns)
+        return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
+
     def start(self) -> np.ndarray:
         """Return where a search begins, ``(P,)``: the nominal value, for delays a quarter of the interval."""
         first = {p.name: p.nominal if p.kind != "delay" else p.low + 0.25 * (p.high - p.low) for p in self.parameters}
@@ -261,7 +259,7 @@ class ParameterTable:
     def slope(self, x: np.ndarray) -> np.ndarray:
         """Return d value / d scale at points on the parameters' scales, ``(P,)``."""
         values = self.unscale(x)
-        return np.array([_TRANSFORMS[c.parameter.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
+        return np.array([TRANSFORMS[c.parameter.transform][2](v) for c, v in zip(self.columns, values, strict=True)])
 
     @property
     def low(self) -> np.ndarray:

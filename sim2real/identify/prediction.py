@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.artifacts.identification import FreeRun, Prediction
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify.model import Channel
 from sim2real.identify.problem import Problem
@@ -91,15 +92,11 @@ def errors(
     models: Sequence[str],
     settle_s: float,
     horizons: Sequence[float],
-) -> list[dict[str, Any]]:
+) -> list[Prediction]:
     """Return each model's error over each horizon, on fitted and on held-out segments.
 
     Beside the models stand ``hold``, that nothing changes, and, where commands are positions, ``told``: every
     joint is where it was told to be.
-
-    Returns:
-        Rows with ``model``, ``horizon_s``, ``held_out``, and ``FIELD_rmse`` and ``FIELD_mae`` of each field that the
-        model predicts; None where there are no samples.
     """
     ahead = columns["into"] - settle_s
     names = labels(problem)
@@ -109,12 +106,10 @@ def errors(
         for horizon_s in horizons:
             for held_out in (False, True):
                 pick = (columns["held_out"] == held_out) & (ahead > 0) & (ahead <= horizon_s)
-                row: dict[str, Any] = {"model": model, "horizon_s": horizon_s, "held_out": held_out}
-                for n, p in predicted.items():
-                    off = (p - columns[f"{n}_measured"])[pick]
-                    row[f"{n}_rmse"] = float(np.sqrt(np.mean(off**2))) if off.size else None
-                    row[f"{n}_mae"] = float(np.mean(np.abs(off))) if off.size else None
-                rows.append(row)
+                off = {n: (p - columns[f"{n}_measured"])[pick] for n, p in predicted.items()}
+                rmse = {n: float(np.sqrt(np.mean(o**2))) if o.size else None for n, o in off.items()}
+                mae = {n: float(np.mean(np.abs(o))) if o.size else None for n, o in off.items()}
+                rows.append(Prediction(model, horizon_s, held_out, rmse, mae))
     return rows
 
 
@@ -125,12 +120,8 @@ def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
 
 def free_runs(
     columns: Mapping[str, np.ndarray], names: Sequence[str], models: Sequence[str], settle_s: float
-) -> list[dict[str, Any]]:
-    """Return the errors of whole segments, each by itself.
-
-    Returns:
-        Rows with ``model``, ``recording``, ``begin_s``, ``seconds``, ``held_out``, ``field``, ``rmse``, ``mae``.
-    """
+) -> list[FreeRun]:
+    """Return the errors of whole segments, each by itself."""
     rows = []
     ahead = columns["into"] - settle_s
     for segment in np.unique(columns["segment"]):
@@ -138,7 +129,7 @@ def free_runs(
         if not pick.any():
             continue
         t = columns["t"][pick]
-        about = {
+        about: dict[str, Any] = {
             "recording": int(columns["recording"][pick][0]),
             "begin_s": float(t[0]),
             "seconds": float(t[-1] - t[0]),
@@ -150,15 +141,8 @@ def free_runs(
                 if predicted is None:
                     continue
                 off = (predicted - columns[f"{name}_measured"])[pick]
-                rows.append(
-                    {
-                        "model": model,
-                        **about,
-                        "field": name,
-                        "rmse": float(np.sqrt(np.mean(off**2))),
-                        "mae": float(np.mean(np.abs(off))),
-                    }
-                )
+                rmse, mae = float(np.sqrt(np.mean(off**2))), float(np.mean(np.abs(off)))
+                rows.append(FreeRun(model=model, field=name, rmse=rmse, mae=mae, **about))
     return rows
 
 

@@ -156,12 +156,6 @@ def check_log(episode: Episode, model: IdentifiableModel) -> None:
             )
 
 
-def measured_times(episode: Episode, node: str) -> np.ndarray:
-    """Return when a node's samples were taken, ``(N,)`` [s]."""
-    steps = episode.steps[node]
-    return np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) / TICKS_PER_S
-
-
 def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
     """Return ``width`` recorded rows from ``first`` on; what is missing repeats the last."""
     return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
@@ -169,7 +163,7 @@ def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
 
 def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
     """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
-    t = measured_times(episode, model.sensor)
+    t = episode.steps[model.sensor].begun_s
     period = float(np.median(np.diff(t)))
     near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
     near = near[np.abs(t[near] - begin_s) < 12 * period]
@@ -204,7 +198,7 @@ def beyond(
     for node, field in fields:
         ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
         for span in spans:
-            t = measured_times(recordings[span.recording], node)
+            t = recordings[span.recording].steps[node].begun_s
             inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
             if inside.any():
                 rows = recordings[span.recording].outputs[node][field][inside]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
+from sim2real.artifacts.identification import Prediction
 from sim2real.identify.bounds import way_out, way_out_of
 from sim2real.identify.identifiability import Check
 from sim2real.identify.parameters import ParameterTable
@@ -111,22 +112,22 @@ class Verdict:
     flags: str = ""
 
 
-def scores(prediction: Sequence[Mapping[str, Any]], positions: Sequence[Position]) -> list[Score]:
+def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[Score]:
     """Return how far each position is off on held-out data at the longest horizon, the worst first.
 
     Args:
-        prediction: Rows of ``prediction.errors``.
+        prediction: What ``prediction.errors`` returned.
         positions: What is judged.
     """
-    keys = {p.column: f"{p.column}_rmse" for p in positions}
-    held_out = [row for row in prediction if row["held_out"] and any(row.get(k) is not None for k in keys.values())]
-    horizon_s = max((row["horizon_s"] for row in held_out), default=None)
-    last = {row["model"]: row for row in held_out if row["horizon_s"] == horizon_s}
+    columns = [p.column for p in positions]
+    held_out = [row for row in prediction if row.held_out and any(row.rmse.get(c) is not None for c in columns)]
+    horizon_s = max((row.horizon_s for row in held_out), default=None)
+    last = {row.model: row.rmse for row in held_out if row.horizon_s == horizon_s}
     if horizon_s is None or "identified" not in last:
         return []
     found = []
     for p in positions:
-        errors = {m: row[keys[p.column]] for m, row in last.items() if row.get(keys[p.column]) is not None}
+        errors = {m: e for m, rmse in last.items() if (e := rmse.get(p.column)) is not None}
         # What diverged to no number is infinitely wrong.
         errors = {m: e if math.isfinite(e) else math.inf for m, e in errors.items()}
         if "identified" in errors:

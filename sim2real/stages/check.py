@@ -12,9 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.manifest import plain
+from sim2real.artifacts.run_folder import newest
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps, named_leaves
-from sim2real.graph.node import to_ticks
+from sim2real.graph.node import TICKS_PER_S, to_ticks
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Vertex
 from sim2real.identify import excitation, identifiability, uncertainty
@@ -22,18 +25,16 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
-from sim2real.identify.segments import Span, check_log, measured_times
+from sim2real.identify.segments import Span, check_log
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
 from sim2real.stages.console import note, pairs, shown, table
+from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
-from sim2real.stages.identified import ROUND_TRIP
-from sim2real.stages.identify import load_log, reach
-from sim2real.stages.manifest import plain
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.recordings import open_recording
 from sim2real.stages.robot import Identifiable
-from sim2real.stages.runs import newest
 
 PLANNED = "planned excitation"
 _LEAST_S = 0.3
@@ -103,7 +104,7 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return Source([shown(p) for p in paths], [load_log(p, pipeline) for p in paths], False)
+        return Source([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
     if not _plannable(pipeline):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
@@ -155,7 +156,7 @@ def judge(
 
 def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) -> dict[str, Any]:
     """Return when a recording was sampled, what its joints did, and what drove them."""
-    t_s = measured_times(episode, model.sensor)
+    t_s = episode.steps[model.sensor].begun_s
     outputs = episode.outputs[model.sensor]
     joints = []
     for c in model.channels:
@@ -172,7 +173,7 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
         )
     commands = []
     for node, tree in model.given.items():
-        sent_s = episode.steps[node].end / 1e6
+        sent_s = episode.steps[node].end / TICKS_PER_S
         for field in jax.tree_util.tree_leaves(tree):
             rows = np.asarray(episode.outputs[node][field], np.float64).reshape(len(sent_s), -1)
             for i, values in enumerate(rows.T):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from sim2real.artifacts import run_folder
+from sim2real.artifacts.timing import Timing
 from sim2real.log import importer
-from sim2real.stages import console, pipeline, runs
+from sim2real.stages import console, pipeline
 from sim2real.stages.config import ImportConfig
 
 
@@ -19,8 +21,10 @@ def run(config: ImportConfig) -> None:
         episode = importer.import_file(file, mapping, config.selection, config.format)
         facts, log = importer.facts(episode), config.out
         if log is None:
-            with runs.open_stage(config.runs, mapping.pipeline, "record", config, mapping.inputs(file)) as stage:
+            with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, mapping.inputs(file)) as stage:
                 importer.write_log(log := stage.output("log", "session.mcap"), episode, mapping)
+                for name, path in Timing.of(episode).save(stage.folder).items():
+                    stage.output(name, path)
                 stage.summary(facts)
         else:
             importer.write_log(log, episode, mapping)

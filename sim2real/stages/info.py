@@ -7,11 +7,11 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from sim2real.artifacts.manifest import plain, versions
+from sim2real.artifacts.run_folder import STAGES, attempts, run_folders
 from sim2real.stages.console import pairs, shown, table
 from sim2real.stages.flags import flag_names
-from sim2real.stages.manifest import plain, versions
 from sim2real.stages.pipeline import available, load_pipeline
-from sim2real.stages.runs import STAGES, attempts, run_folders
 
 
 def installation() -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
+from sim2real.artifacts.run_folder import OpenStage, Source
 from sim2real.identify.fit import as_numbers
 from sim2real.identify.parameters import ParameterTable
 from sim2real.stages.console import note, shown
-from sim2real.stages.identified import hashed
-from sim2real.stages.runs import OpenStage
 
 PARTIAL = "partial.json"
 
@@ -57,30 +56,44 @@ def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], table: Pa
     except (KeyboardInterrupt, SystemExit):
         if best.z is not None and np.isfinite(best.loss):
             path = stage.output("partial", PARTIAL)
-            path.write_text(json.dumps(_document(pipeline, logs, stage.run_dir, table, best), indent=1))
+            _unfinished(pipeline, logs, stage.run_dir, table, best).write(path)
             note(f"interrupted: the best so far is in {shown(path)}, neither judged nor with intervals")
         raise
 
 
-def _document(pipeline: str, logs: Sequence[Path], run_dir: Path, table: ParameterTable, best: Best) -> dict[str, Any]:
+def _unfinished(
+    pipeline: str, logs: Sequence[Path], run_dir: Path, table: ParameterTable, best: Best
+) -> Identification:
+    """Return the best so far as an identification that says that it is none."""
     values = as_numbers(table, np.asarray(best.z))
     done = ", ".join(f"{share:.0%} of {what}" for what, share in best.done.items())
     reason = (
         f"ended by a signal after {done}: these values were neither judged on held-out data nor do they have intervals"
     )
     rows = [
-        {
-            **{"name": p.name, "unit": p.unit, "kind": p.kind, "about": p.about, "nominal": p.nominal},
-            **{"estimate": values[p.name], "lower": p.low, "upper": p.high},
-            "verdict": "interrupted" if p.free else "fixed",
-        }
+        Estimate(
+            name=name,
+            unit=p.unit,
+            kind=p.kind,
+            about=p.about,
+            nominal=p.nominal,
+            estimate=float(value),
+            lower=p.low,
+            upper=p.high,
+            verdict="interrupted" if p.free else "fixed",
+        )
         for p in table
+        for name, value in _each(p.name, values[p.name])
     ]
-    return {
-        "format": 2,
-        "pipeline": pipeline,
-        **hashed(logs, run_dir),
-        "verdict": {"status": "interrupted", "reasons": [reason], "next": f"sim2real identify {pipeline}"},
-        "parameters": rows,
-        "search": {"loss": best.loss, "done": best.done},
-    }
+    return Identification(
+        pipeline=pipeline,
+        logs=tuple(Source.of(path, run_dir) for path in logs),
+        verdict=Judgement("interrupted", (reason,), f"sim2real identify {pipeline}"),
+        parameters=tuple(rows),
+        search=Search(loss=best.loss, done=best.done),
+    )
+
+
+def _each(name: str, value: Any) -> list[tuple[str, float]]:
+    """Return the names and values of a parameter, of which each recording may have its own."""
+    return [(f"{name}@{i}", v) for i, v in enumerate(value)] if isinstance(value, list) else [(name, value)]

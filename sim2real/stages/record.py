@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
+from sim2real.artifacts.recording import LOG, TRUTH, Recording
+from sim2real.artifacts.run_folder import StageFolder, open_stage
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
-from sim2real.stages.runs import StageFolder, open_stage
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 
-LOG = "session.mcap"
-TRUTH = "truth.bin"
+
+def record(pipeline: Pipeline, folder: Path, config: RecordConfig | None = None) -> tuple[Recording, dict[str, Any]]:
+    """Play the excitation on the robot and record it.
+
+    Args:
+        pipeline: The robot.
+        folder: Takes the log.
+        config: How; default: the pipeline's own.
+
+    Returns:
+        The recording, and the summary of its session.
+
+    Raises:
+        Sim2RealError: What stopped the robot; the log holds everything up to then.
+    """
+    config = config or pipeline.record
+    robot = moving_robot(pipeline)
+    signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
+    note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
+    log, truth = folder / LOG, folder / TRUTH
+    with opened(robot, config, truth) as session:
+        nodes = robot.recording_nodes(session, signal)
+        summary = run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
+    return Recording.load(log, truth), summary
 
 
 def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Play the excitation on the robot and write the log.
+    """Record in a stage folder.
 
     Args:
         pipeline: The robot.
@@ -28,16 +51,14 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)
-    signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
+    excitation(config, robot.RATE_HZ, len(robot.ACTION))  # what cannot be played is refused before a folder is made
     with open_stage(root, pipeline.name, "record", config, run_dir=run_dir, dry_run=config.dry_run) as stage:
-        log = stage.output("log", LOG)
-        note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
-        with opened(robot, config, stage.folder / TRUTH) as session:
-            nodes = robot.recording_nodes(session, signal)
-            if session.embedded is not None:
-                stage.output("truth", TRUTH)
-            summary = run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
-        stage.output("timing", "timing.json").write_text(json.dumps(summary, indent=1))
+        stage.output("log", LOG)
+        if config.port == "embedded":
+            stage.output("truth", TRUTH)
+        recording, summary = record(pipeline, stage.folder, config)
+        for name, path in recording.timing.save(stage.folder).items():
+            stage.output(name, path)
         print(table(*timing_rows(summary)))
         warn(summary)
         if config.dry_run:

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sim2real.artifacts.manifest import git_state, plain, versions
 from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
@@ -20,7 +21,6 @@ from sim2real.log.writer import McapRecorder
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
-from sim2real.stages.manifest import git_state, plain, versions
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.rig import answer_rows, is_dry, rig_summary, sent_rows
 from sim2real.stages.robot import Robot, Session

@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
+from sim2real.artifacts.recording import Recording
 from sim2real.graph.episode import Episode
-from sim2real.hardware.truth import Kind, Truth, read_truth
+from sim2real.hardware.truth import Kind, Truth
 from sim2real.stages.console import note
 
 _NEAR_NS = 3_000_000
 
 
-def true_values(path: Path, episode: Episode) -> dict[str, float]:
+def true_values(recording: Recording) -> dict[str, float]:
     """Return the true parameters, and the true mean delays in the log's own terms.
 
     ``sensor_delay`` is from the motion to the measurement's time stamp, ``actuator_delay`` from the end of the
     actuator's step to the motor [s]. Nothing is returned for a robot that is not embedded.
-
-    Args:
-        path: The truth file.
-        episode: The log of the same session.
     """
-    if not path.is_file():
-        return {}
     try:
-        truth = read_truth(path)
+        truth = recording.truth
+        if truth is None:
+            return {}
         values = {name: float(v) for name, v in truth.parameters.items()}
     except (ValueError, KeyError) as error:  # nothing depends on it but a column of a table
-        note(f"warning: {path} is damaged, so nothing is compared with the truth: {error}")
+        note(f"warning: {recording.truth_path} is damaged, so nothing is compared with the truth: {error}")
         return {}
-    origin_ns = (episode.metadata["log"].get("session_end") or {}).get("monotonic_ns")
+    episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
     if origin_ns is None:  # a session that crashed never wrote when it started
         return values
     sensing, actuation = sensing_delay_s(truth, episode, origin_ns), actuation_delay_s(truth, episode, origin_ns)
@@ -43,7 +39,7 @@ def true_values(path: Path, episode: Episode) -> dict[str, float]:
 def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
     """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any."""
     steps = episode.steps["sensor"]
-    stamp = np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) * 1000 + origin_ns
+    stamp = steps.begun * 1000 + origin_ns
     samples = truth.of(Kind.SAMPLE)
     if not len(samples):
         return float("nan")

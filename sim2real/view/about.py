@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from sim2real.artifacts.run_folder import StageFolder
 from sim2real.view.blocks import Block, FoldBlock, pairs_table
-from sim2real.view.run import Artifact
 
 
-def about(artifact: Artifact) -> list[Block]:
-    """Return what a stage ran with: folded away, there for who wants to know."""
+def about(artifact: StageFolder) -> list[Block]:
+    """Return what a stage ran with: folded away at the end of its section."""
     m = artifact.manifest
     when = {k: m[k] for k in ("started", "duration_s", "command", "git") if m.get(k) is not None}
     files = {n: e.get("sha256", "") for n, e in m.get("outputs", {}).items()}

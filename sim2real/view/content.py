@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.graph.episode import Episode, Steps
-from sim2real.view.artifacts import read_deployment
-from sim2real.view.identification import Identification, read_identification
-from sim2real.view.run import Artifact
-from sim2real.view.signals import Recording, Series, read_recording, unit_of
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run_folder import StageFolder
+from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
+from sim2real.view.signals import Series, Signals, signals_of, simulated_series, unit_of
 
 IDLE = "idle"
 
@@ -64,7 +65,7 @@ class Tab:
     episode: Episode | None = None
 
 
-def tabs_of(artifacts: Mapping[str, Artifact]) -> list[Tab]:
+def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
     """Return the tabs of a run's finished stages.
 
     Raises:
@@ -72,25 +73,25 @@ def tabs_of(artifacts: Mapping[str, Artifact]) -> list[Tab]:
     """
     tabs = []
     if "record" in artifacts:
-        artifact = artifacts["record"]
-        log = read_recording(artifact.need("log", "session.mcap"), artifact.output("truth", "truth.bin"))
+        log = signals_of(Recording.load(artifacts["record"].folder))
         tabs.append(_episode_tab(_dry("Record", log), "record", log, []))
     if "identify" in artifacts:
-        found = read_identification(artifacts["identify"])
+        found = Identification.load(artifacts["identify"].folder)
         several = len(found.recordings) > 1
         tabs += [_identify_tab(found, r, f" {r}" if several else "") for r in found.recordings]
     if "deploy" in artifacts:
-        deployed = read_deployment(artifacts["deploy"])
-        for i, (log, simulated) in enumerate(zip(deployed.episodes, deployed.simulated, strict=True)):
-            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, simulated))
+        deployed = Deployment.load(artifacts["deploy"].folder)
+        for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
+            log = signals_of(recording)
+            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, simulated_series(simulated)))
     return [tab for tab in tabs if tab.plots]
 
 
-def _dry(title: str, log: Recording) -> str:
+def _dry(title: str, log: Signals) -> str:
     return f"{title} (dry run)" if log.dry else title
 
 
-def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series]) -> Tab:
+def _episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
     """Return the tab of a log: measured, true and simulated states, what nodes command, and the schedule."""
     plots: dict[str, list[Curve]] = {}
     models = {s.name: s for s in simulated}
@@ -104,8 +105,7 @@ def _episode_tab(title: str, entity: str, log: Recording, simulated: list[Series
     last = log.last_command()
     commands = [n for n in models if n.partition("[")[0] == "command"]
     for index, series in enumerate(last):
-        said = "not sent (dry run): of" if log.dry else "sent by"
-        curves = [_curve(f"{entity}/{series.source}", series, "command", f"{said} {series.source}")]
+        curves = [_curve(f"{entity}/{series.source}", series, "command", f"sent by {series.source}")]
         if index < len(commands):
             curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
         plots.setdefault(_titled(series.name, log.units), []).extend(curves)
@@ -148,7 +148,7 @@ def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
     # A step is due before the last one has ended when that one overran: it cannot wait before it is its turn.
     times = np.maximum.accumulate(times)
     lasting = np.append(np.diff(times) > 0, True)
-    return times[lasting] / 1e6, [name for name, lasts in zip(names, lasting, strict=True) if lasts]
+    return times[lasting] / TICKS_PER_S, [name for name, lasts in zip(names, lasting, strict=True) if lasts]
 
 
 def _curve(folder: str, series: Series, look: str, label: str) -> Curve:

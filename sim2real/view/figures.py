@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from sim2real.artifacts.bundle import History
 from sim2real.view import style
-from sim2real.view.artifacts import Deployment, Training
 from sim2real.view.panels import Line, Panel, over_time, with_unit
-from sim2real.view.signals import Recording
+from sim2real.view.signals import Series, Signals
 from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
 
 
-def recording(log: Recording, name: str) -> str:
+def recording(log: Signals, name: str) -> str:
     """Draw what a log measured, with the truth where it is known, and what was commanded last."""
     middle, length = log.episode.duration_s / 2, min(2.0, log.episode.duration_s / 4)
     zoom = (round(middle, 1), round(middle + length, 1))
@@ -33,7 +34,7 @@ def recording(log: Recording, name: str) -> str:
     return over_time(panels, name, f"Measured and commanded signals over {log.episode.duration_s:.1f} s")
 
 
-def training(curves: Training, name: str) -> str:
+def training(curves: History, name: str) -> str:
     """Draw return and success of each seed over the steps, and their median."""
     seeds = curves.returns.shape[1]
     with styled():
@@ -62,11 +63,18 @@ def training(curves: Training, name: str) -> str:
         return to_svg(figure, name, f"Return and success of {seeds} seeds over the steps of training")
 
 
-def deployment(deployed: Deployment, number: int, name: str) -> str:
-    """Draw one episode on the robot against the same policy in simulation."""
-    log = deployed.episodes[number]
-    units = {**log.units, **deployed.units}
-    simulated = {s.name: s for s in deployed.simulated[number]}
+def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, str], number: int, name: str) -> str:
+    """Draw one episode on the robot against the same policy in simulation.
+
+    Args:
+        log: The robot's session.
+        simulation: Series of the simulation; empty where nothing was simulated.
+        units: Field -> unit.
+        number: The episode's.
+        name: Of the figure, unique on its page.
+    """
+    units = {**log.units, **units}
+    simulated = {s.name: s for s in simulation}
     commands = [n for n in simulated if n.partition("[")[0] == "command"]
     zoom = (0.0, round(min(3.0, log.episode.duration_s / 3), 1))
     panels = []

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from sim2real.artifacts.files import number
+from sim2real.artifacts.identification import FreeRun, Identification
 from sim2real.view import style
-from sim2real.view.identification import FreeRun, Identification
 from sim2real.view.panels import Line, Panel, over_time, with_gaps, with_unit
 from sim2real.view.style import BLUE, GREEN, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
@@ -77,7 +78,13 @@ def title_of(found: Identification, recording: int) -> str:
     """Return what a recording is called; empty where there is but one."""
     if len(found.recordings) < 2:
         return ""
-    return found.logs[recording] if recording < len(found.logs) else f"recording {recording}"
+    names = log_names(found)
+    return names[recording] if recording < len(names) else f"recording {recording}"
+
+
+def log_names(found: Identification) -> list[str]:
+    """Return the names of the recordings, without their folders."""
+    return [log.path.replace("\\", "/").rsplit("/", 1)[-1] for log in found.logs]
 
 
 def shown(found: Identification, recordings: Sequence[int]) -> list[tuple[int, str]]:
@@ -88,7 +95,7 @@ def shown(found: Identification, recordings: Sequence[int]) -> list[tuple[int, s
 
 def prediction_errors(found: Identification, name: str) -> str:
     """Draw each model's error over the horizon: a row for each field, held-out data beside the fitted."""
-    told = {f for row in found.prediction for f in row.rmse if np.isfinite(row.rmse[f])}
+    told = {f for row in found.prediction for f, error in row.rmse.items() if error is not None}
     fields = [*[f for f in found.fields if f in told], *sorted(told - set(found.fields))][:MOST_PANELS]
     models = list(dict.fromkeys(row.model for row in found.prediction))
     kinds = [k for k in (True, False) if any(row.held_out == k for row in found.prediction)]
@@ -97,8 +104,8 @@ def prediction_errors(found: Identification, name: str) -> str:
         grid = figure.subplots(len(fields), len(kinds), squeeze=False, sharex=True, sharey="row")
         for quantity, row in zip(fields, grid, strict=True):
             for axes, held_out in zip(row, kinds, strict=True):
-                for number, model in enumerate(models):
-                    _error_line(axes, found, quantity, model, held_out, _model_look(model, number))
+                for place, model in enumerate(models):
+                    _error_line(axes, found, quantity, model, held_out, _model_look(model, place))
                 axes.set_yscale("log")
                 axes.margins(x=0.05)
             style.plain_log(row[0].yaxis)
@@ -108,8 +115,8 @@ def prediction_errors(found: Identification, name: str) -> str:
         for axes in grid[-1]:
             axes.set_xlabel("horizon [s]")
         entries = []
-        for number, model in enumerate(models):
-            color, dash, mark = _model_look(model, number)
+        for place, model in enumerate(models):
+            color, dash, mark = _model_look(model, place)
             label = _SAID.get(model, model)
             entries.append(Line2D([], [], color=color, ls=dash, marker=mark, ms=5, label=label))
         style.legend_above(figure, entries)
@@ -118,11 +125,11 @@ def prediction_errors(found: Identification, name: str) -> str:
 
 def search(found: Identification, name: str) -> str:
     """Draw the best loss of each generation, and where the refinement ended."""
-    refined = [float(r["after"]) for r in found.search.get("refined", []) if r.get("after") is not None]
+    refined = [r.after for r in found.search.refined if r.after is not None]
     with styled():
         figure = new_figure(2.6, 4.4)
         axes = figure.subplots()
-        axes.plot(np.arange(1, len(found.history) + 1), found.history, color=BLUE)
+        axes.plot(np.arange(1, len(found.search.history) + 1), found.search.history, color=BLUE)
         if refined:
             axes.axhline(refined[-1], color=GREEN, ls=style.DASHES[1], lw=1.2)
             entries = [
@@ -130,11 +137,11 @@ def search(found: Identification, name: str) -> str:
                 Line2D([], [], color=GREEN, ls=style.DASHES[1], lw=1.2, label="refined"),
             ]
             style.legend_above(figure, entries)
-        if np.nanmin([*found.history, *refined]) > 0:
+        if np.nanmin([*found.search.history, *refined]) > 0:
             axes.set_yscale("log")
             style.plain_log(axes.yaxis)
         axes.set(xlabel="generation", ylabel="best loss")
-        return to_svg(figure, name, f"Best loss over {len(found.history)} generations")
+        return to_svg(figure, name, f"Best loss over {len(found.search.history)} generations")
 
 
 def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
@@ -162,7 +169,7 @@ def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
 
 def _errors_of(found: Identification, recording: int, quantity: str) -> str:
     """Return the errors of a free run beside those of holding still."""
-    rows = [r for r in found.free_runs if r.recording == recording and r.field == quantity and r.held_out]
+    rows = [r for r in found.free_run if r.recording == recording and r.field == quantity and r.held_out]
     best: dict[str, FreeRun] = {}
     for row in sorted(rows, key=lambda r: -r.seconds):
         best.setdefault(row.model, row)
@@ -205,7 +212,7 @@ def _error_line(
     rows.sort(key=lambda r: r.horizon_s)
     axes.plot(
         [r.horizon_s for r in rows],
-        [r.rmse[quantity] for r in rows],
+        [number(r.rmse[quantity]) for r in rows],
         color=color,
         ls=dash,
         marker=mark,

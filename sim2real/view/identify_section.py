@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sim2real.artifacts.identification import Estimate, Identification, Quantity
+from sim2real.artifacts.run_folder import StageFolder
 from sim2real.view import identify_figures, intervals, residuals
 from sim2real.view.about import about
 from sim2real.view.blocks import (
@@ -24,14 +26,7 @@ from sim2real.view.blocks import (
     number,
     pretty_unit,
 )
-from sim2real.view.identification import (
-    Estimate,
-    Identification,
-    Quantity,
-    in_readable_unit,
-    read_identification,
-)
-from sim2real.view.run import Artifact
+from sim2real.view.readable import in_readable_unit
 from sim2real.view.signals import unit_of
 
 _TITLES: dict[str, tuple[Tone, str]] = {
@@ -43,9 +38,9 @@ _TITLES: dict[str, tuple[Tone, str]] = {
 _STRONG = 0.9
 
 
-def identify_section(artifact: Artifact) -> Section:
+def identify_section(artifact: StageFolder) -> Section:
     """Return the verdict, the parameters and how sure they are, and how well the model predicts."""
-    found = read_identification(artifact)
+    found = Identification.load(artifact.folder)
     blocks = [
         *_parameters(found),
         *_aggregate(found),
@@ -53,9 +48,9 @@ def identify_section(artifact: Artifact) -> Section:
         *_residuals(found),
         *_correlation(found),
     ]
-    if np.isfinite(found.history).any():
-        refined = found.search.get("refined") or []
-        gain = f" Dashed: refined in {sum(int(r['steps']) for r in refined)} steps." if refined else ""
+    if np.isfinite(found.search.history).any():
+        refined = found.search.refined
+        gain = f" Dashed: refined in {sum(r.steps for r in refined)} steps." if refined else ""
         blocks.append(
             FigureBlock(
                 identify_figures.search(found, "identify-search"), f"The best loss of the search.{gain}", narrow=True
@@ -67,10 +62,11 @@ def identify_section(artifact: Artifact) -> Section:
 
 
 def _banner(found: Identification) -> Banner | None:
-    if not found.status:
+    status = found.verdict.status
+    if not status:
         return None
-    tone, title = _TITLES.get(found.status, ("doubt", found.status[:1].upper() + found.status[1:]))
-    return Banner(tone, title, [_sentence(r) for r in found.reasons])
+    tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
+    return Banner(tone, title, [_sentence(r) for r in found.verdict.reasons])
 
 
 def _sentence(text: str) -> str:
@@ -81,26 +77,27 @@ def _sentence(text: str) -> str:
 
 def _parameters(found: Identification) -> list[Block]:
     """Return table and figure of the parameters, what lies at a bound, and what the data determines."""
-    bounded = [e for e in found.estimates if e.verdict == "at a bound"]
+    bounded = [e for e in found.parameters if e.verdict == "at a bound"]
     active = (
         f"At a bound: {', '.join(_at_bound(e) for e in bounded)}."
         if bounded
         else "No estimate lies at a bound: none is active."
     )
     blocks: list[Block] = [
-        _parameter_table(found.estimates),
+        _parameter_table(found.parameters),
         FigureBlock(
-            intervals.intervals(found.estimates, "identify-intervals"),
+            intervals.intervals(found.parameters, "identify-intervals"),
             f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; what "
             "lies inside the shaded 95 % band agrees with the estimate. Arrows point to marks beyond the edge.",
         ),
     ]
-    if found.determined:
-        known = found.determined
+    if found.check:
+        known = found.check
         items = [_sentence(m) for m in known.messages] or ["Every parameter is determined by itself."]
         items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(known.condition, 2)}.")
         blocks.append(ListBlock("What the data determines", items))
-        rows = [_minute(e, known.per_minute[e.name]) for e in found.estimates if e.name in known.per_minute]
+        errors = known.standard_error_per_minute
+        rows = [_minute(e, value) for e in found.parameters if (value := errors.get(e.name)) is not None]
         if rows:
             caption = "Standard error from one minute of such data"
             heads = ("parameter", "standard error", "unit", "share of the estimate")
@@ -155,7 +152,8 @@ def _aggregate(found: Identification) -> list[Block]:
     if not quantities:
         return []
     count = len(quantities[0].estimates)
-    logs = "".join(f" {i}: {log}." for i, log in enumerate(found.logs[:count])) if count <= len(found.logs) else ""
+    names = identify_figures.log_names(found)[:count]
+    logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
     rows = []
     for q in quantities:
         scale, unit = (1e3, "ms") if q.unit == "s" else (1.0, pretty_unit(q.unit))
@@ -199,8 +197,10 @@ def _predictions(found: Identification) -> list[Block]:
                 f"{_left_out(found, recordings)}",
             )
         )
-        if found.free_runs:
+        if found.free_run:
             blocks.append(_free_run_table(found))
+    if not found.samples:
+        return blocks
     blocks.append(
         FigureBlock(
             identify_figures.predictions(found, "identify-predictions"),
@@ -218,6 +218,8 @@ def _left_out(found: Identification, recordings: Sequence[int]) -> str:
 
 def _residuals(found: Identification) -> list[Block]:
     s = found.samples
+    if not s:
+        return []
     there = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
     if not there.any() or not any("identified" in found.models(f) for f in found.fields):
         return []
@@ -234,7 +236,7 @@ def _residuals(found: Identification) -> list[Block]:
 def _correlation(found: Identification) -> list[Block]:
     if not found.correlation:
         return []
-    names, matrix = found.correlation
+    names, matrix = found.correlation.names, found.correlation.matrix
     pairs = [
         (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
     ]
@@ -293,7 +295,7 @@ def _free_run_table(found: Identification) -> TableBlock:
             number(r.mae),
             unit_of(r.field, found.units) or MISSING,
         ]
-        for r in found.free_runs
+        for r in found.free_run
     ]
     heads = ["model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit"]
     text = (1, 2, 6) if several else (1, 5)
@@ -306,13 +308,13 @@ def _tiles(found: Identification) -> Iterator[Tile]:
         note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
         error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
         yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
-    for e in found.estimates:
+    for e in found.parameters:
         if e.kind == "derived" and e.unit == "s":
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
             truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
             yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
     if found.misfit is not None:
         yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the deviation assumed of a measurement")
-    seconds, evaluations = found.search.get("seconds"), found.search.get("evaluations")
+    seconds, evaluations = found.search.seconds, found.search.evaluations
     if seconds is not None:
         yield Tile("search", f"{float(seconds):.0f} s", f"{number(evaluations)} evaluations" if evaluations else "")

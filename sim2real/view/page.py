@@ -8,8 +8,8 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from sim2real.artifacts.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
 from sim2real.view.blocks import NoteBlock, Section
-from sim2real.view.run import STAGES, Artifact, attempts, finished, open_artifact
 from sim2real.view.sections import SECTIONS, headline
 
 PAGE = "report.html"
@@ -28,7 +28,7 @@ def report(run_dir: Path) -> Path:
         Sim2RealError: When no stage is finished, or what a stage wrote is missing or malformed.
     """
     run_dir = Path(run_dir)
-    artifacts = finished(run_dir)
+    artifacts = finished_stages(run_dir)
     sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()]
     notes = _about_others(run_dir, artifacts)
     return _write(run_dir / PAGE, list(artifacts.values()), sections, run_dir.resolve().name, notes)
@@ -53,13 +53,13 @@ def deploy_page(deploy_folder: Path) -> Path:
 
 
 def _stage_page(folder: Path, stage: str) -> Path:
-    artifact = open_artifact(folder, stage)
+    artifact = open_folder(folder, stage)
     section = SECTIONS[stage](artifact)
     return _write(artifact.folder / PAGE, [artifact], [section], artifact.folder.resolve().parent.name, [])
 
 
 def _write(
-    path: Path, artifacts: Sequence[Artifact], sections: Sequence[Section], run: str, notes: list[NoteBlock]
+    path: Path, artifacts: Sequence[StageFolder], sections: Sequence[Section], run: str, notes: list[NoteBlock]
 ) -> Path:
     """Render a page and write it; a browser that has the old one open never sees half of the new one."""
     environment = Environment(
@@ -87,7 +87,7 @@ def _write(
     return path
 
 
-def _about_others(run_dir: Path, artifacts: dict[str, Artifact]) -> list[NoteBlock]:
+def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
     """Return notes about newer attempts that came to no end: the page shows an older one instead, or none."""
     notes = []
     for stage in STAGES:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.run_folder import finished_stages, pipeline_of
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode
+from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.log.ages import input_ages
 from sim2real.view.content import IDLE, Curve, Tab, states_of, tabs_of
-from sim2real.view.run import finished, pipeline_of
 from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
@@ -53,7 +53,7 @@ def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) ->
         Sim2RealError: When Rerun is not installed, no stage is finished, or what a stage wrote is malformed.
     """
     rr = _rerun()
-    tabs = tabs_of(finished(run_dir))  # before a viewer opens
+    tabs = tabs_of(finished_stages(run_dir))  # before a viewer opens
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
     # A viewer keeps one arrangement for each application: another run, with other stages, must not inherit this one's.
     recording = rr.RecordingStream(f"sim2real {name}")
@@ -125,7 +125,7 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
         for entity, (label, values) in lines.items():
             looks = rr.SeriesLines(names=label, widths=1.2, colors=own)
             recording.log(f"{folder}/{entity}", looks, static=True)
-            times = _time(steps.woken / 1e6)
+            times = _time(steps.woken / TICKS_PER_S)
             recording.send_columns(f"{folder}/{entity}", [times], rr.Scalars.columns(scalars=values))
 
 

@@ -10,8 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from sim2real.artifacts.identification import Identification
 from sim2real.view import style
-from sim2real.view.identification import Identification
 from sim2real.view.identify_figures import MOST_PANELS
 from sim2real.view.panels import with_unit
 from sim2real.view.style import BLUE, GRID, INK, MUTED, ORANGE, SHADE, new_figure, styled, to_svg

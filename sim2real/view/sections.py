@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Deployment, Scores
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run_folder import StageFolder
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
 from sim2real.view import figures, timing
 from sim2real.view.about import about
-from sim2real.view.artifacts import Deployment, read_deployment, read_training
 from sim2real.view.blocks import (
     MISSING,
     Block,
@@ -25,17 +28,16 @@ from sim2real.view.blocks import (
     spoken,
 )
 from sim2real.view.identify_section import identify_section
-from sim2real.view.run import Artifact
 from sim2real.view.servos import DRY, servo_blocks
-from sim2real.view.signals import read_recording, unit_of
+from sim2real.view.signals import Signals, signals_of, simulated_series, unit_of
 
 
-def record_section(artifact: Artifact) -> Section:
+def record_section(artifact: StageFolder) -> Section:
     """Return what was recorded, and how well the nodes kept their times."""
-    log = read_recording(artifact.need("log", "session.mcap"), artifact.output("truth", "truth.bin"))
+    log = signals_of(Recording.load(artifact.folder))
     blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
-    truth = " The true state is what the embedded robot knew of itself." if log.truth else ""
     commanded = "what would have been commanded" if log.dry else "what was commanded"
+    truth = " The true state is what the embedded robot knew of itself." if log.truth else ""
     blocks.append(
         FigureBlock(
             figures.recording(log, "record-signals"),
@@ -51,9 +53,9 @@ def record_section(artifact: Artifact) -> Section:
     return Section("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
 
 
-def train_section(artifact: Artifact) -> Section:
+def train_section(artifact: StageFolder) -> Section:
     """Return the learning curves."""
-    curves = read_training(artifact)
+    curves = History.load(artifact.folder)
     last, seeds = curves.success[-1], curves.returns.shape[1]
     whose = (
         f"seed {curves.best_seed}, the best of {seeds}" if curves.best_seed is not None else f"median of {seeds} seeds"
@@ -71,50 +73,52 @@ def train_section(artifact: Artifact) -> Section:
     return Section("train", "Train", lead, tiles, [figure, table, *about(artifact)])
 
 
-def deploy_section(artifact: Artifact) -> Section:
+def deploy_section(artifact: StageFolder) -> Section:
     """Return the gap between robot and simulation, and each episode."""
-    deployed = read_deployment(artifact)
-    if artifact.dry:
-        return _dry_section(artifact, deployed)
-    blocks: list[Block] = [NoteBlock(text) for log in deployed.episodes for text in log.warnings]
+    deployed = Deployment.load(artifact.folder)
+    logs = [signals_of(recording) for recording in deployed.recordings]
+    if deployed.dry_run:
+        return _dry_section(artifact, logs)
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     rows = [
         [
-            spoken(row["quantity"])[0],
-            row.get("unit") or unit_of(row["quantity"], deployed.units) or spoken(row["quantity"])[1],
-            *[number(row[kind]) for kind in ("real", "simulation", "gap")],
+            spoken(row.quantity)[0],
+            row.unit or unit_of(row.quantity, deployed.units) or spoken(row.quantity)[1],
+            *[number(value) for value in (row.real, row.simulation, row.gap)],
         ]
         for row in deployed.gap
     ]
     blocks.append(
         TableBlock("Robot and simulation", ("quantity", "unit", "robot", "simulation", "gap"), rows, text_columns=(1,))
     )
-    for index in range(len(deployed.episodes)):
-        caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.scores[index])}"
-        blocks.append(FigureBlock(figures.deployment(deployed, index, f"deploy-{index}"), caption))
-    for index, log in enumerate(deployed.episodes):
+    for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
+        caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
+        figure = figures.deployment(log, simulated_series(columns), deployed.units, index, f"deploy-{index}")
+        blocks.append(FigureBlock(figure, caption))
+    for index, log in enumerate(logs):
         blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
-    blocks += servo_blocks([log.episode for log in deployed.episodes])
+    blocks += servo_blocks([log.episode for log in logs])
     real, simulated = (
-        [float(s[kind]["success"]) for s in deployed.scores if s[kind].get("success") is not None]
-        for kind in ("real", "simulation")
+        [float(value) for s in scores if (value := (s or {}).get("success")) is not None]
+        for scores in ([e.real for e in deployed.episodes], [e.simulation for e in deployed.episodes])
     )
     tiles = []
     if real:
         note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
         tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
-    tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in deployed.episodes])]
+    tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in logs])]
     lead = "The policy on the robot, beside the same policy in simulation."
     return Section("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
 
 
-def _dry_section(artifact: Artifact, deployed: Deployment) -> Section:
+def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> Section:
     """Return what a policy would have done; there is no gap, as nothing was moved."""
-    blocks: list[Block] = [NoteBlock(text) for log in deployed.episodes for text in log.warnings]
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     blocks.append(NoteBlock("There is no gap report: a simulation has nothing to be compared with."))
-    for index, log in enumerate(deployed.episodes):
+    for index, log in enumerate(logs):
         caption = f"Episode {index}: what was measured, and what the policy would have sent."
         blocks.append(FigureBlock(figures.recording(log, f"deploy-{index}"), caption))
-    episodes = [log.episode for log in deployed.episodes]
+    episodes = [log.episode for log in logs]
     for index, episode in enumerate(episodes):
         blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
@@ -191,11 +195,12 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
     ]
 
 
-def _scores(score: Mapping[str, Mapping[str, Any]]) -> str:
-    names = dict.fromkeys([*score["real"], *score["simulation"]])
+def _scores(score: Scores) -> str:
+    simulation = score.simulation or {}
+    names = dict.fromkeys([*score.real, *simulation])
     both = [
-        f"{label}: robot {number(score['real'].get(n), 3)}"
-        + (f", simulation {number(score['simulation'].get(n), 3)}" if n in score["simulation"] else "")
+        f"{label}: robot {number(score.real.get(n), 3)}"
+        + (f", simulation {number(simulation.get(n), 3)}" if n in simulation else "")
         + ("" if unit == "1" else f" {unit}")
         for n in names
         for label, unit in [spoken(n)]

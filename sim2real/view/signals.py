@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode, Steps
-from sim2real.hardware.truth import read_truth
-from sim2real.log import TruncatedLogWarning, read_log
+from sim2real.graph.episode import TICKS_PER_S, Episode
 
 
 @dataclass(frozen=True)
@@ -34,8 +30,8 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A log, made ready for plotting.
+class Signals:
+    """A recorded session, made ready for plotting.
 
     Attributes:
         episode: The log.
@@ -51,7 +47,7 @@ class Recording:
     commanded: list[Series]
     truth: dict[str, Series]
     units: Mapping[str, str] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    warnings: Sequence[str] = ()
 
     @property
     def dry(self) -> bool:
@@ -71,39 +67,41 @@ def is_dry(episode: Episode) -> bool:
     return episode.metadata.get("dry_run") is True
 
 
-def read_recording(log: Path, truth: Path | None = None) -> Recording:
-    """Read a log and, if there is one, the embedded robot's account of the truth.
+def signals_of(recording: Recording) -> Signals:
+    """Return the time series of a recorded session.
 
     Raises:
-        Sim2RealError: When the log cannot be read, or holds no step.
+        Sim2RealError: When the log holds no step.
     """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", TruncatedLogWarning)
-        episode = read_log(log)
+    episode = recording.episode
     if not episode.duration_s:
-        raise Sim2RealError(f"the log {log} holds no step", hint="record for longer")
+        raise Sim2RealError(f"the log {recording.path} holds no step", hint="record for longer")
     graph = episode.metadata.get("graph", {})
     measured, commanded = [], []
     for node, steps in episode.steps.items():
         inputs = graph.get(node, {}).get("inputs", {}) or [k for k in episode.messages if k[0] == node]
         outputs = episode.outputs.get(node, {})
         if inputs:
-            commanded += _node_series(node, steps.end / 1e6, outputs)
+            commanded += _node_series(node, steps.end / TICKS_PER_S, outputs)
         else:
-            measured += _node_series(node, sample_times_s(steps), outputs)
-    return Recording(
-        episode,
-        measured,
-        commanded,
-        _true_states(episode, truth),
-        units=episode.metadata.get("units", {}),
-        warnings=[str(w.message) for w in caught if issubclass(w.category, TruncatedLogWarning)],
-    )
+            measured += _node_series(node, steps.begun_s, outputs)
+    t_s, states = recording.true_states() or (np.zeros(0), {})
+    truth = {n: Series(n, "truth", t_s, values) for n, values in states.items()}
+    return Signals(episode, measured, commanded, truth, recording.units, recording.warnings)
 
 
-def sample_times_s(steps: Steps) -> np.ndarray:
-    """Return when each step's sample was taken ``(N,)`` [s]: the time that the step set itself, else its start."""
-    return np.where(steps.ts_overwrite >= 0, steps.ts_overwrite, steps.start) / 1e6
+def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
+    """Return the series of one simulated episode: fields ``NAME`` at times ``t_NAME``, else ``t``."""
+    found: list[Series] = []
+    for name, values in columns.items():
+        if name == "t" or name.startswith("t_"):
+            continue
+        t_s = columns.get(f"t_{name.partition('[')[0]}", columns["t"])  # a vector's entries share their times
+        if len(t_s) != len(values):
+            # Commands have a rate of their own: evenly over the same time, if nothing says when they were sent.
+            t_s = np.arange(len(values)) * (float(columns["t"][-1]) / len(values))
+        found += components(name, "simulation", t_s, values)
+    return found
 
 
 def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> list[Series]:
@@ -124,14 +122,3 @@ def unit_of(name: str, units: Mapping[str, str]) -> str:
 
 def _node_series(node: str, times_s: np.ndarray, outputs: Mapping[str, np.ndarray]) -> list[Series]:
     return [s for name, values in outputs.items() for s in components(name, node, times_s, values)]
-
-
-def _true_states(episode: Episode, path: Path | None) -> dict[str, Series]:
-    end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
-    if path is None or "monotonic_ns" not in end:
-        return {}
-    t_ns, states = read_truth(path).states()
-    t_s = (t_ns - end["monotonic_ns"]) / 1e9
-    # The embedded robot runs before the episode starts and after it ends.
-    inside = (t_s >= 0) & (t_s <= episode.duration_s)
-    return {name: Series(name, "truth", t_s[inside], values[inside]) for name, values in states.items()}

@@ -9,20 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from live_robots import PATIENT
+from live_robots import PATIENT, TINY
 
 from sim2real import cli
 from sim2real.hardware.truth import read_truth
 from sim2real.stages.pipeline import load_pipeline
 
-TINY = [
-    *("--identify.generations=10", "--identify.population=8", "--identify.refine=1"),
-    *("--train.episode-s=2", "--train.timelines=4"),
-    *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
-    *("--train.ppo.evaluations=1", "--train.ppo.eval-envs=4", "--deploy.episodes=1", "--deploy.duration-s=2"),
-    "--deploy.gate.servo-watchdog-s=0.4",
-]
-"""Budgets, and patience with a busy machine."""
 RECORDING = ["--duration-s", "12", "--seed", "1", *PATIENT]
 
 FAULTY = """

@@ -9,6 +9,14 @@ import numpy as np
 from sim2real.hardware.registers import OperatingMode
 from sim2real.hardware.truth import Kind
 
+TINY = [
+    *("--identify.generations=10", "--identify.population=8", "--identify.refine=1"),
+    *("--train.episode-s=2", "--train.timelines=4"),
+    *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
+    *("--train.ppo.evaluations=1", "--train.ppo.eval-envs=4", "--deploy.episodes=1", "--deploy.duration-s=2"),
+    "--deploy.gate.servo-watchdog-s=0.4",
+]
+"""Budgets, and patience with a busy machine."""
 PATIENT = ["--gate.servo-watchdog-s", "0.4"]
 """For a stage whose test is not about this limit: a busy machine is silent for longer than the default now and then."""
 

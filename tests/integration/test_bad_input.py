@@ -9,8 +9,8 @@ import pytest
 
 from sim2real import cli, errors
 from sim2real.hardware.port import WaitingPort
+from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.train import load_parameters
 
 pytestmark = pytest.mark.realtime
 
@@ -161,21 +161,23 @@ def test_damaged_parameters(fails, tmp_path, completed):
         return fails(errors.ERROR, "train", "pendulum", "--parameters", path, "--runs", tmp_path)
 
     for text in ("", "{", "[]", "{}", '{"parameters": 3, "pipeline": "pendulum", "log": {"path": "x"}}'):
-        assert "holds no identified parameters" in damaged(text)
+        assert "is malformed" in damaged(text)
+    assert "format 2, this version reads 3" in damaged(json.dumps({**good, "format": 2}))
     assert "of pipeline 'arm'" in damaged(json.dumps({**good, "pipeline": "arm"}))
     assert "damping" in damaged(
         json.dumps({**good, "parameters": [p for p in good["parameters"] if p["name"] != "damping"]})
     )
     rows = [{**p, "estimate": float("nan")} if p["name"] == "gain" else p for p in good["parameters"]]
-    assert "gain" in damaged(json.dumps({**good, "parameters": rows}))
-    assert "there is no log" in damaged(json.dumps({**good, "log": {"path": "none.mcap"}}))
-    assert "holds no identified parameters" in fails(errors.ERROR, "train", "pendulum", "--parameters", tmp_path)
+    assert "is malformed" in damaged(json.dumps({**good, "parameters": rows}))
+    assert "timing.json is not beside it" in damaged(json.dumps(good))
+    path.unlink()
+    assert "cannot read" in fails(errors.ERROR, "train", "pendulum", "--parameters", tmp_path)
     assert not (tmp_path / "pendulum").exists()
 
 
 def test_parameters_that_are_whole_are_read(completed):
-    document = load_parameters(completed / "identify" / "parameters.json", load_pipeline("pendulum"))
-    assert np.isfinite([p["estimate"] for p in document["parameters"]]).all()
+    found = open_identification(completed / "identify" / "parameters.json", load_pipeline("pendulum"))
+    assert np.isfinite(list(found.values.values())).all()
 
 
 def test_damaged_bundles(fails, tmp_path, completed):

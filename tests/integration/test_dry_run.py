@@ -195,9 +195,10 @@ def test_a_deployment_says_what_the_policy_would_have_sent(tapped, tmp_path):
     assert manifest_of(folder)["status"] == "dry run"
     result = json.loads((folder / "result.json").read_text())
     assert (result["dry_run"], result["gap"]) == (True, [])
-    sent = read_log(folder / "episode_0.mcap").outputs["actuator"]["action"][:, 0]
+    log = read_log(folder / "episode_0.mcap")
+    sent = log.outputs["actuator"]["action"][:, 0]
     assert sent[-1] > 0.2
-    (row,) = result["timing"][0]["sent"]
+    (row,) = log.metadata["log"]["session_end"]["sent"]
     assert (row["name"], row["commands"], row["high"]) == ("hinge", len(sent), pytest.approx(float(sent.max())))
     assert "would have been sent to" in out
     page = (folder / "report.html").read_text(encoding="utf-8")

@@ -77,7 +77,7 @@ def test_late_answers_are_told(make_pipeline, record):
     code, said, folder = record(make_pipeline("late_answers", ILL.format(fault="late=0.3")), duration_s=1)
     assert code == errors.OK
     assert "of the answers came late: when those samples were taken is not sure" in said
-    assert json.loads((folder / "timing.json").read_text())["late_replies"] >= 10
+    assert json.loads((folder / "timing.json").read_text())["bus"]["late"] >= 10
 
 
 @pytest.mark.parametrize("culprit", ["sensor", "agent"])

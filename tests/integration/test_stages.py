@@ -2,13 +2,18 @@
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
-from live_robots import PATIENT, manifest_of
+from live_robots import PATIENT, TINY, manifest_of
 
+import sim2real
 from sim2real import cli
+from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.run_folder import STAGES, finished, newest
+from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
-from sim2real.stages.runs import STAGES, finished, newest
 
 pytestmark = pytest.mark.realtime
 
@@ -28,18 +33,20 @@ def test_a_resumed_run_is_complete(completed):
         assert manifest["status"] == "finished"
         for output in manifest["outputs"].values():
             assert (completed / stage / output["path"]).exists()
-    assert strict_json(completed / "record" / "timing.json")["timing"]["sensor"]["steps"] > 500
+    assert strict_json(completed / "record" / "timing.json")["nodes"]["sensor"]["steps"] > 500
     rows = {p["name"]: p for p in strict_json(completed / "identify" / "parameters.json")["parameters"]}
     assert set(rows) == {"gain", "gravity", "damping", "friction", "sensor_delay", "actuator_delay", "round_trip_delay"}
     result = strict_json(completed / "deploy" / "result.json")
     assert {g["quantity"] for g in result["gap"]} >= {"success", "angle_rms_rad"}
     assert all(g["simulation"] is not None for g in result["gap"] if g["quantity"] != "first_upright_s")
     inputs = manifest_of(completed / "train")["inputs"]
-    assert inputs["log"]["sha256"] == manifest_of(completed / "record")["outputs"]["log"]["sha256"]
+    assert set(inputs) == {"parameters"}, "training reads what identify left, not the log"
     assert inputs["parameters"]["sha256"] == manifest_of(completed / "identify")["outputs"]["parameters"]["sha256"]
     # Relative to the run folder: a run that is moved can still be trained.
-    assert inputs["log"]["path"] == "record/session.mcap"
-    assert strict_json(completed / "identify" / "parameters.json")["log"]["path"] == "record/session.mcap"
+    assert inputs["parameters"]["path"] == "identify/parameters.json"
+    (log,) = strict_json(completed / "identify" / "parameters.json")["logs"]
+    recorded = manifest_of(completed / "record")["outputs"]["log"]
+    assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
 def test_resuming_a_finished_run_does_nothing(completed, root, capsys):
@@ -61,6 +68,43 @@ def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
     assert {p.name for p in again.glob("*.mcap")} == {"episode_0.mcap", "episode_1.mcap"}
     assert all(read_log(p).complete for p in again.glob("*.mcap"))
     assert len(strict_json(again / "result.json")["episodes"]) == 2
+
+
+def test_a_run_that_was_copied_goes_on_without_its_origin(completed, tmp_path, monkeypatch):
+    """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
+    run_dir = tmp_path / "elsewhere" / "pendulum" / "copy"
+    shutil.copytree(completed, run_dir)
+    (run_dir / "record" / "session.mcap").unlink()
+    monkeypatch.chdir(tmp_path)
+    for path in run_dir.rglob("*.json"):
+        typed = {"command", "config"} if path.name == "manifest.json" else set()  # as the user typed them
+        told = {name: value for name, value in strict_json(path).items() if name not in typed}
+        assert str(completed.parent) not in json.dumps(told), path
+    home = ["--run", str(run_dir), "--runs", "elsewhere"]
+    tiny = [f.removeprefix("--train.") for f in TINY if f.startswith("--train.")]
+    assert cli.main(["train", "pendulum", *home, *(f"--{f}" for f in tiny)]) == 0
+    shutil.copy(completed / "record" / "session.mcap", run_dir / "record")
+    assert cli.main(["report", str(run_dir)]) == 0
+    before, after = (Bundle.load(run_dir / n) for n in ("train", "train.2"))
+    assert all(np.array_equal(before.weights[n], after.weights[n]) for n in before.weights)
+
+
+def test_the_stages_are_functions_of_what_others_left(completed, tmp_path):
+    """Each takes the artifact of another one, opened from Python."""
+    pendulum = sim2real.load_pipeline("pendulum")
+    recording = sim2real.Recording.load(completed / "record")
+    brief = replace(pendulum.identify, generations=10, population=8, refine=1, free_run_s=0.0)
+    found = sim2real.identify(recording, pendulum, brief)
+    assert found.values.keys() == sim2real.Identification.load(completed / "identify").values.keys()
+    assert found.timing.nodes["sensor"].steps == len(recording.episode.steps["sensor"])
+    small = replace(pendulum.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1, eval_envs=4)
+    config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=small)
+    bundle, _ = sim2real.train(pendulum, config, found)
+    assert bundle.contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
+    nominal, about = sim2real.train(pendulum, replace(config, model="nominal"))
+    assert (nominal.contract.delays_s, about["hiccups left out"]) == ({}, 0)
+    with pytest.raises(UsageError, match="needs an identification"):
+        sim2real.train(pendulum, config)
 
 
 def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sim2real import cli
+from sim2real.artifacts.run_folder import newest
 from sim2real.log import import_file, read_log
-from sim2real.stages.runs import newest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -44,7 +44,7 @@ def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
     stage = newest(Path("runs"), "rig", "record")
     assert stage.finished
     assert stage.manifest["summary"]["samples"] == {"actuator": 50, "sensor": 50}
-    assert stage.manifest["inputs"]["source"]["path"] == str(workplace / "two.npz")
+    assert stage.manifest["inputs"]["source"]["path"] == "../../../two.npz"
     assert stage.manifest["inputs"]["mapping"]["path"].endswith("import.toml")
     episode = read_log(stage.output("log"))
     assert episode.metadata["pipeline"] == "rig"

@@ -266,15 +266,15 @@ def test_a_timeline_needs_no_connections(file):
 
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
-    from sim2real.stages.identify import load_log
     from sim2real.stages.pipeline import Pipeline
+    from sim2real.stages.recordings import open_recording
 
     write_log(tmp_path / "run.mcap", import_file(file, mapping()), mapping())
-    episode = load_log(tmp_path / "run.mcap", Pipeline("rig", "a rig", "rig"))
+    episode = open_recording(tmp_path / "run.mcap", Pipeline("rig", "a rig", "rig")).episode
     assert len(episode.steps["sensor"]) == COUNT
     assert not recwarn.list
     with pytest.raises(Sim2RealError, match="a log of pipeline 'rig', not of 'arm'"):
-        load_log(tmp_path / "run.mcap", Pipeline("arm", "an arm", "arm"))
+        open_recording(tmp_path / "run.mcap", Pipeline("arm", "an arm", "arm"))
 
 
 def test_a_log_is_never_overwritten_and_a_failed_one_not_left(file, tmp_path):

@@ -149,7 +149,7 @@ def test_a_plan_and_a_log_exclude_each_other():
 
 def test_segments_lie_side_by_side_and_are_not_too_many(judged):
     pipeline = load_pipeline("pendulum")
-    episode = check.load_log(LOG, pipeline)
+    episode = check.open_recording(LOG, pipeline).episode
     spans, length_s = check.cut([episode], pipeline.identify)
     assert len(spans) == judged[1]["segments"]
     assert np.diff([s.begin_s for s in spans]) == pytest.approx(length_s)

@@ -1,109 +1,13 @@
-"""What a deployment's states are called, for scores and for pages."""
+"""What deploy refuses to run."""
 
-from types import SimpleNamespace
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 
+from sim2real.artifacts.bundle import Bundle
 from sim2real.errors import Sim2RealError
-from sim2real.graph.base import Base
-from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
-from sim2real.graph.node import BaseNode
-from sim2real.graph.schedule import draw
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, save_bundle
-from sim2real.robots.loop import control_nodes
 from sim2real.stages import deploy
 from sim2real.stages.pipeline import load_pipeline
-
-ARM = load_pipeline("arm").load()
-
-
-def steps(count, stamped=True):
-    at = 20_000 * np.arange(count)
-    stamp = at + 500 if stamped else np.full(count, -1)
-    return Steps(scheduled=at, start=at, woken=at, ts_overwrite=stamp, end=at + 900, drift=0 * at)
-
-
-@pytest.fixture(scope="module")
-def states(tmp_path_factory):
-    """The states of a deployment of the arm without an embedded robot."""
-    rows = np.arange(50.0)[:, None] + np.array([0.0, 0.1, 0.2])
-    outputs = {
-        "sensor": {"position": 0.01 * rows, "velocity": rows},
-        "agent": {"goal": 2 * rows[:49], "aim": 0 * rows[:49] + [0.1, 0.2, 0.3]},
-        "actuator": {"goal": 3 * rows[:48]},
-    }
-    episode = Episode(
-        steps={n: steps(len(next(iter(o.values())))) for n, o in outputs.items()}, messages={}, outputs=outputs
-    )
-    nowhere = tmp_path_factory.mktemp("deploy") / "truth.bin"
-    return outputs, *deploy._states(nowhere, {}, episode, ARM)
-
-
-def test_vectors_become_columns(states):
-    outputs, t_s, found = states
-    for field in ("position", "velocity"):
-        for i in range(3):
-            np.testing.assert_array_equal(found[f"{field}[{i}]"], outputs["sensor"][field][:, i])
-    np.testing.assert_allclose(t_s, 0.02 * np.arange(50) + 0.0005)
-
-
-def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
-    outputs, _, found = states
-    for i in range(3):
-        np.testing.assert_array_equal(found[f"command[{i}]"], outputs["actuator"]["goal"][:, i])
-        assert set(found[f"aim[{i}]"]) == {0.1 * (i + 1)} or np.allclose(found[f"aim[{i}]"], 0.1 * (i + 1))
-    names = [f"{field}[{i}]" for field in ("aim", "command", "position", "velocity") for i in range(3)]
-    assert sorted(found) == sorted(names), "what the agent wanted is not what was sent: it is left out"
-
-
-def test_the_arms_score_reads_them(states):
-    _, t_s, found = states
-    assert set(ARM.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
-
-
-def test_numbers_keep_their_names():
-    robot = SimpleNamespace(COMMAND=("actuator", "action"))
-    sent = deploy._sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
-    assert {n: v.tolist() for n, v in sent.items()} == {"command": [0.0, 1.0, 2.0, 3.0]}
-    columns = deploy._columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})
-    assert {n: v.tolist() for n, v in columns.items()} == {
-        "th": [0, 1, 2],
-        **{f"pose[{i}]": [i, 4 + i, 8 + i] for i in range(4)},
-    }
-
-
-def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
-    """One message of the recording is used 80 ms late; simulated timelines have 2 ms everywhere."""
-    robot = SimpleNamespace(SUPERVISOR="agent", COMMAND=("actuator", "action"))
-    recorder = MemoryRecorder()
-    for k in range(50):
-        begin = 20_000 * k + (80_000 if k == 30 else 0)
-        recorder.step(StepRecord("agent", k, begin, begin, begin, -1, begin + 1000, 0), {"action": 0.0})
-        recorder.step(StepRecord("actuator", k, begin, begin + 1000, begin, -1, begin + 2000, 0), {"action": 0.0})
-        recorder.message(MessageRecord("agent", "sensor", k, k, 20_000 * k, 20_000 * k))
-        recorder.message(MessageRecord("actuator", "agent", k, k, begin + 1000, begin + 1000))
-    nodes = control_nodes(*(BaseNode(name, 50.0, delay=0.002) for name in ("sensor", "agent", "actuator")))
-    rows = {row["quantity"]: row for row in deploy._age_rows(robot, [recorder.episode()], draw(nodes, 1.0, 3))}
-    worst = rows["age_of_sensor_in_agent_max_s"]
-    assert [worst[k] for k in ("real", "simulation", "gap")] == pytest.approx([0.08, 0.002, 0.078])
-    assert rows["age_of_sensor_in_agent_p50_s"]["real"] == pytest.approx(0.0)
-    assert len(rows) == 4
-    alone = deploy._age_rows(robot, [recorder.episode()], None)
-    assert [row["simulation"] for row in alone] == [None] * 4
-
-
-def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simulation(capsys):
-    slow = steps(50)
-    busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
-    episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    assert deploy._simulate(ARM, None, {"gain": 1.0}, episode, 1.0, 1, "world") == (None, None)
-    assert (
-        "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
-    )
 
 
 @pytest.mark.parametrize("name", ["pendulum", "arm"])
@@ -122,35 +26,8 @@ def test_a_policy_may_not_ask_for_more_than_the_robot_bears(tmp_path, name):
         zeros, actions = np.zeros(size, np.float32), len(low)
         weights = {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(actions)}
         weights |= {"layers.0.kernel": np.zeros((size, actions)), "layers.0.bias": np.zeros(actions)}
-        return save_bundle(tmp_path / str(factor), weights, contract, np.zeros((1, size)))
+        return Bundle.load(save_bundle(tmp_path / str(factor), weights, contract, np.zeros((1, size))))
 
     deploy._load_policy(robot, bundle(1))
     with pytest.raises(Sim2RealError, match=r"(?s)this robot bears -.*hint: train a policy"):
         deploy._load_policy(robot, bundle(50))
-
-
-@struct.dataclass
-class Push(Base):
-    """A policy that always asks for the same voltage."""
-
-    volts: jax.Array
-
-    def get_action(self, obs):
-        return self.volts
-
-
-def test_simulated_measurements_are_compared_with_measurements():
-    """A sensor's reading is as old as on the robot: like is compared with like."""
-    robot, late_s = load_pipeline("pendulum").load(), 0.03
-    values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
-    episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
-    policy = Push(jnp.full(1, 1.5))
-    (t_s, world), (at_s, sensor) = (
-        deploy._simulate(robot, policy, values, episode, 0.6, 1, seen)[0][0] for seen in ("world", "sensor")
-    )
-    assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
-    assert len(sensor["th"]) == len(at_s) < len(t_s)
-    then = np.interp(at_s - late_s, t_s, world["th"])
-    moving = at_s > 0.1
-    np.testing.assert_allclose(sensor["th"][moving], then[moving], atol=1e-4)
-    assert np.abs(sensor["th"] - np.interp(at_s, t_s, world["th"]))[moving].max() > 0.03

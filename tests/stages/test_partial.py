@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim2real.artifacts.run_folder import attempts
 from sim2real.errors import Sim2RealError
 from sim2real.stages import identify
+from sim2real.stages.parameters import open_identification
 from sim2real.stages.partial import Best
 from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.runs import attempts
-from sim2real.stages.train import load_parameters
 
 ROOT = Path(__file__).parents[2]
 LOG = next((ROOT / "datasets" / "pendulum").glob("*.mcap"))
@@ -26,7 +26,7 @@ def pendulum():
 def interrupted(pipeline, root, monkeypatch, ending, told=True):
     """Identify, until a signal comes after two batches of generations; return the stage's folder."""
 
-    def fit(model, logs, windows, config, table, tell=None):
+    def fit(model, episodes, fitted, windows, config, table, tell=None):
         own = table.for_recordings(1)
         for gain, loss in ((20.0, 3.0), (21.0, 1.0), (22.0, 2.0)):
             if told:
@@ -54,8 +54,8 @@ def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeyp
     assert rows["gain"]["estimate"] == pytest.approx(21.0, rel=1e-4)
     assert rows["gain"]["verdict"] == "interrupted"
     assert document["search"]["loss"] == 1.0
-    with pytest.raises(Sim2RealError, match="holds no identified parameters"):
-        load_parameters(path, pendulum)
+    with pytest.raises(Sim2RealError, match="was interrupted"):
+        open_identification(path, pendulum)
 
 
 def test_nothing_is_left_where_nothing_was_found_or_something_else_went_wrong(pendulum, tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ FINALISER = """
 import gc, sys, time
 from types import ModuleType
 from sim2real import cli
-from sim2real.stages import runs
+from sim2real.artifacts import run_folder
 
 class Slow:
     def __del__(self):
@@ -30,7 +30,7 @@ def collecting(phase, info):
         Slow()
 
 def run(pipeline, config, root, run_dir):
-    with runs.open_stage(root, pipeline.name, "record", config, run_dir=run_dir):
+    with run_folder.open_stage(root, pipeline.name, "record", config, run_dir=run_dir):
         try:
             if {by_collector}:
                 gc.callbacks.append(collecting)
@@ -75,10 +75,10 @@ import sys, time
 from types import ModuleType
 import jax, jax.numpy as jnp
 from sim2real import cli
-from sim2real.stages import runs
+from sim2real.artifacts import run_folder
 
 def run(pipeline, config, root, run_dir):
-    with runs.open_stage(root, pipeline.name, "train", config, run_dir=run_dir):
+    with run_folder.open_stage(root, pipeline.name, "train", config, run_dir=run_dir):
         work = jax.jit(lambda x: jax.lax.fori_loop(0, 10**9, lambda i, y: jnp.tanh(y @ y), x), donate_argnums=0)
         work(jnp.ones((300, 300)))  # comes back at once: XLA goes on by itself
         print("started", flush=True)

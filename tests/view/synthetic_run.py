@@ -86,10 +86,9 @@ def parameters(truth: bool = True) -> dict[str, Any]:
 
     names = [EVIL, "friction", "sensor_delay"]
     return {
-        "format": 2,
+        "format": 3,
         "pipeline": "pendulum",
-        "log": {"path": "session.mcap", "sha256": "0" * 64},
-        "logs": [{"path": "/data/session.mcap", "sha256": "0" * 64}],
+        "logs": [{"path": "../record/session.mcap", "sha256": "0" * 64}],
         "verdict": {"status": "hit a bound", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
         "check": {
             "condition": 123.4,
@@ -110,7 +109,7 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             "refined": [{"before": 1.0, "after": 0.9, "steps": 7}],
         },
         "prediction": [
-            {"model": m, "horizon_s": h, "held_out": o, "th_rmse": e * (1 + h), "thdot_rmse": 5 * e}
+            {"model": m, "horizon_s": h, "held_out": o, "rmse": {"th": e * (1 + h), "thdot": 5 * e}, "mae": {}}
             for m, e in (("identified", 0.0117), ("no delay", 0.1), ("nominal", 0.29), ("hold", 0.8))
             for h in (0.1, 0.5, 1.0)
             for o in (False, True)
@@ -189,7 +188,7 @@ def history(seeds: int = 3) -> dict[str, Any]:
     steps = [1000 * k for k in range(1, 11)]
     curves = [[-1300.0 / k - 10 * s for s in range(seeds)] for k in range(1, 11)]
     success = [[min(1.0, 0.1 * k) for _ in range(seeds)] for k in range(1, 11)]
-    return {"steps": steps, "return": curves, "success": success, "seconds": [1.5 * k for k in range(1, 11)]}
+    return {"steps": steps, "returns": curves, "success": success, "seconds": [1.5 * k for k in range(1, 11)]}
 
 
 def result(simulated: bool = True) -> dict[str, Any]:
@@ -199,7 +198,7 @@ def result(simulated: bool = True) -> dict[str, Any]:
         {"quantity": q, "real": v, "simulation": model[q] if model else None, "gap": v - model[q] if model else None}
         for q, v in real.items()
     ]
-    return {"episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
+    return {"format": 2, "episodes": [{"real": real, "simulation": model}] * 2, "gap": rows}
 
 
 def simulation() -> dict[str, np.ndarray]:

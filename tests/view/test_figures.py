@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import synthetic_run
 
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.identification import Identification, Quantity
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run_folder import Source, finished_stages
 from sim2real.view import figures, identify_figures, intervals, residuals, timing
-from sim2real.view.artifacts import read_deployment, read_training
-from sim2real.view.identification import Quantity, read_identification
-from sim2real.view.run import finished
-from sim2real.view.signals import read_recording
+from sim2real.view.signals import signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"
 QUANTITIES = [
@@ -24,36 +26,38 @@ QUANTITIES = [
 
 @pytest.fixture(scope="module")
 def artifacts(finished_run):
-    return finished(finished_run)
+    return finished_stages(finished_run)
 
 
 @pytest.fixture(scope="module")
 def found(artifacts):
-    return read_identification(artifacts["identify"])
+    return Identification.load(artifacts["identify"].folder)
 
 
 @pytest.fixture(scope="module")
 def log(artifacts):
-    return read_recording(artifacts["record"].folder / "session.mcap", artifacts["record"].folder / "truth.bin")
+    return signals_of(Recording.load(artifacts["record"].folder))
 
 
 @pytest.fixture(scope="module")
 def drawn(artifacts, found, log):
     """Every figure there is, by name."""
-    training = read_training(artifacts["train"])
+    deployed = Deployment.load(artifacts["deploy"].folder)
+    episode, simulation = signals_of(deployed.recordings[1]), simulated_series(deployed.simulated[1])
+    training = History.load(artifacts["train"].folder)
     return {
         "record": figures.recording(log, "record"),
-        "intervals": intervals.intervals(found.estimates, "intervals"),
+        "intervals": intervals.intervals(found.parameters, "intervals"),
         "predictions": identify_figures.predictions(found, "predictions"),
         "errors": identify_figures.prediction_errors(found, "errors"),
         "free": identify_figures.free_runs(found, "free"),
         "residuals": residuals.figure(found, "residuals"),
         "search": identify_figures.search(found, "search"),
-        "correlation": identify_figures.correlation(*found.correlation, "correlation"),
+        "correlation": identify_figures.correlation(found.correlation.names, found.correlation.matrix, "correlation"),
         "aggregate": intervals.aggregate(QUANTITIES, "aggregate"),
         "training": figures.training(training, "training"),
         "best": figures.training(replace(training, best_seed=1), "best"),
-        "deployment": figures.deployment(read_deployment(artifacts["deploy"]), 1, "deployment"),
+        "deployment": figures.deployment(episode, simulation, deployed.units, 1, "deployment"),
         "histograms": timing.histograms(log.episode, "histograms"),
         "schedule": timing.schedule(log.episode, "schedule"),
     }
@@ -137,7 +141,7 @@ def test_correlations_stand_in_the_cells(drawn):
 def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
     bare = [
         replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
-        for e in found.estimates
+        for e in found.parameters
     ]
     labels = texts(intervals.intervals(bare, "bare"))
     assert "truth" not in labels
@@ -151,7 +155,9 @@ def test_overlapping_segments_are_drawn_once(found):
 
 
 def test_recordings_do_not_hide_each_other(found):
-    several = replace(found, samples=synthetic_run.three_recordings(), logs=("a.mcap", "b.mcap", "c.mcap"))
+    several = replace(
+        found, samples=synthetic_run.three_recordings(), logs=tuple(Source(f"../{n}.mcap", "") for n in "abc")
+    )
     assert several.disjoint().sum() == 3 * found.disjoint().sum()
     labels = texts(identify_figures.predictions(several, "several"))
     assert [labels.count(f"{n}.mcap") for n in "abc"] == [2, 2, 2]
@@ -195,8 +201,8 @@ def test_the_assumed_deviation_is_drawn_where_it_is_known(found):
 
 
 def test_a_parameter_that_may_be_zero_is_drawn_between_its_bounds(found):
-    zero = replace(found.estimates[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
-    assert "place between the bounds [%]" in texts(intervals.intervals([zero, *found.estimates], "zero"))
+    zero = replace(found.parameters[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
+    assert "place between the bounds [%]" in texts(intervals.intervals([zero, *found.parameters], "zero"))
 
 
 def test_recordings_that_disagree_are_named(drawn):

@@ -176,7 +176,10 @@ def test_the_newest_finished_attempt_is_shown_and_a_newer_failure_is_told(only):
     run = only("identify")
     failed = run / "identify.2"
     failed.mkdir()
-    manifest = {"stage": "identify", "status": "failed", "error": "<i>no</i>", "started": "2026-11-22T08:00:00+00:00"}
+    manifest = {
+        **{"pipeline": "pendulum", "stage": "identify", "inputs": {}, "outputs": {}},
+        **{"status": "failed", "error": "<i>no</i>", "started": "2026-11-22T08:00:00+00:00"},
+    }
     (failed / "manifest.json").write_text(json.dumps(manifest))
     text = report(run).read_text(encoding="utf-8")
     assert "The newest attempt at identify is failed (&lt;i&gt;no&lt;/i&gt;): this page shows identify." in text
@@ -194,7 +197,8 @@ def test_a_log_that_was_cut_is_shown_with_a_note(only):
 
 @pytest.mark.parametrize(("stage", "write"), [("identify", identify_page), ("deploy", deploy_page)])
 def test_a_stage_writes_its_page_before_its_manifest_lists_anything(run, stage, write):
-    (run / stage / "manifest.json").write_text(json.dumps({"pipeline": "pendulum", "status": "running"}))
+    path = run / stage / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "running", "outputs": {}}))
     path = write(run / stage)
     assert path == run / stage / "report.html"
     assert f'<section id="{stage}"' in path.read_text(encoding="utf-8")
@@ -212,8 +216,9 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
     data = synthetic_run.parameters(truth=False)
-    for name in ("correlation", "search", "verdict", "check", "misfit", "aggregate", "free_run", "logs"):
+    for name in ("correlation", "search", "check", "misfit", "aggregate", "free_run"):
         del data[name]
+    data |= {"verdict": {"status": "", "reasons": []}, "logs": []}
     (run / "identify" / "parameters.json").write_text(json.dumps(data))
     words = Page(report(run).read_text(encoding="utf-8")).words
     assert "one seed" in words
@@ -222,18 +227,18 @@ def test_one_seed_and_missing_numbers_are_shown(only):
 
 MALFORMED = {
     "no JSON": ("identify", "parameters.json", b"{", "parameters.json is malformed"),
-    "no parameters": ("identify", "parameters.json", b"{}", "no entry 'parameters'"),
-    "a list": ("train", "history.json", b"[]", "not a JSON object"),
+    "no parameters": ("identify", "parameters.json", b"{}", "missing required field"),
+    "a list": ("train", "history.json", b"[]", "Expected `object`, got `array`"),
     "ragged": (
         "train",
         "history.json",
-        b'{"steps":[1],"return":[[1],[2,3]],"success":[[1]],"seconds":[1]}',
+        b'{"steps":[1],"returns":[[1],[2,3]],"success":[[1]],"seconds":[1]}',
         "malformed",
     ),
     "no free run": ("identify", "free_runs.npz", b"PK", "free_runs.npz is malformed"),
     "no archive": ("identify", "predictions.npz", b"PK", "predictions.npz is malformed"),
     "no episodes": ("deploy", "result.json", b'{"episodes":[],"gap":[]}', "no episode"),
-    "missing": ("deploy", "simulation.npz", None, "has no 'simulation'"),
+    "missing": ("deploy", "simulation.npz", None, "cannot read"),
     "no log": ("record", "session.mcap", b"nothing", "session.mcap"),
 }
 

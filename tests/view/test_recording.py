@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import synthetic_run
 
+from sim2real.artifacts.run_folder import finished_stages
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord, steps_from_records
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.view.content import states_of, tabs_of
 from sim2real.view.recording import view
-from sim2real.view.run import finished
 
 RERUN = Path(sysconfig.get_path("scripts")) / "rerun"
 LAVAPIPE = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
@@ -63,7 +63,7 @@ def test_it_was_sent_by_columns(saved):
 
 def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
     rows = rows_by_entity(saved)
-    for tab in tabs_of(finished(finished_run)):
+    for tab in tabs_of(finished_stages(finished_run)):
         for curve in (c for curves in tab.plots.values() for c in curves):
             assert rows[f"/{curve.entity}"] == len(curve.t_s), curve.entity
     for folder in ("record", "deploy/0", "deploy/1"):
@@ -96,7 +96,7 @@ def test_a_record_alone_can_be_viewed_without_a_scene(tmp_path):
 
 
 def test_plots_bring_together_who_speaks_of_the_same(finished_run):
-    tabs = {tab.title: tab for tab in tabs_of(finished(finished_run))}
+    tabs = {tab.title: tab for tab in tabs_of(finished_stages(finished_run))}
     assert list(tabs) == ["Record", "Identify", "Deploy 0", "Deploy 1"]
     labels = {title: [c.label for c in curves] for title, curves in tabs["Deploy 0"].plots.items()}
     assert labels["th [rad]"] == ["measured by sensor", "true state", "simulation"]
@@ -106,7 +106,7 @@ def test_plots_bring_together_who_speaks_of_the_same(finished_run):
 
 
 def test_a_line_is_interrupted_where_a_segment_ends(finished_run):
-    tab = next(t for t in tabs_of(finished(finished_run)) if t.title == "Identify")
+    tab = next(t for t in tabs_of(finished_stages(finished_run)) if t.title == "Identify")
     curve = tab.plots["th [rad]"][1]
     assert np.isnan(curve.values).sum() == 4
     assert np.all(np.diff(curve.t_s) > 0)
@@ -180,7 +180,7 @@ def test_the_viewer_draws_it(saved, tmp_path):
 def test_each_recording_of_an_identification_has_a_tab_of_its_own(only):
     run = only("identify")
     np.savez(run / "identify" / "predictions.npz", **synthetic_run.three_recordings())
-    tabs = tabs_of(finished(run))
+    tabs = tabs_of(finished_stages(run))
     assert [tab.title for tab in tabs] == ["Identify 0", "Identify 1", "Identify 2"]
     assert len({curve.entity for tab in tabs for plot in tab.plots.values() for curve in plot}) == 3 * 2 * 3
     for tab in tabs:

@@ -7,7 +7,6 @@ what refers to a file in one goes on being right, and a failed attempt does not 
 
 from __future__ import annotations
 
-import difflib
 import errno
 import os
 import re
@@ -20,9 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from sim2real.artifacts.manifest import git_state, plain, read_manifest, reserve, sha256, versions, write_manifest
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
-from sim2real.stages.manifest import git_state, plain, read_manifest, reserve, sha256, versions, write_manifest
-from sim2real.stages.pipeline import available
 
 STAGES = ("record", "identify", "train", "deploy")
 DRY = "dry run"
@@ -30,6 +28,19 @@ DRY = "dry run"
 INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NAME = re.compile(r"\w[\w.-]*")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that an artifact was made from: its path, relative to the run folder, and its SHA-256."""
+
+    path: str
+    sha256: str
+
+    @staticmethod
+    def of(path: Path, run_dir: Path) -> Source:
+        """Return what to keep of a file that an artifact in a run folder was made from."""
+        return Source(portable(path, run_dir), sha256(path))
 
 
 @dataclass(frozen=True)
@@ -158,23 +169,7 @@ def open_stage(
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
     hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
     running = OpenStage(folder)
-    manifest: dict[str, Any] = {
-        "format": 1,
-        "pipeline": pipeline,
-        "stage": stage,
-        "status": "running",
-        "dry_run": dry_run,
-        "exit_code": None,
-        "started": datetime.now(UTC).isoformat(timespec="microseconds"),
-        "duration_s": None,
-        "command": sys.argv,
-        "config": config,
-        "inputs": hashed,
-        "outputs": {},
-        "summary": {},
-        "versions": versions(),
-        "git": git_state(),
-    }
+    manifest = _first_manifest(pipeline, stage, config, hashed, dry_run)
     start = time.monotonic()
     try:
         write_manifest(folder, manifest)
@@ -192,6 +187,27 @@ def open_stage(
         raise told from error
 
 
+def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str, Any], dry_run: bool) -> dict[str, Any]:
+    """Return the manifest of a stage that begins now."""
+    return {
+        "format": 1,
+        "pipeline": pipeline,
+        "stage": stage,
+        "status": "running",
+        "dry_run": dry_run,
+        "exit_code": None,
+        "started": datetime.now(UTC).isoformat(timespec="microseconds"),
+        "duration_s": None,
+        "command": sys.argv,
+        "config": config,
+        "inputs": inputs,
+        "outputs": {},
+        "summary": {},
+        "versions": versions(),
+        "git": git_state(),
+    }
+
+
 def _check_names(pipeline: str, stage: str) -> None:
     """Refuse what is no stage, and a pipeline's name that may lead out of the folder of runs: files hold such names."""
     if stage not in STAGES:
@@ -203,17 +219,11 @@ def _check_names(pipeline: str, stage: str) -> None:
 
 
 def portable(path: Path, run_dir: Path) -> str:
-    """Return a path as an artifact of a run refers to it: relative to the run folder where it lies inside.
+    """Return a path as an artifact of a run refers to it: relative to the run folder.
 
-    A run that is moved, or copied to another machine, still finds what it refers to; `resolved` is the way back.
+    A run that is moved, or copied to another machine, so still finds what lies in it.
     """
-    full, home = path.resolve(), run_dir.resolve()
-    return full.relative_to(home).as_posix() if full.is_relative_to(home) else str(full)
-
-
-def resolved(path: str, run_dir: Path) -> Path:
-    """Return the path that an artifact of a run refers to."""
-    return run_dir / path
+    return Path(os.path.relpath(path.resolve(), run_dir.resolve())).as_posix()
 
 
 def new_run(root: Path, pipeline: str) -> Path:
@@ -242,6 +252,46 @@ def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
 def finished(run_dir: Path, stage: str) -> StageFolder | None:
     """Return the latest finished attempt at a stage in a run folder, or None."""
     return next((attempt for attempt in attempts(run_dir, stage) if attempt.finished), None)
+
+
+def open_folder(folder: Path, stage: str) -> StageFolder:
+    """Return a stage's folder, finished or still at work.
+
+    Raises:
+        Sim2RealError: When there is no such folder.
+    """
+    if not folder.is_dir():
+        raise Sim2RealError(f"there is no folder {folder}", hint=f"make one with `sim2real {stage} PIPELINE`")
+    return StageFolder(folder, read_manifest(folder) or {"stage": stage})
+
+
+def finished_stages(run_dir: Path) -> dict[str, StageFolder]:
+    """Return stage -> its latest finished attempt, in the order of the stages; a dry run where there is no other.
+
+    Raises:
+        Sim2RealError: When there is none at all.
+    """
+    found = {}
+    for stage in STAGES:
+        tried = attempts(run_dir, stage)
+        done = [a for a in tried if a.finished] + [a for a in tried if a.manifest.get("status") == DRY]
+        if done:
+            found[stage] = done[0]
+    if not found:
+        raise Sim2RealError(
+            f"{run_dir} has no finished stage. Looked for: {', '.join(STAGES)}",
+            hint="make one with `sim2real record PIPELINE`, or name another run",
+        )
+    return found
+
+
+def pipeline_of(run_dir: Path) -> str:
+    """Return the name of the pipeline that a run belongs to.
+
+    Raises:
+        Sim2RealError: When the run has no finished stage.
+    """
+    return str(next(iter(finished_stages(run_dir).values())).manifest["pipeline"])
 
 
 def run_folders(root: Path, pipeline: str) -> list[Path]:
@@ -278,35 +328,6 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     return max(candidates, key=lambda c: c.manifest["started"])
 
 
-def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
-    """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
-
-    Of a pipeline's runs the newest in which a stage is finished counts, if there is any: one that failed at its start
-    does not hide those before it.
-
-    Args:
-        root: Folder of all runs.
-        target: What the user typed.
-        pipeline: The pipeline that the run has to belong to; None allows any.
-
-    Raises:
-        UsageError: When there is no such run, or it belongs to another pipeline.
-    """
-    path = Path(target)
-    # What is above counts for a stage folder only: above a pipeline's name is wherever the user happens to be.
-    options = [path.parent if read_manifest(path) is not None else path]
-    options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
-    for folder in options:
-        owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
-        if owners and pipeline and pipeline not in owners:
-            raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
-        if owners:
-            return folder
-    if pipeline is None and (known := run_folders(root, str(target))):
-        return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
-    raise _nothing_there(root, str(target))
-
-
 def _stage_folder(run_dir: Path, stage: str) -> Path:
     """Make a stage's folder, under the first free number; making it takes it, whoever else is at work here."""
     number = 1
@@ -320,20 +341,6 @@ def _stage_folder(run_dir: Path, stage: str) -> Path:
             raise _not_writable(folder, error) from error
         else:
             return folder
-
-
-def _nothing_there(root: Path, target: str) -> UsageError:
-    """Return the error for a name that is none: it says what there is."""
-    pipelines = sorted(available())
-    names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
-    said = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
-    if target in pipelines:
-        hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
-    elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
-        hint = f"did you mean {close[0]}?"
-    else:
-        hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
-    return UsageError(f"there is no file, pipeline or run {target!r}. {said}", hint=hint)
 
 
 def _not_writable(folder: Path, error: OSError) -> Sim2RealError:

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim2real.artifacts import run_folder
+from sim2real.artifacts.manifest import git_state, plain, read_manifest, sha256, write_manifest
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
-from sim2real.stages import runs
 from sim2real.stages.config import RecordConfig, TrainConfig
-from sim2real.stages.manifest import git_state, plain, read_manifest, sha256, write_manifest
 
 
 def record(root, run_dir=None, pipeline="pendulum", text="log"):
-    with runs.open_stage(root, pipeline, "record", RecordConfig(), run_dir=run_dir) as stage:
+    with run_folder.open_stage(root, pipeline, "record", RecordConfig(), run_dir=run_dir) as stage:
         stage.output("log", "session.mcap").write_text(text)
     return stage.result
 
@@ -26,7 +26,9 @@ def record(root, run_dir=None, pipeline="pendulum", text="log"):
 def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
     source = tmp_path / "parameters.json"
     source.write_text("{}")
-    with runs.open_stage(tmp_path / "runs", "pendulum", "train", TrainConfig(seed=3), {"parameters": source}) as stage:
+    with run_folder.open_stage(
+        tmp_path / "runs", "pendulum", "train", TrainConfig(seed=3), {"parameters": source}
+    ) as stage:
         running = json.loads((stage.folder / "manifest.json").read_text())
         stage.output("bundle", "bundle").mkdir()
         (stage.folder / "bundle" / "policy.json").write_text("{}")
@@ -35,7 +37,7 @@ def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
     done = json.loads((stage.folder / "manifest.json").read_text())
     assert (running["status"], running["exit_code"], running["outputs"]) == ("running", None, {})
     assert (done["status"], done["exit_code"], done["pipeline"], done["stage"]) == ("finished", 0, "pendulum", "train")
-    assert done["inputs"] == {"parameters": {"path": str(source), "sha256": sha256(source)}}
+    assert done["inputs"] == {"parameters": {"path": "../../../parameters.json", "sha256": sha256(source)}}
     assert done["outputs"]["bundle"] == {"path": "bundle", "sha256": sha256(stage.folder / "bundle")}
     assert done["summary"] == {"return": 1.5, "steps": 4, "curve": [0, 1, 2]}
     assert done["config"]["seed"] == 3
@@ -57,7 +59,7 @@ def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
 )
 def test_manifest_says_how_a_stage_ended(tmp_path, error, status, code):
     def stopped():
-        with runs.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
+        with run_folder.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
             stage.output("log", "session.mcap").write_text("half")
             stage.output("never", "written.txt")
             raise error
@@ -72,24 +74,27 @@ def test_manifest_says_how_a_stage_ended(tmp_path, error, status, code):
 
 def test_a_promised_output_that_is_missing_fails_the_stage(tmp_path):
     def broken():
-        with runs.open_stage(tmp_path, "pendulum", "record", None) as stage:
+        with run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage:
             stage.output("log", "session.mcap")
 
     with pytest.raises(Sim2RealError, match=r"session\.mcap"):
         broken()
     with pytest.raises(Sim2RealError, match="no finished 'record'"):
-        runs.newest(tmp_path, "pendulum", "record")
+        run_folder.newest(tmp_path, "pendulum", "record")
 
 
 def test_outputs_stay_in_the_stages_folder(tmp_path):
-    with runs.open_stage(tmp_path, "pendulum", "record", None) as stage, pytest.raises(UsageError, match="must lie in"):
+    with (
+        run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage,
+        pytest.raises(UsageError, match="must lie in"),
+    ):
         stage.output("log", "../log.mcap")
 
 
 def test_missing_inputs_are_errors_before_a_folder_is_made(tmp_path):
     with (
         pytest.raises(Sim2RealError, match="cannot read"),
-        runs.open_stage(tmp_path / "runs", "pendulum", "train", None, {"log": tmp_path / "none.mcap"}),
+        run_folder.open_stage(tmp_path / "runs", "pendulum", "train", None, {"log": tmp_path / "none.mcap"}),
     ):
         pass
     assert not (tmp_path / "runs").exists()
@@ -98,31 +103,31 @@ def test_missing_inputs_are_errors_before_a_folder_is_made(tmp_path):
 def test_unknown_stages_are_named(tmp_path):
     with (
         pytest.raises(UsageError, match="Available: record, identify, train, deploy"),
-        runs.open_stage(tmp_path, "pendulum", "fly", None),
+        run_folder.open_stage(tmp_path, "pendulum", "fly", None),
     ):
         pass
 
 
 def test_run_names_are_unique_and_sort_by_age(tmp_path):
-    names = [runs.new_run(tmp_path, "pendulum").name for _ in range(20)]
+    names = [run_folder.new_run(tmp_path, "pendulum").name for _ in range(20)]
     assert names == sorted(set(names))
 
 
 def test_newest_is_the_last_finished_one(tmp_path):
     first, second = record(tmp_path), record(tmp_path)
     record(tmp_path, pipeline="arm")
-    assert runs.newest(tmp_path, "pendulum", "record").folder == second.folder
-    with pytest.raises(KeyboardInterrupt), runs.open_stage(tmp_path, "pendulum", "record", None):
+    assert run_folder.newest(tmp_path, "pendulum", "record").folder == second.folder
+    with pytest.raises(KeyboardInterrupt), run_folder.open_stage(tmp_path, "pendulum", "record", None):
         raise KeyboardInterrupt
-    assert runs.newest(tmp_path, "pendulum", "record").folder == second.folder
-    assert runs.newest(tmp_path, "pendulum", "record", run_dir=first.run_dir).folder == first.folder
+    assert run_folder.newest(tmp_path, "pendulum", "record").folder == second.folder
+    assert run_folder.newest(tmp_path, "pendulum", "record", run_dir=first.run_dir).folder == first.folder
     again = record(tmp_path, run_dir=first.run_dir)
-    assert runs.newest(tmp_path, "pendulum", "record").folder == again.folder
+    assert run_folder.newest(tmp_path, "pendulum", "record").folder == again.folder
 
 
 def test_a_missing_artifact_is_named_with_the_command_that_makes_it(tmp_path):
     with pytest.raises(Sim2RealError) as caught:
-        runs.newest(tmp_path, "pendulum", "identify")
+        run_folder.newest(tmp_path, "pendulum", "identify")
     assert "no finished 'identify' of pipeline 'pendulum'" in str(caught.value)
     assert "sim2real identify pendulum" in str(caught.value)
 
@@ -133,50 +138,50 @@ def test_running_a_stage_again_keeps_the_earlier_attempts(tmp_path):
     record(tmp_path, run_dir, text="2")
     latest = record(tmp_path, run_dir, text="3")
     assert latest.output("log").read_text() == "3"
-    assert [a.output("log").read_text() for a in runs.attempts(run_dir, "record")] == ["3", "2", "1"]
+    assert [a.output("log").read_text() for a in run_folder.attempts(run_dir, "record")] == ["3", "2", "1"]
     with (
         pytest.raises(SafetyStop),
-        runs.open_stage(tmp_path, "pendulum", "record", None, run_dir=run_dir),
+        run_folder.open_stage(tmp_path, "pendulum", "record", None, run_dir=run_dir),
     ):
         raise SafetyStop("too fast")
-    found = runs.finished(run_dir, "record")
+    found = run_folder.finished(run_dir, "record")
     assert found is not None
     assert found.output("log").read_text() == "3"
 
 
 def test_two_at_work_in_one_run_do_not_meet(tmp_path):
-    with runs.open_stage(tmp_path, "pendulum", "train", {"who": "A"}) as a:
+    with run_folder.open_stage(tmp_path, "pendulum", "train", {"who": "A"}) as a:
         a.output("policy", "policy").write_text("A")
-        with runs.open_stage(tmp_path, "pendulum", "train", {"who": "B"}, run_dir=a.run_dir) as b:
+        with run_folder.open_stage(tmp_path, "pendulum", "train", {"who": "B"}, run_dir=a.run_dir) as b:
             b.output("policy", "policy").write_text("B")
             b.summary({"who": "B"})
         a.summary({"who": "A"})
     assert [f.name for f in (a.folder, b.folder)] == ["train", "train.2"]
     for one, who in ((a, "A"), (b, "B")):
-        read = runs.StageFolder(one.folder, read_manifest(one.folder))
+        read = run_folder.StageFolder(one.folder, read_manifest(one.folder))
         assert read.manifest["config"] == read.manifest["summary"] == {"who": who}
         assert read.output("policy").read_text() == who
         assert sha256(read.output("policy")) == read.manifest["outputs"]["policy"]["sha256"]
-    assert runs.finished(a.run_dir, "train").folder == b.folder, "the one that started last"
+    assert run_folder.finished(a.run_dir, "train").folder == b.folder, "the one that started last"
 
 
 def test_what_refers_to_an_attempt_stays_right_when_the_stage_runs_again(tmp_path):
     log = record(tmp_path, text="1").output("log")
-    with runs.open_stage(tmp_path, "pendulum", "identify", None, {"log": log}, log.parent.parent) as stage:
+    with run_folder.open_stage(tmp_path, "pendulum", "identify", None, {"log": log}, log.parent.parent) as stage:
         pass
     record(tmp_path, stage.run_dir, text="2")
     source = stage.result.manifest["inputs"]["log"]
     assert source["path"] == "record/session.mcap"
     moved = tmp_path / "elsewhere"
     stage.run_dir.rename(moved)
-    assert sha256(runs.resolved(source["path"], moved)) == source["sha256"]
+    assert sha256(moved / source["path"]) == source["sha256"]
 
 
 @pytest.mark.parametrize("name", ["../../../etc", "..", "a/b", "", ".hidden", "/etc", "a\nb"])
 def test_names_that_lead_out_of_the_runs_folder(tmp_path, name):
     with (
         pytest.raises(UsageError, match="no name for a pipeline"),
-        runs.open_stage(tmp_path / "r", name, "record", None),
+        run_folder.open_stage(tmp_path / "r", name, "record", None),
     ):
         pass
     assert not any(tmp_path.iterdir())
@@ -192,7 +197,7 @@ def test_a_full_disk_is_said_in_words_and_the_manifest_tells(tmp_path, number, m
         return opened(path, flags, mode)
 
     def fill():
-        with runs.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
+        with run_folder.open_stage(tmp_path, "pendulum", "record", RecordConfig()) as stage:
             monkeypatch.setattr(os, "open", full)  # from here on no file can be made; those that are there have room
             stage.output("log", "session.mcap")
             raise OSError(number, os.strerror(number), "timing.json")
@@ -213,43 +218,6 @@ def test_outputs_that_are_unknown_or_gone(tmp_path):
     done.output("log").unlink()
     with pytest.raises(Sim2RealError, match="is missing"):
         done.output("log")
-
-
-def test_runs_are_found_by_path_name_stage_folder_and_pipeline(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    root = Path("runs")
-    run_dir = record(root).run_dir
-    latest = record(root).run_dir
-    for target in (run_dir, run_dir / "record", run_dir.name):
-        assert runs.find_run(root, target, "pendulum") == run_dir
-        assert runs.find_run(root, target) == run_dir
-    assert runs.find_run(root, "pendulum") == latest
-    with pytest.raises(UsageError, match="a run of pendulum, not of arm"):
-        runs.find_run(root, run_dir, "arm")
-    with pytest.raises(UsageError, match=latest.name):
-        runs.find_run(root, "nothing")
-
-
-def test_a_run_folder_as_working_directory_does_not_stand_for_every_name(tmp_path, monkeypatch):
-    here, there = record(tmp_path / "here").run_dir, record(tmp_path / "there").run_dir
-    monkeypatch.chdir(here)
-    assert runs.find_run(tmp_path / "there", "pendulum") == there
-    assert runs.find_run(tmp_path / "there", there.name) == there
-    assert runs.find_run(tmp_path / "there", ".").resolve() == here
-    assert runs.find_run(tmp_path / "there", "record").resolve() == here
-    with pytest.raises(UsageError, match="nothing"):
-        runs.find_run(tmp_path / "there", "nothing")
-
-
-def test_a_run_that_failed_does_not_hide_those_before(tmp_path):
-    good = record(tmp_path).run_dir
-    with pytest.raises(SafetyStop), runs.open_stage(tmp_path, "pendulum", "record", None) as failed:
-        raise SafetyStop("too fast")
-    assert runs.find_run(tmp_path, "pendulum") == good
-    assert runs.find_run(tmp_path, failed.run_dir.name) == failed.run_dir
-    with pytest.raises(SafetyStop), runs.open_stage(tmp_path, "arm", "record", None) as only:
-        raise SafetyStop("too fast")
-    assert runs.find_run(tmp_path, "arm") == only.run_dir, "there is no other to show"
 
 
 class Colour(Enum):

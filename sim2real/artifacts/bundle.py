@@ -1,0 +1,115 @@
+"""What train leaves: the policy bundle, and how training went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
+from sim2real.policy.contract import PolicyContract
+
+BUNDLE, HISTORY = "bundle", "history.json"
+_AGAIN = "run `sim2real train` again"
+
+
+@dataclass(frozen=True)
+class History:
+    """The evaluations during training.
+
+    Attributes:
+        steps: Shape ``(K,)``: steps in simulation, of each seed.
+        seconds: Shape ``(K,)``: time since training began [s].
+        returns: Shape ``(K, seeds)``: sum of rewards of an episode.
+        success: Shape ``(K, seeds)``: share of success.
+        best_seed: The one whose policy was kept.
+        compile_s: Time to compile [s].
+        train_s: Time to train and evaluate [s].
+        env_steps_per_s: Steps of all seeds per second.
+        others: Further curves ``(K, seeds)`` by name.
+    """
+
+    steps: np.ndarray
+    seconds: np.ndarray
+    returns: np.ndarray
+    success: np.ndarray
+    best_seed: int | None = None
+    compile_s: float | None = None
+    train_s: float | None = None
+    env_steps_per_s: float | None = None
+    others: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that the curves fit together: they may come from a file."""
+        count = len(self.steps)
+        check(count > 0, "no evaluation")
+        check(self.seconds.shape == (count,), f"{self.seconds.shape} times of {count} evaluations")
+        for curve in (self.returns, self.success):
+            check(curve.ndim == 2 and curve.shape == self.returns.shape, "curves of mixed sizes")
+            check(len(curve) == count, f"curves of {len(curve)} for {count} evaluations")
+        best = self.best_seed
+        check(best is None or 0 <= best < self.returns.shape[1], f"no curve of seed {best}")
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        write_json(path, self)
+
+    @staticmethod
+    def load(path: Path) -> History:
+        """Read what ``save`` wrote, or the one in the folder of a train stage.
+
+        Raises:
+            Sim2RealError: When it is missing or not as it should be.
+        """
+        file = path / HISTORY if path.is_dir() else path
+        with malformed(file, _AGAIN):
+            return read_json(file, History)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A policy and what it expects and promises.
+
+    Attributes:
+        contract: What it sees, what it sends, at which rate, and what it was trained from.
+        weights: Name -> array, as ``Policy.from_weights`` takes them.
+        history: How training went; None where only the policy was copied.
+        path: Its folder; None before it was saved.
+    """
+
+    contract: PolicyContract
+    weights: Mapping[str, np.ndarray]
+    history: History | None = None
+    path: Path | None = None
+
+    def save(self, folder: Path) -> dict[str, str]:
+        """Write it into the folder of a train stage.
+
+        Returns:
+            Output -> name of the file or folder in it.
+        """
+        save_bundle(folder / BUNDLE, self.weights, self.contract)
+        written = {"bundle": BUNDLE}
+        if self.history is not None:
+            self.history.save(folder / HISTORY)
+            written["history"] = HISTORY
+        return written
+
+    @staticmethod
+    def load(path: Path) -> Bundle:
+        """Read a policy bundle.
+
+        Args:
+            path: Its folder, or that of a train stage.
+
+        Raises:
+            Sim2RealError: When a file is missing, damaged or of a format that this version does not know.
+        """
+        folder = path / BUNDLE if (path / BUNDLE).is_dir() else path
+        contract = load_bundle(folder).contract
+        beside = folder.with_name(HISTORY)
+        history = History.load(beside) if beside.is_file() else None
+        return Bundle(contract, read_weights(folder), history, folder)

@@ -1,0 +1,116 @@
+"""What deploy leaves: the policy on the robot, beside the same policy in simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.recording import TRUTH, Recording
+from sim2real.errors import Sim2RealError
+
+FORMAT = 2
+RESULT, SIMULATION = "result.json", "simulation.npz"
+_AGAIN = "run `sim2real deploy` again"
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well one episode went: name -> value, None where there is none, such as for a goal never reached.
+
+    Attributes:
+        real: On the robot.
+        simulation: Of the same policy in simulation; None where nothing was simulated.
+    """
+
+    real: Mapping[str, float | None]
+    simulation: Mapping[str, float | None] | None = None
+
+
+@dataclass(frozen=True)
+class Gap:
+    """One quantity on the robot and in simulation: means over episodes and over simulations."""
+
+    quantity: str
+    real: float | None
+    simulation: float | None
+    gap: float | None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """Episodes on the robot beside the same policy in simulation.
+
+    Attributes:
+        episodes: How well each went.
+        gap: What differs.
+        units: Field -> unit.
+        simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; times of its own as
+            ``t_FIELD``. Empty where nothing was simulated.
+        recordings: The robot's sessions.
+        dry_run: Whether nothing was moved: then there are no scores, no simulation and no gap.
+        format: Version of the file.
+    """
+
+    episodes: tuple[Scores, ...]
+    gap: tuple[Gap, ...]
+    units: Mapping[str, str] = field(default_factory=dict)
+    simulated: tuple[Mapping[str, np.ndarray], ...] = ()
+    recordings: tuple[Recording, ...] = ()
+    dry_run: bool = False
+    format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        """Check that there is an episode: it may come from a file."""
+        check(bool(self.episodes), "no episode")
+
+    def save(self, folder: Path) -> dict[str, str]:
+        """Write scores and simulation into a folder; the sessions' logs stand in it already.
+
+        Returns:
+            Output -> name of the file in the folder.
+        """
+        arrays = ("simulated", "recordings")
+        write_json(folder / RESULT, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
+        if self.dry_run:
+            return {"result": RESULT}
+        columns = {f"{n}_{i}": v for i, own in enumerate(self.simulated) for n, v in own.items()}
+        write_arrays(folder / SIMULATION, columns)
+        return {"result": RESULT, "simulation": SIMULATION}
+
+    @staticmethod
+    def load(folder: Path) -> Deployment:
+        """Read what ``save`` wrote, and the logs beside it.
+
+        Raises:
+            Sim2RealError: When something is missing, of another format, or not as it should be.
+        """
+        file = folder / RESULT
+        with malformed(file, _AGAIN):
+            found = read_json(file, Deployment)
+            if found.format != FORMAT:
+                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+        arrays: dict[str, np.ndarray] = {}
+        if not found.dry_run:
+            with malformed(folder / SIMULATION, _AGAIN):
+                arrays = read_arrays(folder / SIMULATION)
+        numbers = range(len(found.episodes))
+        # The embedded robot may run on from one episode to the next: then one account holds the truth of all.
+        truths = [p if (p := folder / f"truth_{i}.bin").is_file() else folder / TRUTH for i in numbers]
+        recordings = tuple(Recording.load(log_of(folder, i), truths[i]) for i in numbers)
+        return replace(found, simulated=tuple(_of_episode(arrays, i) for i in numbers), recordings=recordings)
+
+
+def log_of(folder: Path, number: int) -> Path:
+    """Return the path of an episode's log."""
+    return folder / f"episode_{number}.mcap"
+
+
+def _of_episode(arrays: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
+    """Return the columns of one episode's simulation: those whose names end with its number."""
+    suffix = f"_{number}"
+    return {n.removesuffix(suffix): v for n, v in arrays.items() if n.endswith(suffix)}

@@ -1,0 +1,117 @@
+"""JSON and arrays as artifacts keep them: read into typed dataclasses, with errors that name the file."""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from sim2real.errors import Sim2RealError
+
+T = TypeVar("T")
+
+_FOREIGN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError)
+"""What reading a file that is not as it should be raises."""
+
+
+@contextmanager
+def malformed(path: Path, again: str) -> Iterator[None]:
+    """Turn what reading a malformed file raises into an error that names the file.
+
+    Args:
+        path: The file.
+        again: How to make it anew, for the hint.
+    """
+    try:
+        yield
+    except Sim2RealError:
+        raise
+    except _FOREIGN as error:
+        reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
+        if isinstance(error, OSError):
+            raise Sim2RealError(f"cannot read {path}: {error.strerror or error}", hint=again) from error
+        raise Sim2RealError(f"{path} is malformed: {reason}", hint=again) from error
+
+
+def check(good: bool, reason: str) -> None:
+    """Raise ValueError, to be told by ``malformed``, unless something is as it should be."""
+    if not good:
+        raise ValueError(reason)
+
+
+def read_json(path: Path, kind: type[T]) -> T:
+    """Return the document in a JSON file, checked against a dataclass; entries that it does not know are ignored.
+
+    Args:
+        path: The file.
+        kind: A dataclass; lists of numbers become arrays where it has arrays, null in them NaN.
+
+    Raises:
+        ValueError: When it is no JSON, or an entry is missing or of another kind: the message says which.
+    """
+    try:
+        return msgspec.convert(msgspec.json.decode(path.read_bytes()), kind, dec_hook=_array)
+    except msgspec.MsgspecError as error:
+        raise ValueError(str(error)) from error
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a dataclass, or what it consists of, as JSON; a reader sees the old file or the new one, never a part.
+
+    Args:
+        path: The file.
+        document: What to write; numbers that are infinite or none at all, which JSON lacks, become null.
+    """
+    text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
+    draft = path.with_name(f".{path.name}.tmp")
+    draft.write_bytes(text)
+    os.replace(draft, path)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file.
+
+    Raises:
+        ValueError: When it is none.
+        OSError: When it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(str(error)) from error
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays to a compressed npz file."""
+    named: dict[str, Any] = dict(arrays)
+    np.savez_compressed(path, **named)
+
+
+def _array(kind: type, value: Any) -> Any:
+    if kind is not np.ndarray:
+        raise NotImplementedError(f"no {kind.__name__} in a file")
+
+    def flat(entry: Any) -> Any:
+        return [flat(e) for e in entry] if isinstance(entry, list) else math.nan if entry is None else float(entry)
+
+    return np.array(flat(value), np.float64)
+
+
+def number(value: float | None, missing: float = math.nan) -> float:
+    """Return a number of a document, with ``missing`` for null."""
+    return missing if value is None else value
+
+
+def _plain(value: Any) -> Any:
+    """Return what numpy adds to the kinds of numbers as Python has them."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")

@@ -1,0 +1,357 @@
+"""What identify found: ``parameters.json``, predictions and free runs beside it, and the timing of the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.run_folder import Source
+from sim2real.artifacts.timing import TIMING, Timing
+from sim2real.errors import Sim2RealError
+
+FORMAT = 3
+PARAMETERS, PREDICTIONS, FREE_RUNS = "parameters.json", "predictions.npz", "free_runs.npz"
+ROUND_TRIP = "round_trip_delay"
+"""Name of the sum of all delays."""
+MODELS = ("identified", "no delay", "nominal")
+"""What predicts: what was found, the same fitted without delays, and the data sheet's values."""
+_COLUMNS = ("t", "into", "segment", "recording", "held_out")
+_AGAIN = "run `sim2real identify` again"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One identified parameter; None where a number does not apply, is infinite or not known.
+
+    Attributes:
+        name: Its name; ``NAME@RECORDING`` where each recording has its own.
+        unit: Unit of all numbers.
+        kind: ``derived`` is what follows from others.
+        about: One line for tables and pages.
+        nominal: The data sheet's value.
+        estimate: The value found.
+        standard_error: Its standard error.
+        low95: Lower end of the 95 % interval.
+        high95: Its upper end.
+        lower: Lower bound of the search.
+        upper: Upper bound.
+        verdict: ``accepted``, ``fixed``, ``at a bound``, ``not identifiable`` or ``interrupted``.
+        truth: The embedded robot's own value.
+    """
+
+    name: str
+    unit: str
+    kind: Literal["dynamics", "delay", "measurement", "derived"]
+    about: str
+    nominal: float | None
+    estimate: float
+    verdict: str
+    standard_error: float | None = None
+    low95: float | None = None
+    high95: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    truth: float | None = None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What an identification is worth: its status, why, and the command that goes on from there."""
+
+    status: str
+    reasons: tuple[str, ...]
+    next: str = ""
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """A matrix ``(P, P)`` over named parameters."""
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check its size: it may come from a file."""
+        size = len(self.names)
+        check(self.matrix.shape == (size, size), f"a matrix of {self.matrix.shape} for {size} names")
+
+
+@dataclass(frozen=True)
+class Determined:
+    """What the data determines at the estimate.
+
+    Attributes:
+        condition: Condition number of the Jacobian, in widths of the bounds.
+        undetermined: Groups of parameters of which only combinations are determined.
+        messages: The same in words.
+        standard_error_per_minute: Parameter -> standard error to expect of one minute of such data.
+    """
+
+    condition: float | None
+    undetermined: tuple[tuple[str, ...], ...]
+    messages: tuple[str, ...]
+    standard_error_per_minute: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A descent from one start: its loss before and after, in so many steps."""
+
+    before: float | None
+    after: float | None
+    steps: int
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the estimate was found.
+
+    Attributes:
+        strategy: Of the search; None without one.
+        history: Best loss of each generation ``(G,)``.
+        evaluations: Candidates that were simulated.
+        refined: The descents after it.
+        seconds: What all of it took [s].
+        loss: Of an interrupted search: its best so far.
+        done: Of an interrupted search: share of search and refinement that was done.
+    """
+
+    strategy: str | None = None
+    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    evaluations: int = 0
+    refined: tuple[Refinement, ...] = ()
+    seconds: float | None = None
+    loss: float | None = None
+    done: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How far a model is off after a horizon: field -> root mean square and mean absolute error; None without any."""
+
+    model: str
+    horizon_s: float
+    held_out: bool
+    rmse: Mapping[str, float | None]
+    mae: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How far one position is off on held-out data after the longest horizon.
+
+    Attributes:
+        name: What people call it.
+        column: Its name among the fields, such as ``position[1]``.
+        unit: Its unit.
+        horizon_s: The horizon [s].
+        rmse: Model -> root mean square error; None where it is infinite.
+        beaten_by: The baselines that are as good.
+    """
+
+    name: str
+    column: str
+    unit: str
+    horizon_s: float
+    rmse: Mapping[str, float | None]
+    beaten_by: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that it says how good the identified model is."""
+        check("identified" in self.rmse, f"no error of what was identified in {self.name!r}")
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """How far one model's free run of one recording is off in one field."""
+
+    model: str
+    recording: int
+    begin_s: float
+    seconds: float
+    held_out: bool
+    field: str
+    rmse: float | None
+    mae: float | None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity over recordings: each by itself ``(R,)``, and what they say together.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        estimates: Shape ``(R,)``: one a recording.
+        standard_errors: Shape ``(R,)``.
+        mean: Their mean.
+        standard_error: Of the mean.
+        between: Deviation between recordings, beyond their standard errors.
+        low95: Lower end of the 95 % interval for a further recording.
+        high95: Its upper end.
+        agree: Whether their errors explain by how much they differ.
+    """
+
+    name: str
+    unit: str
+    estimates: np.ndarray
+    standard_errors: np.ndarray
+    mean: float
+    standard_error: float
+    between: float
+    low95: float
+    high95: float
+    agree: bool
+
+    def __post_init__(self) -> None:
+        """Check that every estimate has an error."""
+        check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What identify found.
+
+    Attributes:
+        pipeline: The robot.
+        logs: The recordings: those that were fitted, then those that were held out whole.
+        verdict: What it is worth.
+        parameters: The estimates.
+        search: How they were found.
+        covariance: Of the estimates.
+        correlation: Of the estimates.
+        residual_inflation: By how much residuals that hang together in time widen the errors.
+        misfit: Root mean square of the residuals, in deviations of the measurement.
+        check: What the data determines.
+        prediction: Errors over horizons.
+        held_out: Errors of each position on held-out data, the worst first.
+        free_run: Errors of the free runs.
+        aggregate: What several recordings say; empty for one.
+        segments: How many segments were simulated.
+        held_out_from_s: Where the first segment that was held out begins [s].
+        settle_s: How much of a held-out segment its initial state was fitted to [s].
+        sigma: Field -> deviation that a measurement was assumed to have.
+        units: Field -> unit.
+        posterior: What training draws robots from; None where the search was interrupted.
+        samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
+            ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
+        free: The same of the free runs; empty without any.
+        timing: Of the first recording: what training draws its timing from; None where only the estimates were copied.
+        format: Version of the file.
+    """
+
+    pipeline: str
+    logs: tuple[Source, ...]
+    verdict: Judgement
+    parameters: tuple[Estimate, ...]
+    search: Search = field(default_factory=Search)
+    covariance: Matrix | None = None
+    correlation: Matrix | None = None
+    residual_inflation: float | None = None
+    misfit: float | None = None
+    check: Determined | None = None
+    prediction: tuple[Prediction, ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
+    free_run: tuple[FreeRun, ...] = ()
+    aggregate: tuple[Quantity, ...] = ()
+    segments: int | None = None
+    held_out_from_s: float | None = None
+    settle_s: float = 0.0
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    posterior: Posterior | None = None
+    samples: Mapping[str, np.ndarray] = field(default_factory=dict)
+    free: Mapping[str, np.ndarray] = field(default_factory=dict)
+    timing: Timing | None = None
+    format: int = FORMAT
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter -> the value found, without what follows from others."""
+        return {p.name: p.estimate for p in self.parameters if p.kind != "derived"}
+
+    @property
+    def fields(self) -> list[str]:
+        """The measured fields."""
+        return [n.removesuffix("_measured") for n in self.samples if n.endswith("_measured")]
+
+    @property
+    def recordings(self) -> list[int]:
+        """Numbers of the recordings that there are samples of."""
+        return np.unique(self.samples["recording"]).tolist() if self.samples else []
+
+    def models(self, name: str) -> list[str]:
+        """Return the models that predict a field."""
+        return [m for m in MODELS if f"{name}_{m}" in self.samples]
+
+    def disjoint(self) -> np.ndarray:
+        """Return which samples to show ``(N,)``: segments may overlap, and then the later one is left out."""
+        t_s, segment, recording = (self.samples[n] for n in ("t", "segment", "recording"))
+        chosen, end = np.zeros(len(t_s), bool), {}
+        for number in dict.fromkeys(segment.tolist()):
+            rows = segment == number
+            own = int(recording[rows][0])
+            if t_s[rows][0] > end.get(own, -np.inf):
+                chosen |= rows
+                end[own] = t_s[rows][-1]
+        return chosen
+
+    def save(self, folder: Path) -> dict[str, str]:
+        """Write it into a folder.
+
+        Returns:
+            Output -> name of the file in the folder.
+        """
+        written = {"parameters": PARAMETERS}
+        self.write(folder / PARAMETERS)
+        for name, file, columns in (("predictions", PREDICTIONS, self.samples), ("free_runs", FREE_RUNS, self.free)):
+            if columns:
+                write_arrays(folder / file, columns)
+                written[name] = file
+        return written if self.timing is None else {**written, **self.timing.save(folder)}
+
+    def write(self, path: Path) -> None:
+        """Write the estimates and what is said about them, without samples and timing, as JSON."""
+        arrays = ("samples", "free", "timing")
+        write_json(path, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
+
+    @staticmethod
+    def load(path: Path) -> Identification:
+        """Read what ``save`` wrote.
+
+        Args:
+            path: The folder, or its ``parameters.json``: then it may stand alone, without predictions.
+
+        Raises:
+            Sim2RealError: When it is missing, of another format, or not as it should be.
+        """
+        file = path / PARAMETERS if path.is_dir() else path
+        with malformed(file, _AGAIN):
+            found = read_json(file, Identification)
+            if found.format != FORMAT:
+                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+            check(all(np.isfinite(p.estimate) for p in found.parameters), "an estimate is no number")
+        beside: dict[str, Any] = {}
+        if file.with_name(TIMING).is_file():
+            beside["timing"] = Timing.load(file.with_name(TIMING))
+        for name, other in (("samples", PREDICTIONS), ("free", FREE_RUNS)):
+            if (there := file.with_name(other)).is_file():
+                with malformed(there, _AGAIN):
+                    beside[name] = _columns(read_arrays(there))
+        return replace(found, **beside)
+
+
+def _columns(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return columns that are one value a sample, at least one."""
+    missing = set(_COLUMNS) - set(samples)
+    check(not missing, f"no {', '.join(sorted(missing))}")
+    wrong = [n for n, v in samples.items() if v.ndim != 1 or v.shape != samples["t"].shape]
+    check(not wrong, f"not one value a sample: {', '.join(wrong)}")
+    check(samples["t"].size > 0, "no sample")
+    return samples

@@ -1,0 +1,77 @@
+"""The estimate with its covariance: what training draws robots from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from sim2real.artifacts.files import check
+
+Transform = Literal["linear", "log", "logit"]
+TRANSFORMS = {
+    # to the scale, numpy; back from it, for numpy and JAX; derivative of the value on the scale, from the value
+    "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
+    "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
+    "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),
+}
+"""The scales on which parameters are searched, and on which their uncertainty is Normal."""
+
+
+def from_scale(transform: str, x: Any, numpy: Any = np) -> Any:
+    """Return values for points on a scale.
+
+    Args:
+        transform: Name of the scale.
+        x: The points, of any shape.
+        numpy: ``numpy``, or ``jax.numpy`` inside a program.
+    """
+    return TRANSFORMS[transform][1](x, numpy)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A Normal distribution on the parameters' scales, cut off at their bounds.
+
+    Attributes:
+        names: P of them, with ``@recording`` where each recording has its own.
+        transform: How each scale makes a value.
+        mean: Shape ``(P,)``, on the scales.
+        covariance: Shape ``(P, P)``, on the scales.
+        low: Shape ``(P,)``: bounds on the scales.
+        high: Shape ``(P,)``.
+
+    Raises:
+        ValueError: When the sizes differ or an entry is no number.
+    """
+
+    names: tuple[str, ...]
+    transform: tuple[Transform, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check that it is one distribution: it may come from a file."""
+        size = len(self.names)
+        shapes = {a.shape for a in (self.mean, self.low, self.high)}
+        fits = shapes == {(size,)} and self.covariance.shape == (size, size) and len(self.transform) == size
+        check(fits, "the posterior has mixed sizes")
+        finite = all(np.isfinite(a).all() for a in (self.mean, self.covariance, self.low, self.high))
+        check(finite, "an entry of the posterior is no number")
+
+    def sample(self, rng: np.random.Generator, count: int, widen: float = 1.0) -> dict[str, np.ndarray]:
+        """Draw parameter sets: name -> ``(count,)``.
+
+        Args:
+            rng: Random numbers.
+            count: How many.
+            widen: Factor on the standard deviations.
+        """
+        values, axes = np.linalg.eigh(self.covariance)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T
+        x = np.clip(x, self.low, self.high)
+        return {n: from_scale(t, x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}

@@ -1,0 +1,101 @@
+"""A recorded session: its log and, of an embedded robot, the account of what really happened."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.timing import Timing
+from sim2real.graph.episode import Episode
+from sim2real.hardware.truth import Truth, read_truth
+from sim2real.log.reader import TruncatedLogWarning, read_log
+
+LOG, TRUTH = "session.mcap", "truth.bin"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded session.
+
+    Attributes:
+        path: The log.
+        episode: What it holds.
+        truth_path: What an embedded robot told of itself; None where there is none.
+        warnings: What the log lacks: it was cut, or parts of it cannot be read.
+    """
+
+    path: Path
+    episode: Episode
+    truth_path: Path | None = None
+    warnings: tuple[str, ...] = ()
+
+    @staticmethod
+    def load(path: Path, truth: Path | None = None) -> Recording:
+        """Read a log; one that was cut is read up to the cut.
+
+        Args:
+            path: The log, or the folder of a record stage.
+            truth: The embedded robot's account; default: the one beside the log, if there is one.
+
+        Raises:
+            Sim2RealError: When it is no log.
+        """
+        log = path / LOG if path.is_dir() else path
+        truth = truth or log.with_name(TRUTH)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", TruncatedLogWarning)
+            episode = read_log(log)
+        said = tuple(str(w.message) for w in caught if issubclass(w.category, TruncatedLogWarning))
+        return Recording(log, episode, truth if truth.is_file() else None, said)
+
+    @property
+    def pipeline(self) -> str | None:
+        """Name of the pipeline that recorded it; None where the log does not say."""
+        return self.episode.metadata.get("pipeline")
+
+    @property
+    def dry_run(self) -> bool:
+        """Whether nothing was moved: what it holds as commands was never sent."""
+        return self.episode.metadata.get("dry_run") is True
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Field -> unit, where the session names them."""
+        return self.episode.metadata.get("units", {})
+
+    @property
+    def end(self) -> Mapping[str, Any]:
+        """What the session said at its end; empty after a crash."""
+        return self.episode.metadata.get("log", {}).get("session_end") or {}
+
+    @cached_property
+    def timing(self) -> Timing:
+        """How long everything took."""
+        return Timing.of(self.episode)
+
+    @cached_property
+    def truth(self) -> Truth | None:
+        """What an embedded robot told of itself; None for any other.
+
+        Raises:
+            Sim2RealError: When its file is damaged.
+        """
+        return None if self.truth_path is None else read_truth(self.truth_path)
+
+    def true_states(self) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+        """Return times ``(N,)`` [s] since the session's start and true states ``(N,)`` by name, within the session.
+
+        None for a robot that is not embedded, and where the log does not say when it started.
+        """
+        if self.truth is None or "monotonic_ns" not in self.end:
+            return None
+        t_ns, states = self.truth.states()
+        t_s = (t_ns - self.end["monotonic_ns"]) / 1e9
+        inside = (t_s >= 0) & (t_s <= self.episode.duration_s)
+        return t_s[inside], {n: s[inside] for n, s in states.items()}

@@ -1,0 +1,198 @@
+"""What happened on the robot beside the same policy in simulation: scores, and the gap between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2real.artifacts.deployment import Deployment, Gap, Scores
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.timing import Timing
+from sim2real.errors import Sim2RealError
+from sim2real.graph.episode import Episode, named_leaves
+from sim2real.graph.node import TICKS_PER_S
+from sim2real.graph.schedule import draw
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.windows import newest_message
+from sim2real.log.ages import input_ages
+from sim2real.runtime.bursts import make_room
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.console import note, progress
+from sim2real.stages.interruption import patiently
+from sim2real.stages.robot import Robot
+
+_SIMULATIONS = 32
+States = tuple[np.ndarray, dict[str, np.ndarray]]
+"""Times ``(N,)`` [s], and columns: states ``(N,)``, and what was sent, once a step."""
+
+
+def compare(
+    robot: Robot, recordings: Sequence[Recording], policy: Any, values: Mapping[str, float] | None, duration_s: float
+) -> Deployment:
+    """Return how deployments went, beside simulations of the same policy.
+
+    What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
+
+    Args:
+        robot: The robot.
+        recordings: The robot's sessions.
+        policy: The policy that ran.
+        values: Identified parameters to simulate with; None: nothing is simulated.
+        duration_s: How long to simulate [s].
+    """
+    real = [_states(recording, robot) for recording in recordings]
+    seen = "world" if all(r.true_states() is not None for r in recordings) else "sensor"
+    with progress(None, "simulate the same"):
+        simulated, timeline = patiently(
+            lambda: _simulate(robot, policy, values, recordings[0].timing, duration_s, len(recordings), seen)
+        )
+    episodes, gap = _scored(robot, real, simulated)
+    gap += _age_rows(robot, [r.episode for r in recordings], timeline)
+    columns = [{"t": t, **states} for t, states in (simulated or [])[: len(recordings)]]
+    columns += [{}] * (len(recordings) - len(columns))
+    return Deployment(episodes, tuple(gap), dict(robot.UNITS), tuple(columns), tuple(recordings))
+
+
+def _states(recording: Recording, robot: Robot) -> States:
+    """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
+    episode = recording.episode
+    sent = _sent(robot, episode.outputs[robot.SUPERVISOR], episode.outputs[robot.COMMAND[0]])
+    if (true := recording.true_states()) is not None:
+        t_s, states = true
+        return t_s, {**sent, **states}
+    return episode.steps["sensor"].begun_s, {**sent, **_columns(episode.outputs["sensor"])}
+
+
+def _columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
+    columns = {}
+    for name, values in fields.items():
+        flat = np.asarray(values).reshape(len(values), -1)
+        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
+    return columns
+
+
+def _sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
+    field = robot.COMMAND[1]
+    return _columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})
+
+
+def _simulate(
+    robot: Robot,
+    policy: Any,
+    values: Mapping[str, float] | None,
+    timing: Timing,
+    duration_s: float,
+    episodes: int,
+    seen: str,
+) -> tuple[list[States] | None, Timeline | None]:
+    """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
+
+    ``seen`` says which states: those of the ``world``, or as the ``sensor`` measures them, as late as on the robot.
+    Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
+    once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
+    None and None where there is nothing to simulate with.
+    """
+    if values is None:
+        return None, None
+    try:
+        computation, hiccups = timing.computation(1.0 / robot.RATE_HZ)
+    except Sim2RealError as error:  # the robot has run: what it did must not be lost
+        note(f"warning: nothing to compare with: {error.args[0]}")
+        return None, None
+    if hiccups:
+        left = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
+        note(f"the simulation leaves out steps that took longer than a period of the policy: {left}")
+    nodes, _ = robot.training(values, {}, computation, True)
+    timeline = draw(nodes, duration_s, _SIMULATIONS, 0)
+    make_room(nodes, timeline)
+    graph = CompiledGraph(nodes, robot.SUPERVISOR, timeline)
+    # Each deployment's own trial in turn: its simulation has the same to do.
+    trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
+    params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
+    recorded = (seen, robot.SUPERVISOR, robot.COMMAND[0])
+
+    def one(eps: jax.Array, params: Any) -> Any:
+        return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
+
+    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
+    return [_run(graph, records, robot, e, seen) for e in range(_SIMULATIONS)], timeline
+
+
+def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
+    """Return rows of the gap table: how old the data were that policy and actuator acted on, on the robot and here."""
+    rows = []
+    for reader in (robot.SUPERVISOR, robot.COMMAND[0]):
+        measured = [input_ages(e, reader) for e in episodes]
+        for name in measured[0]:
+            ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]
+            simulated = None
+            if timeline is not None and (reader, name) in timeline.edges:
+                simulated = _drawn_ages(timeline, reader, name)
+            for label, of in (("p50", 0.5), ("max", 1.0)):
+                r = _mean([float(np.quantile(a, of)) for a in ages if a.size])
+                s = None if simulated is None else float(np.mean(np.quantile(simulated, of, axis=1)))
+                gap = None if r is None or s is None else r - s
+                quantity = f"age_of_{name}_in_{reader}_{label}_s"
+                rows.append(Gap(quantity, r, s, gap))
+    return rows
+
+
+def _drawn_ages(timeline: Timeline, reader: str, name: str) -> np.ndarray:
+    """Return how old the newest message of each step is in drawn timelines [s]; the same steps of all, ``(E, N)``."""
+    edge, vertex = timeline.edges[reader, name], timeline.vertices[reader]
+    newest = newest_message(edge, vertex)[:, : int(vertex.count.min())]
+    first = int((newest < 0).sum(axis=1).max())
+    sent = np.take_along_axis(timeline.vertices[edge.sender].end, newest.clip(0), axis=1)
+    return (vertex.start[:, : newest.shape[1]] - sent)[:, first:] / TICKS_PER_S
+
+
+def _run(graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: int, seen: str) -> States:
+    """Return times [s] and states of one simulation."""
+
+    def sent(node: str) -> dict[str, Any]:
+        ran = records[node].seq[e] >= 0
+        return {n: np.asarray(leaf)[e][ran] for n, leaf in named_leaves(records[node].output).items()}
+
+    def steps(node: str) -> np.ndarray:
+        return records[node].seq[e][records[node].seq[e] >= 0]
+
+    name, vertices = robot.COMMAND[0], graph.timeline.vertices
+    when = vertices[name].end[e][steps(name)] / TICKS_PER_S
+    columns = {**_sent(robot, sent(robot.SUPERVISOR), sent(name)), **_columns(sent(seen))}
+    if seen == "world":  # a tick's message is its state at the end
+        t_s = (steps(seen) + 1) / graph.nodes[seen].rate
+    else:
+        t_s = vertices[seen].start[e][steps(seen)] / TICKS_PER_S
+    return t_s, {**columns, "t_command": when}
+
+
+def _scored(
+    robot: Robot, real: Sequence[States], simulated: Sequence[States] | None
+) -> tuple[tuple[Scores, ...], list[Gap]]:
+    """Return the scores of every deployment, and the gap table: means over deployments and over simulations.
+
+    None stands for a score that there is not, such as when a goal was reached that never was.
+    """
+    on_robot = [_scores(robot, t, s) for t, s in real]
+    in_simulation = [_scores(robot, t, s) for t, s in simulated or []]
+    gap = []
+    for quantity in on_robot[0]:
+        r, s = (_mean([score[quantity] for score in scores]) for scores in (on_robot, in_simulation))
+        gap.append(Gap(quantity, r, s, None if r is None or s is None else r - s))
+    beside = [*in_simulation[: len(real)], *[None] * (len(real) - len(in_simulation))]
+    return tuple(Scores(r, s) for r, s in zip(on_robot, beside, strict=True)), gap
+
+
+def _scores(robot: Robot, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in robot.score(t_s, states).items()}
+
+
+def _mean(values: list[float | None]) -> float | None:
+    there = [v for v in values if v is not None]
+    return float(np.mean(there)) if there else None

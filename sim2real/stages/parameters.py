@@ -1,0 +1,46 @@
+"""Identified parameters that belong to a pipeline, opened for the stages that simulate with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from sim2real.artifacts.identification import Identification
+from sim2real.errors import Sim2RealError
+from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.robot import Identifiable
+
+
+def open_identification(path: Path, pipeline: Pipeline) -> Identification:
+    """Read what identify found for a pipeline.
+
+    Args:
+        path: The stage's folder, or ``parameters.json``.
+        pipeline: The robot that it must be of.
+
+    Raises:
+        Sim2RealError: When it is missing, damaged, of another pipeline, or was interrupted.
+    """
+    found = Identification.load(path)
+    check_parameters(found, pipeline)
+    return found
+
+
+def check_parameters(found: Identification, pipeline: Pipeline) -> None:
+    """Check that a pipeline can be simulated with what was identified.
+
+    Raises:
+        Sim2RealError: When it is of another pipeline, lacks parameters, or was interrupted.
+    """
+    hint = f"make them with `sim2real identify {pipeline.name}`"
+    if found.pipeline != pipeline.name:
+        raise Sim2RealError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}", hint=hint)
+    if found.posterior is None:
+        raise Sim2RealError(
+            "this identification was interrupted: it says nothing about how sure its estimates are", hint=hint
+        )
+    robot = cast(Identifiable, pipeline.load())
+    expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
+    there = {p.name for p in found.parameters if p.standard_error is not None}
+    if lacking := [n for n in expected if n not in there]:
+        raise Sim2RealError(f"these parameters hold no finite estimate of {', '.join(lacking)}", hint=hint)

@@ -1,0 +1,45 @@
+"""Logs that belong to a pipeline, opened for the stages that read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sim2real.artifacts.recording import Recording
+from sim2real.errors import Sim2RealError
+from sim2real.identify.segments import require_moved
+from sim2real.log.importer import import_file, load_mapping
+from sim2real.stages.console import note
+from sim2real.stages.pipeline import Pipeline
+
+
+def open_recording(path: Path, pipeline: Pipeline) -> Recording:
+    """Read a log of a pipeline; a log that was cut is used as far as it goes.
+
+    A file of another recorder is imported in memory, where the pipeline has a mapping for it.
+
+    Args:
+        path: The file.
+        pipeline: The robot that it must be of.
+
+    Raises:
+        Sim2RealError: When it is no log, of another pipeline, or of a dry run, or has holes.
+    """
+    if path.suffix != ".mcap" and path.is_file() and (mapping := pipeline.folder / "import.toml").is_file():
+        return Recording(path, import_file(path, load_mapping(mapping)))
+    recording = Recording.load(path)
+    for warning in recording.warnings:
+        note(f"warning: {warning}; what is there is used")
+    owner = recording.pipeline
+    if owner is None:
+        raise Sim2RealError(
+            f"{path} does not say which pipeline it is of: its metadata is damaged", hint="record again"
+        )
+    if owner != pipeline.name:
+        raise Sim2RealError(
+            f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
+        )
+    require_moved(recording.episode, str(path))
+    holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
+    if holes:
+        raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
+    return recording

@@ -1,0 +1,54 @@
+"""What a user means by a run: its path, its name, a stage folder in it, or a pipeline's newest."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from sim2real.artifacts.manifest import read_manifest
+from sim2real.artifacts.run_folder import STAGES, attempts, finished, run_folders
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline import available
+
+
+def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
+    """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
+
+    Of a pipeline's runs the newest in which a stage is finished counts, if there is any: one that failed at its start
+    does not hide those before it.
+
+    Args:
+        root: Folder of all runs.
+        target: What the user typed.
+        pipeline: The pipeline that the run has to belong to; None allows any.
+
+    Raises:
+        UsageError: When there is no such run, or it belongs to another pipeline.
+    """
+    path = Path(target)
+    # What is above counts for a stage folder only: above a pipeline's name is wherever the user happens to be.
+    options = [path.parent if read_manifest(path) is not None else path]
+    options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
+    for folder in options:
+        owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
+        if owners and pipeline and pipeline not in owners:
+            raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
+        if owners:
+            return folder
+    if pipeline is None and (known := run_folders(root, str(target))):
+        return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
+    raise _nothing_there(root, str(target))
+
+
+def _nothing_there(root: Path, target: str) -> UsageError:
+    """Return the error for a name that is none: it says what there is."""
+    pipelines = sorted(available())
+    names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
+    said = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
+    if target in pipelines:
+        hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
+    elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
+        hint = f"did you mean {close[0]}?"
+    else:
+        hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
+    return UsageError(f"there is no file, pipeline or run {target!r}. {said}", hint=hint)

@@ -1,0 +1,76 @@
+"""The timing of a session: what it says, and what training draws from it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.timing import Timing
+from sim2real.errors import Sim2RealError
+from sim2real.graph.episode import Episode, Messages, Steps
+from sim2real.graph.fitting import resample
+
+
+@pytest.fixture
+def episode():
+    """Two nodes at 50 Hz; two of the agent's steps take 30 ms instead of 1 ms; no step uses every fourth message."""
+    start = 20_000 * np.arange(100)
+    took = np.full(100, 1000)
+    took[[10, 50]] = 30_000
+    zeros, never = np.zeros(100, np.int64), np.full(100, -1)
+    late = Steps(start, start, start + 200, never, start + took, zeros)
+    quick = Steps(start, start, start, never, start + 500, zeros)
+    sent = start + 500
+    used = np.where(np.arange(100) % 4 == 3, -1, np.arange(100))
+    messages = Messages(np.arange(100), used, sent, sent + 250)
+    end = {"transactions": 200, "lost_replies": 3, "retries": 3, "late_replies": 5, "late_s": [0.0, 0.001, 0.004]}
+    counted = {"agent": {"overruns": 2}, "sensor": {"overruns": 0}}
+    metadata = {"log": {"session_end": {**end, "timing": counted, "monotonic_ns": 12}}}
+    return Episode({"sensor": quick, "agent": late}, {("agent", "sensor"): messages}, {}, metadata)
+
+
+def test_it_says_what_happened(episode):
+    timing = Timing.of(episode)
+    agent = timing.nodes["agent"]
+    assert list(timing.nodes) == ["agent", "sensor"], "in the order in which the session names them"
+    assert (agent.steps, agent.overruns) == (100, 2)
+    assert (agent.computation.p50, agent.computation.max) == (0.001, 0.03)
+    assert agent.lateness.p50 == pytest.approx(0.0002)
+    assert agent.period.p50 == pytest.approx(0.02)
+    (connection,) = timing.connections
+    assert (connection.reader, connection.input, connection.messages, connection.unread) == ("agent", "sensor", 100, 25)
+    assert connection.transport.p99 == pytest.approx(0.00025)
+    assert (timing.bus.lost, timing.bus.late, timing.bus.lateness.max) == (3, 5, 0.004)
+    assert timing.monotonic_ns == 12
+
+
+def test_it_comes_back_to_the_last_bit(episode, tmp_path):
+    timing = Timing.of(episode)
+    assert timing.save(tmp_path) == {"timing": "timing.json", "timing_samples": "timing.npz"}
+    back = Timing.load(tmp_path)
+    assert (back.nodes, back.connections, back.bus) == (timing.nodes, timing.connections, timing.bus)
+    for name in ("steps_s", "transport_s"):
+        ours, theirs = getattr(timing, name), getattr(back, name)
+        assert set(ours) == set(theirs)
+        assert all(np.array_equal(ours[n], theirs[n]) for n in ours)
+
+
+def test_hiccups_are_left_out_and_counted(episode):
+    delays, dropped = Timing.of(episode).computation(0.005)
+    assert dropped == {"agent": 2}
+    assert {type(d) for d in delays.values()} == {type(resample(np.full(98, 0.001)))}
+    rng = np.random.default_rng(0)
+    assert np.unique(delays["agent"].sample(rng, (1000,))).tolist() == [0.001]
+    with pytest.raises(Sim2RealError, match="only 0 of 100 steps of node 'sensor' took less"):
+        Timing.of(episode).computation(0.0001)
+
+
+def test_samples_of_other_nodes_are_refused(episode, tmp_path):
+    Timing.of(episode).save(tmp_path)
+    document = json.loads((tmp_path / "timing.json").read_text())
+    del document["nodes"]["agent"]
+    (tmp_path / "timing.json").write_text(json.dumps(document))
+    with pytest.raises(Sim2RealError, match="its nodes are others"):
+        Timing.load(tmp_path)
+    with pytest.raises(Sim2RealError, match="cannot read"):
+        Timing.load(tmp_path / "nowhere.json")
