@@ -57,7 +57,7 @@ class InputState(Base):
         ts_sent: Shape ``(W,)``: when each message was sent [s from the episode's start]; 0 in an empty slot.
         ts_recv: Shape ``(W,)``: when each message was received [s].
         data: The messages; leaves of shape ``(W, ...)``.
-        delay_dist: The connection's delay where it is trainable, else None. Indexing leaves it whole.
+        delay_dist: The connection's ``TrainableDist``, None if its delay is not trainable; indexing leaves it whole.
     """
 
     seq: Any
@@ -76,12 +76,12 @@ class StepState(Base):
     """Everything that ``BaseNode.step`` may read and replace.
 
     Attributes:
-        rng: The node's key; split it and put the new one back.
+        rng: The node's JAX key; a step that uses it splits it and returns the new one.
         state: The node's state.
         params: The node's parameters.
         inputs: Input name -> InputState.
-        eps: int32: which timeline this is.
-        seq: int32: which step of the node this is, from 0.
+        eps: int32: index of the timeline that is played.
+        seq: int32: number of this step of the node, from 0.
         ts: float32: when the step started [s from the episode's start].
     """
 
@@ -99,17 +99,17 @@ class GraphState(Base):
     """The state of a whole graph; dictionaries are keyed by node name.
 
     Attributes:
-        eps: int32: which timeline is played.
-        step: int32: the position in it: a row of the compiled graph, a step of the supervisor elsewhere; -1 before it
-            starts.
-        rng: Keys.
+        eps: int32: index of the timeline that is played.
+        step: int32: position in the timeline: the row in a compiled graph, the supervisor's step elsewhere; -1 before
+            the start.
+        rng: JAX keys.
         params: Parameters.
         state: States.
-        seq: int32: steps that each node has made. In a compiled graph: the step of the supervisor that awaits its
-            caller, between ``reset`` and ``step``; empty otherwise.
-        delays: Node -> input name -> trainable delay, for those connections that have one.
+        seq: int32: number of steps that each node has made. In a compiled graph it is empty, except after ``reset``,
+            ``step`` and ``observe``: then it has the number of the supervisor's step that the caller makes next.
+        delays: Node -> input name -> trainable delay, for the connections that have one.
         buffer: The last outputs of each node, oldest first; compiled graphs only.
-        aux: Anything that a user wants to carry along.
+        aux: For the user; the graph passes it on unchanged.
     """
 
     eps: Any = 0

@@ -10,10 +10,13 @@ from sim2real.graph.node import BaseNode
 
 
 def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, BaseNode]:
-    """Return nodes, given by name or as a list, by name.
+    """Return nodes as a dictionary by name, checked.
+
+    Args:
+        nodes: The nodes, as a list or by name.
 
     Raises:
-        UsageError: When one is no node, two have the same name, or a key is not its node's name.
+        UsageError: When an entry is no node, two nodes have the same name, or a key is not its node's name.
     """
     if not isinstance(nodes, Mapping | Sequence) or isinstance(nodes, str):
         raise UsageError(
@@ -32,11 +35,11 @@ def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, Bas
 
 
 def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, Any] | None = None) -> None:
-    """Check that every sender is in the graph: itself, and not just a node of the same name.
+    """Check that every sender is in the graph: the object itself, not only a node of the same name.
 
     Args:
         nodes: The nodes by name.
-        among: Senders of other names are left out of the graph on purpose; None: none are.
+        among: Check only senders with these names (others are left out of the graph on purpose); None: all senders.
 
     Raises:
         UsageError: When a sender is missing, or is another object than the node of its name.

@@ -1,6 +1,7 @@
 """How long a computation or a transfer takes: fixed, random, recorded or to be identified.
 
-Timelines are drawn in numpy, all episodes at once; distrax distributions are accepted at the API.
+Timelines are drawn in numpy, all episodes at once. Wherever a distribution is expected, a number of seconds or a
+distrax distribution is accepted too.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ class DelayDistribution(ABC):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Draw delays [s] of the given shape; the last axis runs along successive messages."""
+        """Draw delays [s] of the given shape; the last axis holds successive messages or steps."""
 
     @abstractmethod
     def quantile(self, q: float) -> float:
-        """Return the delay [s] that a share ``q`` of the samples does not exceed."""
+        """Return the delay [s] that a fraction ``q`` of the samples does not exceed."""
 
     def window(self, rate_out: float) -> int:
-        """Return how many messages the reader's window grows by, for a sender at ``rate_out`` Hz."""
+        """Return how many more messages the reader's window must hold, for a sender at ``rate_out`` [Hz]."""
         del rate_out
         return 0
 
 
 class StaticDist(DelayDistribution):
-    """A distrax distribution, clipped at 0, or a constant.
+    """A constant delay, or a distrax distribution clipped at 0.
 
     Args:
         dist: A ``distrax.Distribution`` over seconds, or a number of seconds.
@@ -70,7 +71,7 @@ class StaticDist(DelayDistribution):
         """Draw delays [s]; samples below 0 become 0."""
         if self._constant is not None:
             return np.full(shape, self._constant)
-        if type(self.dist).__name__ == "Normal":  # numpy draws 1e6 of these in 10 ms, distrax compiles for 300 ms first
+        if type(self.dist).__name__ == "Normal":  # numpy draws 1e6 in 10 ms; distrax would first compile for 300 ms
             raw = rng.normal(float(self.dist.loc), float(self.dist.scale), shape)
         else:
             key = jax.random.key(int(rng.integers(2**31)))
@@ -78,7 +79,10 @@ class StaticDist(DelayDistribution):
         return np.maximum(raw, 0.0)
 
     def quantile(self, q: float) -> float:
-        """Return a quantile of the clipped distribution [s]; 1e5 samples decide unless it is (a mixture of) Normal."""
+        """Return a quantile of the clipped distribution [s].
+
+        Exact for a constant, a Normal and a mixture of Normals; of other distributions estimated from 1e5 samples.
+        """
         if not 0.0 < q < 1.0:
             raise UsageError(f"a quantile lies between 0 and 1, got {q}")
         if self._constant is not None:
@@ -94,7 +98,7 @@ class StaticDist(DelayDistribution):
 
 
 def _quantile_of_mixture(q: float, weights: np.ndarray, loc: np.ndarray, scale: np.ndarray) -> float:
-    """Return a quantile of a mixture of Normal distributions, clipped at 0, by bisection of its distribution."""
+    """Return a quantile of a mixture of Normal distributions, clipped at 0, by bisection of its CDF."""
     parts = [NormalDist(float(m), max(float(s), 1e-12)) for m, s in zip(loc, scale, strict=True)]
     low = min(p.inv_cdf(q) for p in parts)
     high = max(p.inv_cdf(q) for p in parts)
@@ -106,11 +110,11 @@ def _quantile_of_mixture(q: float, weights: np.ndarray, loc: np.ndarray, scale: 
 
 
 class EmpiricalDist(DelayDistribution):
-    """Delays resampled from a record in blocks, so that runs of slow steps stay runs.
+    """Recorded delays, resampled in blocks of successive ones (block bootstrap): runs of slow steps stay together.
 
     Args:
         samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
-        block: Successive samples that are drawn together; 1 resamples independently.
+        block: Length of a block; 1 draws every delay independently.
     """
 
     def __init__(self, samples: np.ndarray, block: int = 10) -> None:
@@ -143,17 +147,18 @@ _INTERPOLATIONS = ("zoh", "linear", "linear_real_only", "zoh_mean")
 
 @struct.dataclass
 class TrainableDist(Base, DelayDistribution):
-    """A delay that is chosen when the graph runs, between two bounds: ``min + alpha * (max - min)``.
+    """A delay that may change while the graph runs, between two bounds: ``min + alpha * (max - min)``.
 
-    Timelines are built with the least delay and the reader's window is widened, so that every message that any delay
-    within the bounds could deliver is there.
+    It is traced by JAX, so it can be identified or randomised without compiling again. Timelines are drawn with the
+    smallest delay, and the reader's window is lengthened so that it holds the messages for every delay in the bounds.
 
     Attributes:
-        alpha: Traced, in [0, 1].
-        min: Least delay [s].
+        alpha: Position between the bounds, in [0, 1]; traced.
+        min: Smallest delay [s].
         max: Largest delay [s].
-        interp: ``zoh``, ``linear``, ``linear_real_only`` (real messages only), or ``zoh_mean`` (inputs of a world).
-        burst: Messages that may come within the bounds on top of what the sender's rate explains.
+        interp: How the window is read at the delay: ``zoh``, ``linear``, ``linear_real_only``, or ``zoh_mean``
+            (inputs of a world only); ``apply`` says what each does.
+        burst: Extra messages in the window, for a sender that at times sends faster than its rate.
     """
 
     alpha: Any
@@ -164,9 +169,15 @@ class TrainableDist(Base, DelayDistribution):
 
     @classmethod
     def create(cls, delay: float, min: float, max: float, interp: str = "zoh", burst: int = 0) -> TrainableDist:
-        """Return the distribution with ``delay`` [s] between ``min`` and ``max`` [s].
+        """Return the distribution with a given delay.
 
-        ``burst`` messages more than the sender's rate explains may come within the bounds: recorded timing needs some.
+        Args:
+            delay: The delay [s].
+            min: Smallest delay [s].
+            max: Largest delay [s].
+            interp: How the window is read at the delay; see ``apply``.
+            burst: Extra messages in the window, for a sender that at times sends faster than its rate: recorded timing
+                usually needs 1 or 2.
 
         Raises:
             UsageError: Unless ``0 <= min < max``, ``min <= delay <= max`` and ``interp`` is known.
@@ -191,33 +202,37 @@ class TrainableDist(Base, DelayDistribution):
         return self.replace(alpha=alpha)  # pyright: ignore[reportAttributeAccessIssue]
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the least delay: what timelines are built with [s]."""
+        """Return the smallest delay [s] in the given shape: timelines are drawn with it."""
         del rng
         return np.full(shape, self.min)
 
     def quantile(self, q: float) -> float:
-        """Return the delay at construction: what phases are built with [s]."""
+        """Return the delay [s], whatever ``q`` is: a new connection takes it as its expected delay."""
         del q
         return float(self.delay)
 
     def window(self, rate_out: float) -> int:
-        """Return ``ceil(rate_out * (max - min)) + burst``, what the reader's window grows by."""
+        """Return how many more messages the reader's window must hold: ``ceil(rate_out * (max - min)) + burst``."""
         return math.ceil(round(rate_out * (self.max - self.min), 9)) + self.burst
 
     def apply(
         self, inputs: InputState, age_s: Any, window: int, period_s: float, ts_s: Any = 0.0, skip: bool = False
     ) -> InputState:
-        """Pick or interpolate the messages that a step reads at this delay.
+        """Return the messages that a step reads at this delay.
 
-        ``zoh`` picks the last ``window`` messages that have arrived. ``linear`` takes the newest of them, and all those
-        before, as far back as they arrived, from the line through all messages that were sent; a message that has not
-        arrived yet is the upper end of that line. There, the default output in an empty slot arrived at time 0; with
-        ``linear_real_only`` infinitely long ago, so that the first message holds until it arrives.
+        - ``zoh``: the last ``window`` messages that have arrived.
+        - ``linear``: linear interpolation between messages over their arrival times. The newest entry is the value at
+          the step's start, between the last message that has arrived and the next one, which has not. Each entry
+          before it lies as far back as its message arrived before the newest one. Empty slots hold the default output,
+          which counts as having arrived at time 0.
+        - ``linear_real_only``: the same, but the default output counts as having arrived infinitely long ago: the
+          first message's value is then used even before it arrives.
+        - ``zoh_mean``: the mean over the reader's period of the message that holds.
 
-        Messages are received this delay after they were sent, whatever ``ts_recv`` says of the timeline's least delay.
+        Arrival times are recomputed as sent time plus this delay: ``inputs.ts_recv`` has the smallest delay in it.
 
         Args:
-            inputs: The widened window, leaves ``(W, ...)``.
+            inputs: The lengthened window, leaves ``(W, ...)``.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
             window: The window that the user asked for.
             period_s: The reader's period [s]; used by ``zoh_mean`` alone.
@@ -225,7 +240,7 @@ class TrainableDist(Base, DelayDistribution):
             skip: Whether a message that arrives exactly at the start is left to the next step.
 
         Returns:
-            The window of ``window`` messages.
+            The inputs with a window of ``window`` messages.
         """
         late = age_s - self.delay  # time since arrival at this delay; negative: not there yet
         received = jnp.where(inputs.seq >= 0, inputs.ts_sent + self.delay, inputs.ts_recv)
@@ -233,7 +248,7 @@ class TrainableDist(Base, DelayDistribution):
         if self.interp == "zoh_mean":
             return _mean_over_period(inputs, late, window, period_s)
         width = inputs.seq.shape[0]
-        # Times are whole ticks, and float32 is finer than half a tick: so a tie is a tie.
+        # Times are whole ticks, and float32 resolves half a tick at these ages: exact ties are recognised.
         arrived = late > HALF_TICK_S if skip else late > -HALF_TICK_S
         last = jnp.maximum(jnp.sum(arrived) - 1, window - 1)
         if self.interp == "zoh":
@@ -247,7 +262,10 @@ class TrainableDist(Base, DelayDistribution):
 
 
 def _interpolate(inputs: InputState, knots: Any, query: Any) -> InputState:
-    """Interpolate every leaf linearly at ``query``, in time relative to the reader; clamped at the ends."""
+    """Interpolate every leaf linearly at the times ``query``; before the first knot and after the last it is constant.
+
+    Times ``knots (W,)`` and ``query (w,)`` are relative to the reader's start [s].
+    """
     above = jnp.clip(jnp.sum(knots[None] <= query[:, None], axis=1), 1, knots.shape[0] - 1)
     low, high = jnp.take(knots, above - 1), jnp.take(knots, above)
     span = jnp.where(high > low, high - low, 1.0)
@@ -263,12 +281,12 @@ def _interpolate(inputs: InputState, knots: Any, query: Any) -> InputState:
 
 
 def _mean_over_period(inputs: InputState, late: Any, window: int, period_s: float) -> InputState:
-    """Average the held message over the reader's period: exact to first order, differentiable in the delay.
+    """Average the messages over the reader's period, each weighted by how long it holds; differentiable in the delay.
 
-    What cannot be averaged (whole numbers, seq, times) is that of the message that holds when the period begins. What
-    held before the oldest message in the window is not known: the oldest stands for it.
+    Integers, ``seq`` and times are not averaged: they are those of the message that holds when the period begins. The
+    oldest message in the window counts as holding from the start of the period.
     """
-    # Share of the period in which each message, or a newer one, holds.
+    # Fraction of the period in which each message, or a newer one, holds.
     share = jnp.clip(1.0 + late / period_s, 0.0, 1.0)
     first = jnp.maximum(jnp.sum(late > -HALF_TICK_S) - window, 0)
     held = jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
@@ -276,8 +294,8 @@ def _mean_over_period(inputs: InputState, late: Any, window: int, period_s: floa
     def one(leaf: Any, now: Any) -> Any:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             return now
-        # Message by message, not as a product of arrays: this fuses with the physics. On two CPU cores the whole
-        # rollout of a motor with a window of five took 27 ns a tick with a dot product, and 17 ns so.
+        # A sum over the messages, not a dot product, as XLA fuses it with the physics: measured 17 ns per tick against
+        # 27 ns (rollout of a motor, window of five messages, two CPU cores).
         mean = leaf[0]
         for i in range(1, leaf.shape[0]):
             mean = mean + (leaf[i] - leaf[i - 1]) * share[i].astype(leaf.dtype)

@@ -15,8 +15,15 @@ TICKS_PER_S = 1_000_000
 class StepRecord(NamedTuple):
     """One finished step of a node; times in ticks [us] from the episode's start.
 
-    ``woken`` is when the thread really ran, ``ts_overwrite`` the start that the step set itself (-1: it did not).
-    ``drift`` is how far overruns have moved the node's schedule.
+    Attributes:
+        node: The node's name.
+        seq: Number of the step, from 0.
+        scheduled: The step's slot (timing rule 2).
+        start: When the step starts by the timing rules.
+        woken: When the thread really began to run it.
+        ts_overwrite: The start that the step set itself; -1 if it did not.
+        end: When the step ended and its output was sent.
+        drift: How far earlier overruns have moved the node's schedule.
     """
 
     node: str
@@ -30,7 +37,16 @@ class StepRecord(NamedTuple):
 
 
 class MessageRecord(NamedTuple):
-    """One message of a connection; times in ticks [us]. ``seq_in`` is -1 if no step consumed it."""
+    """One message of a connection; times in ticks [us] from the episode's start.
+
+    Attributes:
+        node: The reader's name.
+        input: Name of the reader's input.
+        seq_out: The sender's step that made the message.
+        seq_in: The reader's step that consumed it; -1 if none did.
+        sent: When it was sent.
+        received: When it arrived.
+    """
 
     node: str
     input: str
@@ -41,16 +57,21 @@ class MessageRecord(NamedTuple):
 
 
 class Recorder(Protocol):
-    """Takes what a running graph reports. Every call returns at once: nothing here may block a control loop."""
+    """Receives what a running graph reports. Implementations return at once: control loops call them."""
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """The episode starts: time 0 is ``monotonic_ns`` on the monotonic clock, ``epoch_ns`` on the wall clock."""
+        """Take note of an episode's start.
+
+        Args:
+            epoch_ns: The start on the wall clock [ns since 1970].
+            monotonic_ns: The start on the monotonic clock [ns].
+        """
 
     def step(self, record: StepRecord, output: Any) -> None:
-        """A step has ended with this output: a pytree of numpy arrays or numbers."""
+        """Take a step that has ended, and its output: a pytree of numpy arrays or numbers."""
 
     def message(self, record: MessageRecord) -> None:
-        """The fate of a message is known."""
+        """Take a message that was consumed, or that no step will consume any more."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +124,7 @@ class Episode:
         messages: (node, input name) -> the messages on that connection.
         outputs: Node -> field name -> array with one row a step, shape ``(N, ...)``.
         metadata: What the session's log says about itself (pipeline, configuration, versions, ...).
-        complete: Whether the session ended in order; False after a crash.
+        complete: Whether the session ended properly; False after a crash.
     """
 
     steps: Mapping[str, Steps]
@@ -114,13 +135,13 @@ class Episode:
 
     @property
     def duration_s(self) -> float:
-        """When the last step ended [s]."""
+        """End of the last step [s from the episode's start]; 0 without steps."""
         ends = [int(s.end[-1]) for s in self.steps.values() if len(s)]
         return max(ends, default=0) / TICKS_PER_S
 
 
 class MemoryRecorder:
-    """A recorder that keeps everything in memory and hands it over as an ``Episode``."""
+    """A recorder that keeps everything in memory and returns it as an ``Episode``."""
 
     def __init__(self) -> None:
         self._steps: dict[str, list[StepRecord]] = {}
@@ -164,7 +185,7 @@ def messages_from_records(records: list[MessageRecord]) -> Messages:
 
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves of a message by dotted name (``th``, ``pose.x``), in a fixed order."""
-    import jax  # a log is written without JAX when messages are plain dictionaries
+    import jax  # imported late: a log of plain dictionaries is written without JAX
 
     if isinstance(tree, Mapping) and not any(isinstance(v, Mapping) or is_dataclass(v) for v in tree.values()):
         return dict(tree)
@@ -177,5 +198,6 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def _stack(outputs: list[Any]) -> dict[str, np.ndarray]:
+    """Return the outputs of N steps as one array per leaf, shape ``(N, ...)``."""
     rows = [named_leaves(o) for o in outputs]
     return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in (rows[0] if rows else {})}

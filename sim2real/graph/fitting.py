@@ -8,17 +8,18 @@ from sim2real.errors import UsageError
 from sim2real.graph.delays import EmpiricalDist, StaticDist
 
 _CONSTANT_S = 1e-7
-"""Delays that spread less than this are one number."""
+"""Delays with a smaller standard deviation are fitted by a constant [s]."""
 _LONGEST_BLOCK = 200
+"""Largest lag at which the autocorrelation is computed [delays]."""
 
 
 def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> StaticDist:
-    """Fit a mixture of normal distributions: smooth, a few numbers, without memory from one delay to the next.
+    """Fit a mixture of normal distributions; delays drawn from it are independent of each other.
 
     Args:
         samples: Shape ``(n,)``: recorded delays [s].
-        components: At most so many; fewer where the Bayesian information criterion prefers it.
-        seed: Of the fit's start.
+        components: Largest number of components; the Bayesian information criterion chooses how many are used.
+        seed: Seed of the fit's initial values.
 
     Returns:
         A constant, or a ``distrax.MixtureSameFamily``, clipped at 0 when drawn from.
@@ -31,7 +32,7 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
         return StaticDist(float(x.mean()))
     if x.size < 2 * components:
         raise UsageError(f"{x.size} delays are too few for a mixture of up to {components} components")
-    import distrax  # 1.6 s, and scikit-learn another 1 s: only for those who fit
+    import distrax  # imported late: distrax takes 1.6 s, scikit-learn another 1 s
     import jax.numpy as jnp
     from sklearn.mixture import GaussianMixture
 
@@ -49,10 +50,10 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
 
 
 def resample(samples: np.ndarray) -> EmpiricalDist:
-    """Return the distribution that replays the record in blocks as long as its memory.
+    """Return an ``EmpiricalDist`` whose blocks are as long as the recorded delays stay correlated.
 
-    The block is the time over which delays stay correlated (the sum of the autocorrelation up to its first value below
-    0.1, twice over for both sides), so that independent delays are drawn one by one and runs of slow steps stay runs.
+    The block length is ``1 + 2 * (sum of the autocorrelation over lags 1, 2, ...)``, up to the first lag at which it
+    falls below 0.1. So independent delays are drawn one by one, and runs of slow steps stay together.
 
     Args:
         samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
@@ -75,6 +76,7 @@ def resample(samples: np.ndarray) -> EmpiricalDist:
 
 
 def _checked(samples: np.ndarray) -> np.ndarray:
+    """Return the samples as float64, once they are known to be at least 2 finite delays of at least 0 s."""
     x = np.asarray(samples, np.float64)
     if x.ndim != 1 or x.size < 2 or not np.isfinite(x).all() or (x < 0).any():
         raise UsageError(f"recorded delays must be at least 2 finite times of at least 0 s, got shape {x.shape}")

@@ -19,9 +19,9 @@ class Scheduling(Enum):
     """What an overrun does to the steps after it."""
 
     FREQUENCY = "frequency"
-    """The whole later schedule moves: the node keeps its frequency."""
+    """All later steps are scheduled later by the same amount: the distance between steps is kept."""
     PHASE = "phase"
-    """The node returns to its grid."""
+    """Later steps stay at their original times: the node returns to its grid."""
 
 
 class Jitter(Enum):
@@ -30,11 +30,26 @@ class Jitter(Enum):
     LATEST = "latest"
     """All of them."""
     BUFFER = "buffer"
-    """Those whose nominal arrival has passed as well."""
+    """Only those whose nominal arrival time has passed too."""
 
 
 class Connection:
-    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``."""
+    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``.
+
+    Args:
+        input_node: The reader.
+        output_node: The sender.
+        blocking: As in ``BaseNode.connect``, and so are the others.
+        delay: Expected communication delay [s]; None: the 0.99 quantile of ``delay_dist``.
+        delay_dist: Communication delay in simulation: seconds, or a distribution over seconds; None: 0.
+        window: Number of messages that the step sees.
+        skip: Whether messages that arrive exactly at the start are left to the next step.
+        jitter: Which of the messages that have arrived a non-blocking input hands over.
+        name: Key in ``step_state.inputs``.
+
+    Raises:
+        UsageError: When an option makes no sense or two exclude each other.
+    """
 
     def __init__(
         self,
@@ -71,7 +86,7 @@ class Connection:
 
     @property
     def trainable(self) -> bool:
-        """Whether the delay is chosen when the graph runs."""
+        """Whether the delay may change while the graph runs (``TrainableDist``)."""
         return isinstance(self.delay_dist, TrainableDist)
 
     @property
@@ -81,9 +96,9 @@ class Connection:
 
     @property
     def total_window(self) -> int:
-        """Messages that a reader must see so that any trainable delay within its bounds can be served."""
+        """Number of messages that the runtime keeps for the reader: the window, and more for a trainable delay."""
         extra = self.delay_dist.window(self.output_node.rate)
-        if self.averaged:  # and those that arrive while the tick lasts
+        if self.averaged:  # the mean also uses messages that arrive during the tick
             extra += math.ceil(self.output_node.rate / self.input_node.rate)
         return self.window + extra
 
@@ -102,16 +117,17 @@ class Connection:
 
 
 class BaseNode:
-    """One computation that runs at a rate: override ``step`` and the ``init_*`` methods that it needs.
+    """A computation that runs at a fixed rate: override ``step`` and the ``init_*`` methods that it needs.
 
     Args:
         name: Unique in the graph.
         rate: Nominal frequency [Hz].
-        delay: Expected computation delay [s], which shifts the phases of readers; default: the 0.99 quantile of
-            ``delay_dist``.
+        delay: Expected computation delay [s]; the schedules of readers start later by it. Default: the 0.99 quantile
+            of ``delay_dist``.
         delay_dist: Computation delay in simulation: a distrax distribution over seconds, a ``DelayDistribution`` or a
             number of seconds; default 0.
-        advance: With only blocking inputs, start as soon as they are there, before the scheduled time too.
+        advance: Start as soon as the blocking inputs have arrived, even before the scheduled time. Needs a blocking
+            input; with a non-blocking input as well the schedule holds.
         scheduling: What an overrun does to later steps.
         color: Colour in drawings.
         order: Place in drawings.
@@ -121,7 +137,7 @@ class BaseNode:
     """
 
     jittable: bool = True
-    """Whether ``step`` may be traced by JAX; a node that talks to hardware in plain Python says False."""
+    """Whether JAX can trace ``step``; False for a node that talks to hardware in plain Python."""
 
     def __init__(
         self,
@@ -168,13 +184,18 @@ class BaseNode:
 
         Args:
             output_node: The sender.
-            blocking: Wait for the messages that are due by the nominal schedule.
-            delay: Expected communication delay [s], for phases; default: the 0.99 quantile of ``delay_dist``.
+            blocking: Whether a step waits for the messages that are due by the nominal schedule.
+            delay: Expected communication delay [s], from which phases are computed; default: the 0.99 quantile of
+                ``delay_dist``.
             delay_dist: Communication delay in simulation; may be a ``TrainableDist``; default 0.
-            window: How many of the last messages the step sees.
-            skip: Leave this input out of the phase, and messages that arrive exactly at the start to the next step.
+            window: Number of messages that the step sees, the last ones.
+            skip: Ignore this input in the node's phase (needed once in every loop of connections), and leave messages
+                that arrive exactly at a step's start to the next step.
             jitter: What a non-blocking input does with messages that arrive early.
             name: Key in ``step_state.inputs``; default: the sender's name.
+
+        Returns:
+            The connection.
 
         Raises:
             UsageError: When the input's name is taken or an option makes no sense.
@@ -206,19 +227,19 @@ class BaseNode:
         return self.phase + self.delay
 
     def now(self) -> float:
-        """Return the time since the episode's start [s], of the clock that the node runs on; 0 when it runs on none."""
+        """Return the time since the episode's start [s] on the runtime's clock; 0 while the node does not run."""
         return self._clock() if self._clock else 0.0
 
     def at(self, monotonic_ns: int) -> float:
-        """Return a time of the machine's monotonic clock as time since the episode's start [s]."""
+        """Convert a time of the machine's monotonic clock [ns] to the time since the episode's start [s]."""
         return (monotonic_ns - self._origin_ns) / 1e9
 
     def set_clock(self, clock: Callable[[], float] | None, origin_ns: int = 0) -> None:
-        """Set what ``now`` and ``at`` go by; called by the runtime.
+        """Set the clock that ``now`` and ``at`` use; called by the runtime.
 
         Args:
             clock: Returns the time since the episode's start [s]; None when the node does not run.
-            origin_ns: The episode's start on the machine's monotonic clock.
+            origin_ns: The episode's start on the machine's monotonic clock [ns].
         """
         self._clock, self._origin_ns = clock, origin_ns
 
@@ -233,12 +254,12 @@ class BaseNode:
         return Empty()
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the message that stands in a reader's window before the first one has arrived."""
+        """Return the default output: the message in a reader's window before the first real one has arrived."""
         del rng, graph_state
         return Empty()
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay [s] of trainable inputs, by input name; others are ignored."""
+        """Return delays [s] by input name, for inputs with a trainable delay; other entries are ignored."""
         del rng, graph_state
         return {}
 
@@ -271,7 +292,7 @@ class BaseWorld(BaseNode):
     """
 
     def __init__(self, name: str, rate: float, color: str | None = None, order: int | None = None) -> None:
-        # A hair less than the period: the end of a tick is never taken for the start of the next but one.
+        # Slightly less than the period: rounded to whole microseconds, a tick must not end after the next one starts.
         busy = 0.999 / _rate(rate, f"node {name!r}")
         super().__init__(name, rate, delay=busy, delay_dist=StaticDist(busy), color=color, order=order)
 
@@ -303,6 +324,7 @@ def phase_ticks(node: BaseNode, _path: tuple[str, ...] = ()) -> int:
 
 
 def _as_distribution(dist: Any, where: str) -> DelayDistribution:
+    """Return what the user passed as a distribution; ``where`` names the node or connection in errors."""
     if dist is None:
         return StaticDist(0.0)
     if isinstance(dist, DelayDistribution):
@@ -314,6 +336,7 @@ def _as_distribution(dist: Any, where: str) -> DelayDistribution:
 
 
 def _expected_delay(delay: float | None, dist: DelayDistribution, where: str) -> float:
+    """Return the expected delay [s]: the one given, or the 0.99 quantile."""
     value = dist.quantile(0.99) if delay is None else delay
     if not (isinstance(value, Real) and math.isfinite(value) and value >= 0):
         raise UsageError(f"{where}: the expected delay must be finite and at least 0 s, got {value!r}")

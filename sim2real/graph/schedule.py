@@ -1,8 +1,8 @@
-"""The timing rules of a graph, once: delays in, timelines out.
+"""The timing rules of a graph, in one place: delays in, timelines out.
 
-Everything is computed and compared in integer ticks (1 us), as ties are the normal case: with delays as expected a
-message arrives exactly when its reader starts. The wall-clock runtime calls the same functions one step at a time with
-measured times; here they act on all episodes at once. ``docs/timing.md`` draws each rule.
+Times are computed and compared in integer ticks (1 us), because ties are the normal case: when all delays are as
+expected, a message arrives exactly when its reader starts. The wall-clock runtime calls the same functions step by step
+with measured times; here they act on all episodes at once. ``docs/timing.md`` states the numbered rules and draws them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,27 @@ from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
 
 
 def slot(node: BaseNode, k: np.ndarray | int, phase: int | None = None) -> np.ndarray:
-    """Return when step ``k`` is scheduled [ticks] (rule 2): ``floor(k * 1e6 / rate + 0.5) + phase``."""
+    """Return when step ``k`` is scheduled [ticks] (rule 2): ``floor(k * 1e6 / rate + 0.5) + phase``.
+
+    Args:
+        node: The node.
+        k: Number of the step, from 0; or an array of them.
+        phase: The node's phase [ticks]; None: computed.
+
+    Returns:
+        int64, of the shape of ``k``.
+    """
     offset = phase_ticks(node) if phase is None else phase
-    # Multiplied before it is divided: then a half stays a half, and is rounded up.
+    # Multiply before dividing: exact halves stay exact and are rounded up.
     return np.floor(np.asarray(k) * TICKS_PER_S / node.rate + 0.5).astype(np.int64) + offset
 
 
 def waits_for_schedule(node: BaseNode) -> bool:
-    """Return whether a step never starts before its slot; False with ``advance`` and only blocking inputs (rule 3)."""
+    """Return whether steps wait for their slot (rule 3): unless ``advance`` is set and all inputs block.
+
+    Raises:
+        UsageError: When ``advance`` is set and no input blocks.
+    """
     if not node.advance:
         return True
     if not any(c.blocking for c in node.inputs.values()):
@@ -40,13 +53,28 @@ def waits_for_schedule(node: BaseNode) -> bool:
 
 
 def start(scheduled, drift, previous_end, blocked_until, waits: bool):  # noqa: ANN001, ANN201
-    """Return a step's start [ticks] (rule 3); every argument is an int or an array of one shape."""
+    """Return a step's start [ticks] (rule 3); times are ints, or int64 arrays of one shape.
+
+    Args:
+        scheduled: The step's slot [ticks].
+        drift: How far the schedule has moved [ticks].
+        previous_end: End of the node's previous step [ticks].
+        blocked_until: Last arrival among the messages that the step waits for; 0 without any [ticks].
+        waits: Whether the step waits for its slot; see ``waits_for_schedule``.
+    """
     free = np.maximum(previous_end, blocked_until)
     return np.maximum(scheduled + drift, free) if waits else free
 
 
 def next_drift(scheduling: Scheduling, scheduled, drift, previous_end):  # noqa: ANN001, ANN201
-    """Return how far the schedule has moved after a step's start is fixed [ticks] (rule 3)."""
+    """Return how far the schedule has moved once a step's start is known [ticks] (rule 3).
+
+    Args:
+        scheduling: What an overrun does to the later steps.
+        scheduled: The step's slot [ticks].
+        drift: How far the schedule had moved before [ticks].
+        previous_end: End of the node's previous step [ticks].
+    """
     if scheduling is Scheduling.PHASE:
         return drift * 0
     return drift + np.maximum(0, previous_end - scheduled - drift)
@@ -59,29 +87,32 @@ def eligible(connection: Connection, received: np.ndarray, first_seq: int = 0) -
         connection: The connection.
         received: Shape ``(..., M)``: arrivals [ticks].
         first_seq: Sequence number of the first message along the last axis.
+
+    Returns:
+        int64, of the shape of ``received``.
     """
     received = np.asarray(received, np.int64)
     if connection.averaged:
-        # A tick averages over the commands that arrive before its output leaves; none of them can depend on it.
+        # A tick averages over the commands that arrive before its output is sent; none of them can depend on it.
         return received - to_ticks(connection.input_node.delay) + 1
     earliest = received + 1 if connection.skip else received
     if connection.jitter is Jitter.BUFFER:
         seq = first_seq + np.arange(received.shape[-1])
         earliest = np.maximum(earliest, slot(connection.output_node, seq, 0) + connection.phase_ticks)
-    return np.maximum.accumulate(earliest, axis=-1)  # in order, always
+    return np.maximum.accumulate(earliest, axis=-1)  # messages are consumed in order
 
 
 def quota(connection: Connection, k: np.ndarray | int) -> np.ndarray:
-    """Return how many messages a blocking input has waited for up to and with step ``k`` (rule 6).
+    """Return how many messages a blocking input has waited for, in total, when step ``k`` starts (rule 6).
 
-    They are those whose sender's nominal start slot is at most the step's slot (before it, with ``skip``).
+    These are the messages whose sender's slot is not later than the slot of step ``k``; with ``skip``, earlier than it.
     """
     limit = slot(connection.input_node, k)
     if connection.skip:
         limit = limit - 1
     sender = connection.output_node
     ahead = limit - phase_ticks(sender)
-    # The inverse of slot() up to rounding: one too many on either side, then counted exactly.
+    # The inverse of slot(), up to rounding: compare the neighbours of the guess exactly.
     guess = np.floor(ahead * (sender.rate / TICKS_PER_S)).astype(np.int64)
     candidates = guess[..., None] + np.arange(-1, 3)
     fits = (candidates >= 0) & (slot(sender, candidates, 0) <= ahead[..., None])
@@ -95,18 +126,19 @@ def draw(
     rng: np.random.Generator | int = 0,
     recorded: Timeline | None = None,
 ) -> Timeline:
-    """Draw timelines: sample every delay, then apply the rules.
+    """Draw timelines: sample all delays, then apply the rules.
 
     Args:
         nodes: The nodes, by name or as a list.
         duration_s: Steps that start before this time belong to the timeline [s].
         episodes: How many timelines; ignored with ``recorded``.
         rng: Generator or seed of the delays.
-        recorded: Vertices and edges that are kept as they are; only what is missing is drawn (say, a simulated world).
+        recorded: Vertices and edges that are kept as they are; only those that are missing, e.g. of a simulated world,
+            are drawn.
 
     Raises:
-        UsageError: On an algebraic loop, a duration that holds no step, ``advance`` without a blocking input, a sender
-            that is not in the graph, or a distribution that draws what is no delay.
+        UsageError: On an algebraic loop, a duration in which a node makes no step, ``advance`` without a blocking
+            input, a sender that is not in the graph, or a distribution whose samples are not valid delays.
     """
     nodes = by_name(nodes)
     check_senders(nodes)
@@ -144,7 +176,7 @@ def derive(
         delays: Node -> computation delays, shape ``(E, N)`` [ticks].
         transfers: (node, input) -> communication delays, shape ``(E, M)`` [ticks].
         duration: Steps that start before this belong to the timeline [ticks].
-        kept: Vertices and edges that are taken as they are.
+        kept: Vertices and edges that are taken as they are, not derived.
     """
     kept = kept or Timeline({}, {})
     vertices = dict(kept.vertices)
@@ -157,7 +189,7 @@ def derive(
     for key in transfers:
         connection = nodes[key[0]].inputs[key[1]]
         sender = connection.output_node.name
-        # Of a blocking input, `received` holds what steps waited for; messages after the last step have arrived too.
+        # For a blocking input `received` has only the messages that steps waited for; here all are needed.
         arrivals = np.maximum.accumulate(vertices[sender].end + transfers[key], axis=1)
         seq_in = consumer(connection, arrivals, vertices[key[0]], vertices[sender])
         edges[key] = Edge(arrivals, seq_in, sender)
@@ -165,10 +197,10 @@ def derive(
 
 
 def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
-    """Apply the rules to the delays that a record shows: what comes out must be the record's own timeline.
+    """Apply the rules to the delays of a recorded episode.
 
-    A start that a step moved itself is taken as given. Whether the record keeps the rules is then one comparison:
-    ``rederive(episode, nodes)`` against ``Timeline.from_episode(episode, nodes)``.
+    The result equals ``Timeline.from_episode(episode, nodes)`` if the recorded run kept the rules. Starts that a step
+    has set itself are copied from the record.
 
     Args:
         episode: A record of all of ``nodes``.
@@ -199,7 +231,17 @@ def at_delay(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex,
 
 
 def consumer(connection: Connection, received: np.ndarray, reader: Vertex, sender: Vertex) -> np.ndarray:
-    """Return which step consumes each message, shape ``(E, M)`` (rule 6); -1 where none does."""
+    """Return which step consumes each message (rule 6).
+
+    Args:
+        connection: The connection.
+        received: Shape ``(E, M)``: arrivals [ticks].
+        reader: The reader's steps.
+        sender: The sender's steps.
+
+    Returns:
+        Shape ``(E, M)``, int64: the reader's step; -1 where no step consumes the message.
+    """
     count = received.shape[1]
     if connection.blocking:
         upto = quota(connection, np.arange(reader.start.shape[1]))
@@ -211,6 +253,7 @@ def consumer(connection: Connection, received: np.ndarray, reader: Vertex, sende
 
 
 def _delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration."""
     last = to_ticks(duration_s) - 1 - phase_ticks(node)
     count = int(np.floor(last * (node.rate / TICKS_PER_S))) + 2 if last >= 0 else 0
     count = int((slot(node, np.arange(count)) <= last + phase_ticks(node)).sum())
@@ -223,7 +266,7 @@ def _delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Gen
 
 
 def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """Return delays in ticks; a distribution may be a user's own."""
+    """Draw delays [ticks] and check them, as the distribution may be a user's own class."""
     seconds = np.asarray(dist.sample(rng, shape))
     if seconds.shape != shape or not np.isfinite(seconds).all() or (seconds < 0).any():
         raise UsageError(
@@ -240,7 +283,10 @@ def _run_in_order(
     vertices: dict[str, Vertex],
     received: dict[tuple[str, str], np.ndarray],
 ) -> None:
-    """Fix starts and ends of all steps (rules 3 to 5): free-running nodes first, blocking ones in slot order."""
+    """Compute starts and ends of all steps (rules 3 to 5); fills ``vertices`` and ``received``.
+
+    Nodes without blocking inputs depend on no message and come first; the others follow step by step, in slot order.
+    """
     linked = []
     for name, busy in delays.items():
         if any(c.blocking for c in nodes[name].inputs.values()):
@@ -262,10 +308,10 @@ def _run_in_order(
 
 
 def _free_running(node: BaseNode, busy: np.ndarray) -> Vertex:
-    """Return the steps of a node that waits for no message."""
+    """Return the steps of a node without blocking inputs."""
     waits = waits_for_schedule(node)
     slots = slot(node, np.arange(busy.shape[1]))
-    if busy.shape[1] < 2 or (busy[:, :-1] <= np.diff(slots)).all():  # no overrun anywhere: the schedule itself
+    if busy.shape[1] < 2 or (busy[:, :-1] <= np.diff(slots)).all():  # no overruns: steps start at their slots
         begin = np.broadcast_to(slots, busy.shape).copy()
         return Vertex(begin, begin + busy, np.full(busy.shape[0], busy.shape[1]))
     begin, end = np.empty_like(busy), np.empty_like(busy)
@@ -300,7 +346,7 @@ class _BlockingRun:
         self.drift = self.previous = np.zeros(busy.shape[0], np.int64)
 
     def step(self, k: int) -> None:
-        """Fix start and end of step ``k``; everything before it in slot order is fixed."""
+        """Compute start and end of step ``k``, once all steps of earlier slots are known."""
         blocked = np.zeros_like(self.previous)
         for connection, upto in self.inputs:
             blocked = np.maximum(blocked, self._last_arrival(connection, int(upto[k])))
@@ -310,7 +356,10 @@ class _BlockingRun:
         self.vertex.start[:, k], self.vertex.end[:, k] = begin, self.previous
 
     def _last_arrival(self, connection: Connection, upto: int) -> np.ndarray:
-        """Return when the last message of this step's group arrives: 0 without one, never if nobody sends it."""
+        """Return the last arrival [ticks] among messages up to number ``upto``; 0 if the step waits for no new one.
+
+        ``NEVER`` if the sender does not send that many.
+        """
         key = (self.node.name, connection.name)
         ends = self.vertices[connection.output_node.name].end
         if key not in self.received:
@@ -328,7 +377,7 @@ class _BlockingRun:
 
 
 def topological(nodes: Mapping[str, BaseNode]) -> list[str]:
-    """Return node names so that every sender of a connection that is not skipped comes before its reader."""
+    """Return the node names in an order in which senders come before readers; skipped connections do not count."""
     order: list[str] = []
 
     def visit(node: BaseNode) -> None:
@@ -340,6 +389,6 @@ def topological(nodes: Mapping[str, BaseNode]) -> list[str]:
         order.append(node.name)
 
     for node in nodes.values():
-        phase_ticks(node)  # names the loop, if there is one
+        phase_ticks(node)  # raises an error that names the loop, if there is one
         visit(node)
     return order

@@ -18,7 +18,7 @@ from sim2real.graph.node import BaseNode, Connection, to_ticks
 
 _FORMAT = 2
 NEVER = np.int64(2**60)
-"""When a step starts, or a message arrives, that there is none of [ticks]."""
+"""Time of a step or a message that does not exist [ticks]."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Vertex:
     """The steps of one node; times in ticks [us] from the episode's start.
 
     Attributes:
-        start: Shape ``(E, N)``, int64.
+        start: Shape ``(E, N)``, int64. Entries after an episode's last step are padding, in increasing order.
         end: Shape ``(E, N)``, int64.
-        count: Shape ``(E,)``: how many steps each episode has; what stands behind them in ``start`` only increases.
+        count: Shape ``(E,)``: how many steps each episode has.
     """
 
     start: np.ndarray
@@ -41,9 +41,10 @@ class Edge:
     """The messages of one connection.
 
     Attributes:
-        received: Shape ``(E, M)``, int64 [ticks]; message m is the sender's step m, sent at its end.
+        received: Shape ``(E, M)``, int64: arrivals [ticks]. Message m is the output of the sender's step m, sent at
+            the end of that step.
         seq_in: Shape ``(E, M)``, int64: the reader's step that consumed it; -1 if none did.
-        sender: The node whose messages these are.
+        sender: The sender's name.
     """
 
     received: np.ndarray
@@ -60,7 +61,7 @@ class Timeline:
 
     @property
     def episodes(self) -> int:
-        """How many episodes there are."""
+        """Number of episodes E."""
         return next((len(v.count) for v in self.vertices.values()), 0)
 
     def __getitem__(self, index: slice | np.ndarray | Sequence[int]) -> Timeline:
@@ -71,7 +72,11 @@ class Timeline:
         )
 
     def filter(self, names: Iterable[str]) -> Timeline:
-        """Keep some nodes, and the edges between them."""
+        """Return the timeline of some of the nodes, with the edges between them.
+
+        Raises:
+            UsageError: When a name is not in the timeline.
+        """
         names = set(names)
         missing = names - set(self.vertices)
         if missing:
@@ -85,13 +90,17 @@ class Timeline:
 
     @staticmethod
     def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
-        """Return the timeline of one recorded episode (E = 1): of those ``nodes`` that the record holds.
+        """Return the timeline of one recorded episode (E = 1).
+
+        Args:
+            episode: The record.
+            nodes: The nodes by name; those that are not in the record, and connections to them, are left out.
 
         Messages whose delay is trainable arrive at its least value, as in a timeline that is drawn: the record has them
         at the delay of that time, and windows need them for any.
 
         Raises:
-            UsageError: When it holds none of them, or messages of a connection that the nodes do not have.
+            UsageError: When the record has none of the nodes.
         """
         vertices, edges = {}, {}
         present = [n for n in nodes if n in episode.steps]
@@ -111,7 +120,7 @@ class Timeline:
 
     @staticmethod
     def stack(timelines: Sequence[Timeline]) -> Timeline:
-        """Join timelines of the same graph along the episodes; shorter ones are padded."""
+        """Return one timeline with the episodes of several timelines of the same graph; shorter ones are padded."""
         if not timelines:
             raise UsageError("no timelines to stack")
         first = timelines[0]
@@ -178,15 +187,16 @@ class Timeline:
     def cut(
         self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None
     ) -> tuple[Timeline, dict[str, np.ndarray]]:
-        """Cut one episode into segments whose time starts at 0 each.
+        """Cut one episode into segments; in each, time starts at 0.
 
         Args:
-            begins: Where the segments start [ticks].
-            length: Their length [ticks].
-            lead: Node -> how long before the start its steps are kept as well, at negative times [ticks].
+            begins: Starts of the segments [ticks].
+            length: Length of every segment [ticks].
+            lead: Node -> how long before the segment's start its steps are kept as well, at negative times [ticks].
 
         Returns:
-            The segments as episodes, and for each node the sequence number that its step 0 had, shape ``(E,)``.
+            The segments as E episodes; and for each node, shape ``(E,)``, which step of the original episode is step 0
+            of each segment.
 
         Raises:
             UsageError: When the timeline has more than one episode.
@@ -202,6 +212,7 @@ class Timeline:
         return Timeline.stack(parts), firsts
 
     def _part(self, firsts: Mapping[str, int], begin: int, length: int) -> Timeline:
+        """Return one segment; ``firsts`` has the first step of each node that belongs to it."""
         vertices, edges = {}, {}
         last: dict[str, int] = {}
         for n, v in self.vertices.items():
@@ -213,7 +224,7 @@ class Timeline:
         for (n, i), e in self.edges.items():
             take = slice(firsts[e.sender], last[e.sender])
             seq_in = e.seq_in[:, take]
-            # What an earlier step consumed stands in the window of the first step of the segment.
+            # A message that was consumed before the segment's first step is in the window of that step.
             inside = (seq_in >= 0) & (seq_in < last[n])
             seq_in = np.where(inside, np.maximum(seq_in - firsts[n], 0), -1)
             edges[n, i] = Edge(e.received[:, take] - begin, seq_in, e.sender)
@@ -221,12 +232,12 @@ class Timeline:
 
 
 def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
-    """Return an edge with one message for each of the sender's steps; a damaged record may lack some."""
+    """Return an edge (E = 1) with one entry for each of the ``sent`` messages; a damaged record may lack some."""
     received, seq_in = np.full(sent, NEVER), np.full(sent, -1, np.int64)
     known = messages.seq_out < sent
     received[messages.seq_out[known]] = messages.received[known]
     seq_in[messages.seq_out[known]] = messages.seq_in[known]
-    # In order, always: what comes behind a message that is lost, or that no recorded step consumed, counts as lost too.
+    # Messages are consumed in order: after one that is lost, or that no recorded step consumed, all count as lost.
     lost = np.logical_or.accumulate((seq_in < 0) | (seq_in >= steps))
     return Edge(received[None], np.where(lost, -1, seq_in)[None], sender)
 
@@ -243,7 +254,7 @@ def _at_least_delay(connection: Connection, edge: Edge, episode: Episode, vertic
 
 
 def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "right"] = "left") -> np.ndarray:
-    """Do ``np.searchsorted`` in each row at once.
+    """Apply ``np.searchsorted`` to every row.
 
     Args:
         rows: Shape ``(E, N)``, int64, not decreasing along the last axis.
@@ -254,7 +265,8 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
         Shape ``(E, M)``: where each value belongs in its row.
     """
     low = min(int(rows.min(initial=0)), int(values.min(initial=0)))
-    # What never happens stands at NEVER: cut down to just above everything that does, so that the sum fits 64 bits.
+    # Rows are searched as one sorted array, each lifted above the one before. NEVER is replaced by a time just above
+    # all others, so that the lifted values fit into 64 bits.
     real = [a[a < NEVER // 2] for a in (rows, values)]
     high = max(int(a.max(initial=0)) for a in real) + 2
     lift = (np.arange(len(rows), dtype=np.int64) * (high - low + 1))[:, None]
@@ -267,5 +279,6 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
 
 
 def _pad(arrays: Sequence[np.ndarray], value: np.int64) -> np.ndarray:
+    """Join arrays ``(E_i, N_i)`` along the episodes, after padding each to the largest width."""
     width = max(a.shape[1] for a in arrays)
     return np.concatenate([np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=value) for a in arrays])

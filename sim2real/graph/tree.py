@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 
 def tree_dynamic_slice(tree: Any, start_indices: jax.Array) -> Any:
-    """Take one element per leading axis, clamped at the ends, keeping those axes with length one.
+    """Take one element along each of the leading axes, which stay as axes of length one; indices are clamped.
 
     Args:
         tree: A pytree; every leaf has at least ``len(start_indices)`` leading axes.
@@ -30,5 +30,5 @@ def tree_dynamic_slice(tree: Any, start_indices: jax.Array) -> Any:
 
 
 def strong(tree: Any) -> Any:
-    """Give every leaf a strong dtype, so that a scan's carry keeps its type."""
+    """Return the tree without JAX's weak types, which would change the type of a scan's carry."""
     return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)

@@ -1,4 +1,4 @@
-"""What stands in a reader's window, worked out from a timeline."""
+"""Which messages are in a reader's window, computed from a timeline."""
 
 from __future__ import annotations
 
@@ -12,26 +12,32 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, to_ticks
 from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
 
 _ROUNDING = 2
-"""By how much slots that are rounded one by one may lie closer together than their period [ticks]."""
+"""Each slot is rounded to whole ticks, so the distance of two may be this much smaller than the period [ticks]."""
 
 
 def newest_message(edge: Edge, reader: Vertex) -> np.ndarray:
-    """Return the newest message that each step of the reader has consumed, shape ``(E, N)``; -1 before the first."""
+    """Return the newest message that the reader has consumed by each step, shape ``(E, N)``; -1 before the first."""
     steps = np.broadcast_to(np.arange(reader.start.shape[1], dtype=np.int64), reader.start.shape)
     return search_rows(np.where(edge.seq_in < 0, NEVER, edge.seq_in), steps, "right") - 1
 
 
 def longest_burst(edge: Edge, reader: Vertex) -> int:
-    """Return the most messages that one step after the first has consumed at once."""
+    """Return the largest number of messages that one step consumes; the first step does not count."""
     newest = np.where(np.arange(reader.start.shape[1]) < reader.count[:, None], newest_message(edge, reader), -1)
     return int(np.diff(newest, axis=1).max(initial=0))
 
 
 def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex) -> np.ndarray:
-    """Return at which steps a trainable delay near its upper bound needs messages that have left the window.
+    """Return the steps at which a trainable delay may need messages that are no longer in the window.
 
-    The window holds what a sender that keeps its rate sends within the bounds. In a burst it holds less time than that;
-    what is in it may then not have arrived yet at the largest delay, and would be a message from the future.
+    The window is long enough for a sender that keeps its rate. When messages come in a burst, the same number of
+    messages spans less time: at the largest delay, the one that a step should read has then been pushed out.
+
+    Args:
+        connection: The connection; without a trainable delay no step is affected.
+        edge: Its messages.
+        reader: The reader's steps.
+        sender: The sender's steps.
 
     Returns:
         Shape ``(E, N)``, bool.
@@ -39,7 +45,7 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
     dist = connection.delay_dist
     if not isinstance(dist, TrainableDist):
         return np.zeros(reader.start.shape, bool)
-    # The newest message that must have arrived whatever the delay is; of a mean, the one that holds at the start.
+    # The newest message that is read at the largest delay (for a mean: that holds at the start) if all are on time.
     oldest = newest_message(edge, reader) - (connection.total_window - connection.window)
     if not (edge.seq_in.shape[1] and reader.start.shape[1]):
         return np.zeros(reader.start.shape, bool)
@@ -49,7 +55,7 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
 
 
 def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.ndarray:
-    """Return which episodes have bursts that a window widened for a trainable delay does not hold, ``(E,)``, bool."""
+    """Return which episodes have a burst that is too long for the window of a trainable delay, ``(E,)``, bool."""
     bursty = np.zeros(timeline.episodes, bool)
     for (name, input_name), edge in timeline.edges.items():
         connection = nodes[name].inputs[input_name]
@@ -58,10 +64,10 @@ def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.nda
 
 
 def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
-    """Check that no trainable delay within its bounds ever meets a window that is too short.
+    """Check that every window is long enough for every trainable delay within its bounds.
 
     Raises:
-        UsageError: The first place where one would.
+        UsageError: Naming the first step where a window is too short, and how many there are.
     """
     for (name, input_name), edge in timeline.edges.items():
         if name not in nodes or input_name not in nodes[name].inputs:

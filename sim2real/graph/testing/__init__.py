@@ -1,4 +1,4 @@
-"""What a test of nodes and runtimes needs: nodes that give wrong messages away, the rules by the letter, suites."""
+"""For tests of nodes and runtimes: conformance suites, hash nodes, random graphs and a reference of the rules."""
 
 from sim2real.graph.testing.conformance import NodeConformance as NodeConformance
 from sim2real.graph.testing.conformance import Played as Played

@@ -1,4 +1,4 @@
-"""Suites to inherit: what holds for every node, and for every runtime."""
+"""Test suites to inherit: what every node and every runtime must fulfil."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from sim2real.graph.timeline import Timeline
 
 
 def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -> StepState:
-    """Return what a node's first step gets when nothing has arrived yet.
+    """Return the step state of a node's first step, before any message has arrived.
 
     Args:
         nodes: The node and its senders, by name.
         name: The node.
-        key: JAX key.
+        key: JAX key of parameters, states and default outputs.
     """
     keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}
     gs = GraphState()
@@ -47,19 +47,19 @@ def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -
 
 
 class NodeConformance(ABC):
-    """What every node keeps to. Inherit in a test module, under a name that starts with ``Test``."""
+    """Tests that every node must pass. Inherit in a test module, under a name that starts with ``Test``."""
 
     @abstractmethod
     def graph(self) -> tuple[Mapping[str, BaseNode], str]:
-        """Return the node, connected, with its senders, by name; and its name."""
+        """Return the connected node and its senders, by name; and the name of the node to test."""
 
     def given(self) -> tuple[BaseNode, StepState, Mapping[str, BaseNode]]:
-        """Return node, step state and all nodes."""
+        """Return the node, its first step state, and all nodes by name."""
         nodes, name = self.graph()
         return nodes[name], first_step_state(nodes, name, jax.random.key(0)), nodes
 
     def test_the_step_is_pure(self) -> None:
-        """The same step state gives the same results, and is left alone."""
+        """The same step state gives the same results and is not modified."""
         node, given, _ = self.given()
         before = copy.deepcopy(jax.tree_util.tree_map(np.asarray, _without_keys(given)))
         first, second = node.step(given), node.step(given)
@@ -67,14 +67,14 @@ class NodeConformance(ABC):
         assert _equal(before, _without_keys(given)), f"node {node.name!r}: step changed what it was given"
 
     def test_the_step_keeps_structure_shapes_and_dtypes(self) -> None:
-        """State, parameters and key go out as they came in: a compiled program carries them."""
+        """State, parameters and key keep structure, shapes and dtypes: a compiled loop carries them."""
         node, given, _ = self.given()
         after, _ = node.step(given)
         for field in ("state", "params", "rng"):
             _same_form(getattr(given, field), getattr(after, field), f"node {node.name!r}: {field}")
 
     def test_the_output_looks_like_the_default_output(self) -> None:
-        """Readers find both in one window."""
+        """Output and default output have the same structure: a reader's window holds both."""
         node, given, nodes = self.given()
         gs = GraphState(
             params={n: x.init_params(jax.random.key(1)) for n, x in nodes.items()}, state={node.name: given.state}
@@ -88,7 +88,7 @@ class NodeConformance(ABC):
         assert _equal(_without_keys(one), _without_keys(two)), f"node {node.name!r}: init is not reproducible"
 
     def test_the_step_can_be_compiled(self) -> None:
-        """Unless the node says that it cannot."""
+        """JAX can trace the step, unless ``jittable`` is False."""
         node, given, _ = self.given()
         if node.jittable:
             _same_form(jax.eval_shape(node.step, given)[1], node.step(given)[1], f"node {node.name!r}: traced output")
@@ -109,20 +109,28 @@ class Played(NamedTuple):
 
 
 class RuntimeConformance(ABC):
-    """What every runtime that plays timelines keeps to: every step sees the messages that the rules say."""
+    """Tests that every runtime must pass: each step sees exactly the messages that the timing rules say."""
 
     make: MakeNode = staticmethod(hash_node)
     """Makes the hash nodes, in Python or in JAX."""
     seeds: Sequence[int] = range(8)
-    """The random graphs."""
+    """Seeds of the random graphs."""
     duration_s: float = 0.4
+    """Length of an episode [s]."""
 
     @abstractmethod
     def play(self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, episode: int) -> Played:
-        """Play one episode of a timeline."""
+        """Play one episode of a timeline in the runtime under test.
+
+        Args:
+            nodes: The nodes by name.
+            supervisor: Name of the supervisor.
+            timeline: The timelines to play.
+            episode: Which of them.
+        """
 
     def test_every_step_sees_what_the_rules_say(self) -> None:
-        """Hashes over all that was seen, against the rules by the letter."""
+        """The hash of everything a node has seen equals that of the reference implementation."""
         for seed in self.seeds:
             nodes = random_graph(seed, make=type(self).make)
             timeline = draw(nodes, self.duration_s, 2, seed)
@@ -141,7 +149,7 @@ def _replace(gs: GraphState, /, **fields: Any) -> GraphState:
 
 
 def _without_keys(tree: Any) -> Any:
-    """Return the tree with keys as the numbers they are made of."""
+    """Return the tree with JAX keys replaced by their raw numbers."""
 
     def one(leaf: Any) -> Any:
         is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

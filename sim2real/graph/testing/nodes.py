@@ -1,4 +1,4 @@
-"""Nodes that give any wrong message away, and random graphs of them."""
+"""Hash nodes, whose output reveals any wrong message that they were given, and random graphs of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Value(Base):
 
 
 def mix(a: int, b: int) -> int:
-    """Mix two 32-bit integers; the order of the mixed values matters."""
+    """Return a 32-bit hash of two 32-bit integers; it depends on their order."""
     return ((a ^ (b & _MASK)) * _PRIME + _OFFSET) & _MASK
 
 
@@ -34,7 +34,7 @@ def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) 
 
     Args:
         state: The state before.
-        seq: Which step it is.
+        seq: Number of the step.
         windows: For each input, in the order of their names: seq and value of each message, oldest first.
     """
     acc = mix(state, seq)
@@ -45,17 +45,17 @@ def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) 
 
 
 class HashInPython(BaseNode):
-    """Its state depends on everything that it was given: every slot of every window, in order."""
+    """A hash node in Python: its state is a hash of every entry of every window of all its steps."""
 
     jittable = False
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return a number made of the node's name."""
+        """Return a hash of the node's name."""
         del rng, graph_state
         return jnp.uint32(zlib.crc32(self.name.encode()))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
-        """Return a random number: readers must all get the same one."""
+        """Return a random number; all readers must get the same one."""
         del graph_state
         return Value(x=jax.random.bits(rng, (), jnp.uint32))
 
@@ -70,7 +70,7 @@ class HashInPython(BaseNode):
 
 
 class HashInJax(HashInPython):
-    """The same in JAX."""
+    """A hash node in JAX; same numbers as ``HashInPython``."""
 
     jittable = True
 
@@ -97,7 +97,7 @@ class HashWorldInJax(HashInJax, BaseWorld):
 
 
 class Contraction(BaseNode):
-    """Moves halfway to the mean of what it sees: float messages whose rounding errors die out."""
+    """A node with float messages whose state contracts, so that rounding differences between runtimes die out."""
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a random number."""
@@ -110,7 +110,7 @@ class Contraction(BaseNode):
         return Value(x=jax.random.normal(rng))
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Move, under a push that differs from step to step."""
+        """Move towards the mean of the inputs, plus a term that differs from step to step."""
         seen = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
         target = sum(seen) / max(len(seen), 1)
         state = 0.5 * step_state.state + 0.4 * target + jnp.sin(1.3 * step_state.seq)
@@ -125,35 +125,63 @@ class MakeNode(Protocol):
     """Makes a node, or a world, of a random graph."""
 
     def __call__(self, name: str, rate: float, world: bool, **options: Any) -> BaseNode:
-        """Return the node; ``options`` are those of ``BaseNode``, none for a world."""
+        """Return the node.
+
+        Args:
+            name: Unique in the graph.
+            rate: Steps per second [Hz].
+            world: Whether to make a world.
+            options: Of ``BaseNode``; none for a world.
+        """
         ...
 
 
 def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
-    """Return a hash node or world in plain Python."""
+    """Return a hash node in plain Python.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        world: Whether it is a world.
+        options: Of ``BaseNode``; not used by a world.
+    """
     return HashWorldInPython(name, rate) if world else HashInPython(name, rate, **options)
 
 
 def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
-    """Return a hash node or world in JAX."""
+    """Return a hash node in JAX.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        world: Whether it is a world.
+        options: Of ``BaseNode``; not used by a world.
+    """
     return HashWorldInJax(name, rate) if world else HashInJax(name, rate, **options)
 
 
 def contracting_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
-    """Return a contracting node or world."""
+    """Return a node with float messages.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        world: Whether it is a world.
+        options: Of ``BaseNode``; not used by a world.
+    """
     return ContractingWorld(name, rate) if world else Contraction(name, rate, **options)
 
 
 def random_graph(seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node) -> Any:
-    """Return nodes by name with random rates, delays and connections; the first is a fine supervisor.
+    """Return nodes by name with random rates, delays and connections; the first one can be the supervisor.
 
-    Delays are multiples of 0.1 ms and often as expected, so ties happen; some exceed a period by far, so steps
-    overrun and messages come in bursts. Every kind of option occurs; loops run through skipped connections.
+    Delays are multiples of 0.1 ms and often equal to the expected ones, so ties occur; some are several periods long,
+    so steps overrun and messages come in bursts. All options of connections occur; loops have a skipped connection.
 
     Args:
-        seed: Of everything that is random.
-        size: Nodes that are no worlds, 1 to 6; default: random.
-        worlds: Worlds, 0 to 2; default: random.
+        seed: Seed of all random choices.
+        size: Number of nodes that are not worlds, 1 to 6; default: random.
+        worlds: Number of worlds, 0 to 2; default: random.
         make: Makes the nodes.
     """
     rng = np.random.default_rng(seed)
@@ -175,13 +203,13 @@ def random_graph(seed: int, size: int | None = None, worlds: int | None = None, 
 
 
 def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNode, skip: bool) -> None:
-    """Connect two nodes with random options, now and then twice.
+    """Connect two nodes with random options, sometimes twice.
 
     Args:
         rng: Source of the options.
-        reader: A world's inputs never block: its tick waits for nobody.
-        sender: Any node.
-        skip: Whether the connection must be skipped; otherwise it sometimes is.
+        reader: The node that reads; if it is a world, its inputs do not block.
+        sender: The node that sends.
+        skip: True: the connection is skipped; False: it may be.
     """
     for name in (None, f"{sender.name} again")[: 2 if rng.random() < 0.15 else 1]:
         reader.connect(
@@ -196,7 +224,7 @@ def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNo
 
 
 def _delays(rng: np.random.Generator, rate: float, at_least: float) -> dict[str, Any]:
-    """Return delays [s]: as expected, or jittery, or with hiccups of several periods."""
+    """Return delay options: constant, or random, or random with hiccups of several periods."""
     kind = rng.random()
     scale = float(rng.uniform(0.05, 0.4)) / rate
     if kind < 0.35:

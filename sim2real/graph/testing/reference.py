@@ -1,4 +1,4 @@
-"""The timing rules by the letter: Python integers, one message at a time. Slow, and independent of schedule.py."""
+"""A second, slow implementation of the timing rules, message by message in Python integers, to test schedule.py."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sim2real.graph.timeline import Timeline
 
 
 class Reference:
-    """One episode of a graph, worked out from nothing but its delays.
+    """One episode of a graph, computed from its delays alone.
 
     Args:
         nodes: The nodes by name.
-        timeline: Where the delays are taken from: computation, communication, and how many steps there are.
-        episode: Which of its episodes.
+        timeline: Source of the computation and communication delays and of the number of steps.
+        episode: Index of the episode in ``timeline``.
 
     Attributes:
         starts: Node -> start of each step [ticks].
@@ -44,19 +44,19 @@ class Reference:
         self.seq_in = {(n, i): self._consumers(c) for n, node in nodes.items() for i, c in node.inputs.items()}
 
     def phase(self, node: BaseNode) -> int:
-        """Rule 1 [ticks]."""
+        """Return a node's phase [ticks] (rule 1)."""
         return max([0, *(self.arrival(c) for c in node.inputs.values() if not c.skip)])
 
     def arrival(self, c: Connection) -> int:
-        """Rule 1, of a connection [ticks]."""
+        """Return the phase of a connection: the nominal arrival of its first message [ticks] (rule 1)."""
         return self.phase(c.output_node) + round(c.output_node.delay * 1e6) + round(c.delay * 1e6)
 
     def slot(self, node: BaseNode, k: int) -> int:
-        """Rule 2 [ticks]."""
+        """Return the slot of step ``k`` [ticks] (rule 2)."""
         return math.floor(Fraction(k * 1_000_000) / Fraction(node.rate) + Fraction(1, 2)) + self._phases[node.name]
 
     def group(self, c: Connection, k: int) -> list[int]:
-        """Rule 6, blocking: the messages that step ``k`` waits for."""
+        """Return the messages of a blocking input that step ``k`` waits for (rule 6)."""
         out, high = [], self.slot(c.input_node, k)
         low = self.slot(c.input_node, k - 1) if k else None
         for i in range(len(self.busy[c.output_node.name])):
@@ -69,7 +69,7 @@ class Reference:
         return out
 
     def received(self, c: Connection, i: int) -> int:
-        """Rule 5 [ticks]."""
+        """Return when message ``i`` is received [ticks] (rule 5)."""
         key = c.input_node.name, c.name
         known = self._received[key]
         while len(known) <= i:
@@ -79,7 +79,14 @@ class Reference:
         return known[i]
 
     def window(self, node: str, name: str, k: int, width: int) -> list[int]:
-        """Rule 7: the messages that step ``k`` sees on an input, oldest first; -1 in empty slots."""
+        """Return the messages that a step sees on an input, oldest first; -1 in empty slots (rule 7).
+
+        Args:
+            node: The reader's name.
+            name: The input's name.
+            k: Number of the step.
+            width: Length of the window.
+        """
         seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k][-width:]
         return [-1] * (width - len(seen)) + seen
 
@@ -92,7 +99,7 @@ class Reference:
         """
         made: dict[str, list[int]] = {n: [] for n in self.nodes}
         order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
-        while order:  # of steps at one time, those first that need none of the others
+        while order:  # steps that start at the same time may need each other's outputs: repeat until all are done
             waiting = []
             for t, k, n in order:
                 windows = []
@@ -115,6 +122,7 @@ class Reference:
         return {n: self.phase(node) for n, node in self.nodes.items()}
 
     def _advance(self, name: str) -> bool:
+        """Compute start and end of a node's next step (rules 3 and 4); False if it has none or cannot be known yet."""
         node, starts, ends = self.nodes[name], self.starts[name], self.ends[name]
         k, blocked = len(starts), 0
         if k == len(self.busy[name]):
@@ -137,6 +145,7 @@ class Reference:
         return True
 
     def _consumers(self, c: Connection) -> list[int]:
+        """Return which step consumes each message; -1 if none does."""
         name = c.input_node.name
         sent = self.count[c.output_node.name]
         out, head = [-1] * sent, 0
@@ -148,7 +157,7 @@ class Reference:
         return out
 
     def _takes(self, c: Connection, k: int, message: int) -> bool:
-        """Rule 6, non-blocking: whether step ``k`` takes this message, if it has taken those before."""
+        """Return whether step ``k`` takes a message of a non-blocking input, all earlier ones being taken (rule 6)."""
         t, r = self.starts[c.input_node.name][k], self.received(c, message)
         if c.averaged:
             return r < t + round(c.input_node.delay * 1e6)
