@@ -1,4 +1,4 @@
-"""AsyncGraph: a graph whose nodes step one by one, on the wall clock or on a simulated one."""
+"""AsyncGraph: runs the nodes of a graph step by step, on the wall clock or on a simulated clock."""
 
 from __future__ import annotations
 
@@ -29,36 +29,37 @@ from sim2real.runtime.stepper import Stepper
 from sim2real.runtime.wallclock import WallClockRun
 
 _INTERRUPTED_S = 1.0
-"""How long nodes have for their stop when a start is interrupted [s]."""
+"""Time that the nodes' ``stop`` may take when a start is interrupted, e.g. by Ctrl-C [s]."""
 
 
 class AsyncGraph:
     """Runs a graph: on hardware in real time, or in simulation in the order of events.
 
-    Two ways to run it. ``start`` and then ``run_for`` or ``wait``: the supervisor makes its own steps. Or, like a gym
-    environment, ``reset`` and then ``step``: each returns what the supervisor sees at its next step, and the caller
-    provides the output. ``with graph:`` stops it on the way out; so does the interpreter's exit.
+    There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor makes
+    its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from the caller
+    and returns what the supervisor sees at its next step. The graph stops when ``with graph:`` is left and when the
+    interpreter exits.
 
-    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step, and the
-    call that waits, or else the next one, raises it with the node's name. A step that hangs is a failure, too: its
-    node's ``stop`` is then called from outside, as is that of a node whose startup outlives the graph.
+    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The call
+    that is waiting raises the failure with the node's name; if none is waiting, the next call does. A step that hangs
+    is a failure too; as its thread is busy, the node's ``stop`` is then called from another thread. The same is done
+    for a node that is still in its startup when the graph stops.
 
     Args:
         nodes: The nodes, by name or as a list.
-        supervisor: The node at whose steps ``reset``, ``step`` and ``run`` hand over.
-        clock: What moves time.
-        real_time_factor: Simulated seconds a second, at most; 0: as fast as possible. Simulated clock only.
-        recorder: Takes what happens.
-        duration_s: How long drawn timelines are [s]. Simulated clock only; needed unless ``timeline`` is given.
-        timeline: What happens when; the graph state's ``eps`` selects the episode. Simulated clock only.
+        supervisor: The node whose steps the caller of ``reset``, ``step`` and ``run`` sees, usually the policy.
+        clock: The wall clock or the simulated clock.
+        real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
+        recorder: Receives all steps and messages.
+        duration_s: Length of drawn timelines [s]. Simulated clock only; needed unless ``timeline`` is given.
+        timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: How long a call waits for the next step, and the supervisor for its caller [s].
-        spin_s: How long threads poll before a step instead of sleeping [s]. Wall clock only.
-        step_timeout_s: How long a step of any node may take before it counts as hanging, which stops the graph [s]; 0:
-            as long as it likes; default: ten periods of its node, at least 1 s. What the caller takes for a step does
-            not count. Wall clock only.
+        spin_s: How long before each step a thread polls the clock instead of sleeping [s]. Wall clock only.
+        step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
+            default: ten periods of its node, at least 1 s. The caller's own time does not count. Wall clock only.
 
     Raises:
-        UsageError: When the nodes form no graph or an option does not go with the clock.
+        UsageError: When the nodes do not form a graph, or an option does not fit the clock.
     """
 
     def __init__(
@@ -92,18 +93,25 @@ class AsyncGraph:
     def init(
         self, rng: jax.Array, params: Mapping[str, Any] | None = None, order: Sequence[str] | None = None
     ) -> GraphState:
-        """Return the state in which the graph starts, see ``init_graph_state``."""
+        """Return the state in which the graph starts; see ``init_graph_state``.
+
+        Args:
+            rng: A JAX key.
+            params: Parameters that are used as given; the other nodes' come from ``init_params``.
+            order: Names of nodes that are initialised first.
+        """
         return init_graph_state(self.nodes, self.supervisor, rng, params, order)
 
     def warmup(self, graph_state: GraphState, jit_step: bool | Mapping[str, bool] = True) -> None:
-        """Compile all steps ahead of time for graph states like this one, unless that is done.
+        """Compile all steps ahead of time for graph states like this one, unless they are compiled already.
 
-        Pure steps run once, and the result is dropped; a step with a callback, or in plain Python, does not run.
+        A step without side effects is then run once and its result dropped, which fills caches. A step with a callback
+        or in plain Python is not run.
 
         Args:
             graph_state: As ``init`` returns it.
-            jit_step: Whether steps are compiled: of all nodes, or by name (default: True). Nodes with
-                ``jittable = False`` never are.
+            jit_step: Whether to compile the steps: one value for all nodes, or node name -> value (True for nodes that
+                are not named). Nodes with ``jittable = False`` are never compiled.
 
         Raises:
             UsageError: When a step's results do not fit its node's state or default output.
@@ -126,7 +134,7 @@ class AsyncGraph:
 
         Raises:
             UsageError: When the graph is running.
-            Sim2RealError: When a startup failed, or another thread stopped the graph meanwhile; all nodes are stopped
+            Sim2RealError: When a startup failed, or another thread stopped the graph meanwhile. All nodes are stopped
                 then.
         """
         if self.running:
@@ -134,12 +142,12 @@ class AsyncGraph:
         self._start(graph_state, own=True, timeout_s=timeout_s)
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Stop the graph, from any state and any thread; does nothing when it is stopped.
+        """Stop the graph; may be called at any time and from any thread. Does nothing if it is stopped already.
 
-        A graph that is being started ends as well: when this returns, no startup runs or will run.
+        A start in progress is ended too: after this call no node's startup is running or will run.
 
         Raises:
-            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
+            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or that a node did not end.
         """
         atexit.unregister(self.stop)
         with self._lock:
@@ -149,27 +157,28 @@ class AsyncGraph:
             run.stop(timeout_s)
 
     def run_for(self, duration_s: float) -> GraphState:
-        """Let the running graph run on, the supervisor making its own steps, and return its state.
+        """Let the graph run for a while, the supervisor making its own steps, and return the graph's state.
 
-        On the simulated clock all steps that start within the next ``duration_s`` are made. Returns early when
-        another thread stops the graph. After ``reset``, the next step is offered to the caller again.
+        On the simulated clock all steps are made that start within the next ``duration_s`` seconds. Returns early if
+        another thread stops the graph. If the graph was started with ``reset``, the caller makes the steps again
+        afterwards.
         """
         run = self._running()
         run.run_for(duration_s)
         return run.snapshot()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the running graph ends: it is stopped, or the simulated timeline is over.
+        """Wait until the graph is stopped, or the end of the simulated timeline is reached.
 
         Returns:
-            Whether it ended in time.
+            False if the time was up before that.
         """
         if self._run is None:
             raise UsageError("the graph is not running", hint="call start() first")
         return self._run.wait(timeout_s)
 
     def reset(self, graph_state: GraphState, timeout_s: float = 60.0) -> tuple[GraphState, StepState]:
-        """Start an episode, stopping one that runs, and return what the supervisor sees at its first step."""
+        """Start an episode, after stopping a running one; return what the supervisor sees at its first step."""
         self.stop()
         run = self._start(graph_state, own=False, timeout_s=timeout_s)
         step_state = run.observe(self._timeout_s)
@@ -181,13 +190,14 @@ class AsyncGraph:
         """Make the supervisor's step and return what it sees at its next one.
 
         Args:
-            graph_state: What the call before returned; the nodes keep their own states while the graph runs.
-            step_state: The supervisor's step state after the step; None: as it was.
+            graph_state: Not used, as the nodes keep their own states while the graph runs; here to have the signature
+                of ``CompiledGraph.step``.
+            step_state: The supervisor's step state after the step; None: unchanged.
             output: The step's output; None: the supervisor makes the step itself.
 
         Raises:
-            UsageError: Before ``reset``, past the end of the timeline, or when the output does not look like the
-                supervisor's default output (the step is still on offer then).
+            UsageError: Before ``reset``, past the end of the timeline, or when the output does not have the form of the
+                supervisor's default output (the same step can then be made again).
             GraphTimeout: When there was no next step in time.
         """
         del graph_state
@@ -198,7 +208,10 @@ class AsyncGraph:
         return run.snapshot(), observed
 
     def run(self, graph_state: GraphState) -> GraphState:
-        """Run the graph to the end of the supervisor's next step, which it makes itself; start it if need be."""
+        """Run the graph to the end of the supervisor's next step, which the supervisor makes itself.
+
+        Starts the graph from ``graph_state`` if it is not running.
+        """
         run = self._run if self.running and self._run else self._restart(graph_state)
         run.observe(self._timeout_s)
         run.settle(run.reply(Reply()), self._timeout_s)
@@ -206,18 +219,18 @@ class AsyncGraph:
 
     @property
     def running(self) -> bool:
-        """Whether an episode is on."""
+        """Whether an episode is running."""
         return self._run is not None and not self._run.ended
 
     @property
     def graph_state(self) -> GraphState:
-        """The graph's state as of each node's last finished step, in the episode that runs or was the last."""
+        """The state of the running episode, or of the last one, after the last finished step of each node."""
         if self._run is None:
             raise UsageError("the graph has not run", hint="call start() or reset()")
         return self._run.snapshot()
 
     def statistics(self) -> dict[str, NodeStatistics]:
-        """Return how well each node kept its times in the episode that runs or was the last."""
+        """Return timing statistics of each node in the running episode, or in the last one."""
         return {} if self._run is None else self._run.statistics()
 
     def __enter__(self) -> AsyncGraph:
@@ -289,14 +302,17 @@ class AsyncGraph:
         try:
             run.begin(timeout_s)
         except BaseException as error:
-            # Ctrl-C must stay Ctrl-C, and soon, whatever a startup that hangs makes of the stop.
+            # Ctrl-C must be raised unchanged, and soon, even if a startup hangs and the stop fails.
             with noted(error):
                 self.stop(timeout_s if isinstance(error, Exception) else min(timeout_s, _INTERRUPTED_S))
             raise
         return run
 
     def _timeline_of(self, graph_state: GraphState) -> tuple[Timeline, int]:
-        """Return the timeline and the episode in it; drawn ones depend on the graph state's keys alone."""
+        """Return the timelines and the index of the episode to play.
+
+        Timelines that are drawn here depend on nothing but the graph state's ``eps`` and the supervisor's key.
+        """
         eps = int(graph_state.eps)
         if self._timeline is not None:
             if not 0 <= eps < self._timeline.episodes:

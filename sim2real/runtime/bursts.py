@@ -1,4 +1,4 @@
-"""Messages that come in bursts: after a hiccup, a node that returns to its grid makes several steps at once."""
+"""Windows for messages that come in bursts, e.g. when a node catches up with its grid after a hiccup."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sim2real.graph.windows import overfull
 
 
 def make_room(nodes: Mapping[str, BaseNode], timeline: Timeline) -> dict[tuple[str, str], int]:
-    """Widen, in place, the windows with trainable delays that do not hold the bursts of a timeline.
+    """Lengthen, in place, the windows with a trainable delay that are too short for the bursts of a timeline.
 
-    Without it such a timeline is refused (``sim2real.graph.windows.check_bursts``). A window that does hold them stays
-    as it is, so a timeline without hiccups costs nothing.
+    Otherwise ``sim2real.graph.windows.check_bursts`` refuses such a timeline. Windows that are long enough stay as they
+    are.
 
     Returns:
-        (node, input) -> how many messages the window grew by, where it did.
+        (node, input) -> number of messages that were added to the window, for the windows that were too short.
     """
     grown: dict[tuple[str, str], int] = {}
     for key, edge in timeline.edges.items():

@@ -1,4 +1,4 @@
-"""A connection on the wall clock: messages in, stamped on arrival; messages out by the timing rules."""
+"""A connection on the wall clock: stamps messages when they arrive, hands them over by the timing rules."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ _CHUNK = 1024
 
 
 class Table:
-    """Values of a vectorised rule by step, computed in chunks: a numpy call a step would cost more than the rule."""
+    """The values of a vectorised function of the step number, computed in chunks: cheaper than one numpy call a step.
+
+    Args:
+        rule: Maps step numbers, shape ``(n,)``, to integers of the same shape.
+    """
 
     def __init__(self, rule: Callable[[np.ndarray], np.ndarray]) -> None:
         self._rule = rule
@@ -33,7 +37,12 @@ class Table:
 
 
 class Channel:
-    """One connection's messages between two threads."""
+    """The queue of one connection's messages, between the sender's thread and the reader's.
+
+    Args:
+        connection: The connection.
+        clock: Stamps the arrivals.
+    """
 
     def __init__(self, connection: Connection, clock: MonotonicClock) -> None:
         self.connection = connection
@@ -47,7 +56,13 @@ class Channel:
         self._quota = Table(lambda k: quota(connection, k)) if connection.blocking else None
 
     def put(self, seq: int, sent: int, leaves: list[np.ndarray]) -> None:
-        """Deliver a message (the sender's side): it arrives now, in order."""
+        """Deliver a message, which arrives now; called by the sender.
+
+        Args:
+            seq: The sender's step that made it.
+            sent: When it was sent [ticks].
+            leaves: The message, as ``Format.pack`` returns it.
+        """
         with self._condition:
             received = max(self._clock.now(), sent, self._last_arrival)
             self._last_arrival = received
@@ -56,13 +71,16 @@ class Channel:
             self._condition.notify()
 
     def stop(self) -> None:
-        """Wake a reader that waits."""
+        """End the channel: a reader that waits gets ``Stopped``."""
         with self._condition:
             self._stopped = True
             self._condition.notify_all()
 
     def wait_group(self, k: int) -> int:
-        """Wait for the messages that step ``k`` waits for, if the input is blocking; return the last arrival, else 0.
+        """Wait for the messages that step ``k`` needs; a non-blocking input needs none.
+
+        Returns:
+            Arrival of the last one [ticks]; 0 if there is none.
 
         Raises:
             Stopped: When the graph stopped meanwhile.
@@ -93,16 +111,16 @@ class Channel:
         return self._taken
 
     def consumed(self, k: int) -> Iterator[MessageRecord]:
-        """Yield the records of what step ``k`` took, now that it is finished."""
+        """Return the records of the messages that step ``k`` took; called when the step has finished."""
         taken, self._taken = self._taken, []
         return (self._record(m, k) for m in taken)
 
     def leftover(self) -> Iterator[MessageRecord]:
-        """Yield the records of what no step consumed, once both threads have ended."""
+        """Return the records of messages that no finished step consumed; called when both threads have ended."""
         return (self._record(m, -1) for m in (*self._taken, *self._queue))
 
     def _due(self, upto: int) -> int:
-        """Return how many queued messages have a smaller seq."""
+        """Return how many queued messages have a ``seq`` below ``upto``."""
         return min(len(self._queue), max(0, upto - self._queue[0].seq)) if self._queue else 0
 
     def _record(self, m: Message, seq_in: int) -> MessageRecord:

@@ -1,4 +1,4 @@
-"""Clocks of a running graph, and what a process does to keep to them."""
+"""The clocks of a running graph, and interpreter settings for real time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _SWITCH_INTERVAL_S = 0.0005
 
 
 class Clock(Enum):
-    """What moves a graph's time."""
+    """The time base of a running graph."""
 
     SIMULATED = "simulated"
-    """Delays are sampled, nodes step in the order of events on one thread."""
+    """Delays are sampled; nodes step in the order of events, on one thread."""
     WALL_CLOCK = "wall_clock"
-    """One thread a node, on the machine's monotonic clock."""
+    """The machine's monotonic clock; every node has a thread."""
 
 
 class MonotonicClock:
@@ -32,7 +32,7 @@ class MonotonicClock:
         self.origin_ns = time.monotonic_ns()
 
     def begin(self, lead_s: float) -> None:
-        """Put time 0 ``lead_s`` ahead, so that every thread is asleep before its first slot."""
+        """Set time 0 to ``lead_s`` seconds from now, so that every thread sleeps before its first slot."""
         self.origin_ns = time.monotonic_ns() + int(lead_s * 1e9)
 
     def now(self) -> int:
@@ -44,15 +44,18 @@ class MonotonicClock:
         return (time.monotonic_ns() - self.origin_ns) / 1e9
 
     def sleep_past(self, tick: int, stopping: threading.Event, spin: int = 0) -> bool:
-        """Sleep until the clock shows more than ``tick``; return False when ``stopping`` came first.
+        """Sleep until the clock shows more than ``tick``.
 
-        More than, because a reader that looks while the clock still shows ``tick`` would miss a message stamped with
-        that same tick an instant later, which by the rules is its own.
+        "More", because a message may still arrive while the clock shows ``tick``, and by the rules it belongs to a step
+        that starts at ``tick``.
 
         Args:
             tick: When to wake [ticks].
-            stopping: Ends the sleep at once.
-            spin: Poll instead of sleeping for the last stretch [ticks].
+            stopping: Ends the sleep at once when it is set.
+            spin: How long to poll instead of sleeping at the end [ticks].
+
+        Returns:
+            False if ``stopping`` was set.
         """
         while (rest := tick + 1 - spin - self.now()) > 0:
             if stopping.wait(rest / TICKS_PER_S):
@@ -69,12 +72,12 @@ _realtime_before: tuple[bool, float, bool] = (True, 0.005, False)
 
 @contextmanager
 def realtime() -> Iterator[None]:
-    """Keep the interpreter from pausing control threads; wall-clock episodes enter it by themselves.
+    """Keep the interpreter from pausing control threads; wall-clock episodes do this by themselves.
 
-    The garbage collector runs once, what is alive is frozen, and collection is off until the exit: reference counting
-    goes on, but cyclic garbage made meanwhile stays (a step as the runtime makes it leaves none). The interpreter
-    offers the lock to waiting threads after 0.5 ms instead of 5 ms. The last exit restores both, unless the caller had
-    frozen objects before: what is frozen then stays so.
+    On entry the garbage collector runs once and is then switched off: reference cycles made inside the block are not
+    freed before its end (the runtime's own steps make none). Objects alive at entry are frozen (``gc.freeze``). The
+    interpreter's switch interval is 0.5 ms instead of 5 ms. All of this is restored when the last of nested blocks
+    ends, except that objects stay frozen if the caller had frozen some before.
     """
     global _realtime_users, _realtime_before
     with _realtime_lock:

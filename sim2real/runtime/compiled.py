@@ -1,7 +1,7 @@
-"""A graph as one program: timing is data, physics is never masked.
+"""A graph as one compiled program, in which timelines are data and the world always runs.
 
-Timing tables are constants of the program; the state that each copy carries is the nodes' own, the last few outputs
-of each, an episode and a row.
+Timing tables are constants of the program. The state that each copy carries consists of the nodes' states, the last few
+outputs of each node, the index of the episode and the row.
 """
 
 from __future__ import annotations
@@ -28,23 +28,26 @@ from sim2real.runtime.wiring import Wiring, wire
 class CompiledGraph:
     """A graph over given timelines, for ``jit``, ``vmap``, ``scan`` and ``grad``.
 
-    Three ways to run it, all from what ``init`` returns. ``rollout``: the supervisor makes its own steps. ``reset`` and
-    ``step``, like a gym environment: each returns what the supervisor sees at its next step, and the caller provides
-    the output; ``run`` is ``step`` with the supervisor's own output. ``observe`` and ``advance``: the same row by row,
-    for programs that look at every row anyway; in some of them the supervisor makes no step.
+    A row is the part of an episode that the compiled loop runs in one pass: due steps of the nodes, then a fixed number
+    of world ticks. There are three ways to run the graph, each from the state that ``init`` returns:
 
-    Running past the end, or stepping before a reset, is an error; so is mixing the ways. Where ``jit`` or ``vmap`` hide
-    where a state stands, running past the end cannot be seen: then the state stays as it is at the end, and what the
-    supervisor gets has ``seq`` -1.
+    - ``rollout``: the supervisor makes its own steps.
+    - ``reset`` and ``step``, as in a gym environment: each returns what the supervisor sees at its next step, and the
+      caller provides the output. ``run`` is ``step`` with the supervisor's own output.
+    - ``observe`` and ``advance``: the same row by row. In some rows the supervisor makes no step.
+
+    Running past the end of the timeline, stepping before a reset, and mixing the three ways are errors. Under ``jit``
+    and ``vmap`` the position in the timeline may not be known when the program is traced; past the end the state then
+    stays unchanged, and the supervisor's step state has ``seq`` -1.
 
     Args:
-        nodes: The nodes, by name or as a list. Those that the timeline does not hold are left out.
-        supervisor: The node at whose steps ``reset`` and ``step`` hand over, usually the policy; or its name.
-        timeline: What ran when, in one or more episodes.
-        given: Nodes that are not run, as their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
+        nodes: The nodes, by name or as a list. Those that are not in the timeline are left out.
+        supervisor: The node whose steps the caller of ``reset`` and ``step`` makes, usually the policy; or its name.
+        timeline: Timelines of one or more episodes.
+        given: Nodes that are not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
     Attributes:
-        rows_per_pass: Rows that a pass of ``rollout``'s loop holds; a program gets longer with them.
+        rows_per_pass: Unroll factor of ``rollout``'s loop over rows.
 
     Raises:
         UsageError: When nodes, connections and timeline do not fit each other.
@@ -65,24 +68,23 @@ class CompiledGraph:
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes)
         self._walk = Walk(self.program, self.supervisor)
-        # A CPU only compiles longer with several rows in a pass. A GPU copies what is carried half as often with two:
-        # 0.63 times the time of one at 100,000 pendulums on an H200 (three 0.66, four 0.68), and 0.77 times at 30 Hz
-        # over 100 Hz (three 0.78, four 0.82).
+        # Unrolling halves how often a GPU copies the carried state: 100,000 pendulums on an H200 take 0.63 of the time
+        # with two rows (three: 0.66, four: 0.68). On a CPU it only makes compilation longer.
         self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
     @property
     def rows(self) -> int:
-        """Rows of an episode."""
+        """Number of rows of an episode."""
         return self.wiring.rows
 
     @property
     def episodes(self) -> int:
-        """Episodes."""
+        """Number of episodes."""
         return self.timeline.episodes
 
     @property
     def steps(self) -> int:
-        """Steps of the supervisor in the shortest episode: ``reset`` shows the first, ``step`` the others."""
+        """Number of the supervisor's steps in the shortest episode; ``reset`` returns the first."""
         return int(self._walk.counts.min())
 
     def init(
@@ -96,9 +98,9 @@ class CompiledGraph:
 
         Args:
             rng: A JAX key.
-            params: Parameters of some nodes; the others' come from ``init_params``.
-            order: Nodes that are initialised first.
-            eps: Which episode, int or traced.
+            params: Parameters of some nodes; the other nodes' come from ``init_params``.
+            order: Names of nodes that are initialised first.
+            eps: Index of the episode, int or traced.
 
         Raises:
             UsageError: When there is no such episode, or a name is unknown.
@@ -111,7 +113,7 @@ class CompiledGraph:
         self.program.check_given(outputs)
         buffer |= {name: outputs[name] for name in self.given}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
-        # The row is numpy's: what follows in the same program sees that it is the first.
+        # A numpy number, not a traced one: code later in the same program can see that this is the first row.
         return _replace(gs, eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
@@ -121,7 +123,7 @@ class CompiledGraph:
             gs: What ``init`` returned.
 
         Returns:
-            The graph's state, in which ``seq`` says which step of the supervisor awaits, and what the supervisor sees.
+            The graph's state, whose ``seq`` has the number of the supervisor's next step; and what the supervisor sees.
         """
         self._check_row_start(gs, "reset")
         return self._walk.to_first(gs)
@@ -133,8 +135,11 @@ class CompiledGraph:
 
         Args:
             gs: What ``reset`` or ``step`` returned.
-            step_state: The supervisor's step state after the step; None: as ``gs`` has it.
+            step_state: The supervisor's step state after the step; None: unchanged.
             output: The step's output; None: the supervisor makes the step itself, from ``step_state``.
+
+        Returns:
+            The graph's state, and what the supervisor sees at its next step.
 
         Raises:
             UsageError: Before ``reset``, or when the episode has no further step.
@@ -155,32 +160,37 @@ class CompiledGraph:
         return self._walk.to_next(gs, turn, k < 0)
 
     def run(self, gs: GraphState) -> GraphState:
-        """Run to the supervisor's next step, make it as the supervisor does, and run to the one after it.
+        """Let the supervisor make its next step itself, and run to the step after it.
 
-        From what ``init`` returned it resets first; in a scan, reset before it, as the carried state changes its form.
+        A state from ``init`` is reset first. With a scan, call ``reset`` before the loop: it adds an entry to ``seq``,
+        and a loop's carry must keep its structure.
         """
         return self.step(gs if gs.seq else self.reset(gs)[0])[0]
 
     def run_row(self, gs: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
-        """Run one row: every slot of the boundary, then the world's ticks."""
+        """Run one row: the due steps of the nodes, then the world's ticks.
+
+        Returns:
+            The graph's state, and each node's steps of the row.
+        """
         self._check_row_start(gs, "run_row")
         return self._run_row(gs, inside=not _traced(gs.step))
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
     ) -> tuple[GraphState, dict[str, Rollout]]:
-        """Run an episode from ``init`` to its last row, or ``rows`` of it.
+        """Run the rows of an episode, the supervisor making its own steps.
 
         Args:
             gs: What ``init`` or another rollout returned.
             record: Nodes whose outputs are returned.
-            rows: How many rows; default: all that are left, or all that there are where ``gs`` is traced.
+            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced.
 
         Returns:
             The last state, and the records by node.
 
         Raises:
-            UsageError: When ``rows`` or ``record`` asks for what is not there.
+            UsageError: When fewer than ``rows`` rows are left, or a node in ``record`` does not run.
         """
         self._check_row_start(gs, "rollout")
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
@@ -204,14 +214,15 @@ class CompiledGraph:
         return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
     def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Any]:
-        """Run the slots of a row before the supervisor's, and return what it sees.
+        """Run a row up to the supervisor's step, and return what the supervisor sees.
 
         Args:
             gs: A state at the start of a row.
-            inside: Promises that this is not behind the last row, as episodes end before: nothing is selected then.
+            inside: Promise that the row is not past the end of the timeline, because episodes end earlier. It saves
+                masking every update.
 
         Returns:
-            The graph's state, the supervisor's step state, and whether it makes a step in this row.
+            The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
 
         Raises:
             UsageError: When the supervisor makes several steps in one row.
@@ -224,7 +235,17 @@ class CompiledGraph:
         return _replace(gs, seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
     def advance(self, gs: GraphState, step_state: StepState, output: Any, inside: bool = False) -> GraphState:
-        """Put in the supervisor's step and run the rest of the row; the counterpart of ``observe``."""
+        """Take the supervisor's step and run the rest of the row; the counterpart of ``observe``.
+
+        Args:
+            gs: What ``observe`` returned.
+            step_state: The supervisor's step state after the step.
+            output: The step's output; ignored in a row without a step.
+            inside: As in ``observe``.
+
+        Returns:
+            The state at the start of the next row.
+        """
         turn, k = self._walk.only_turn(), self._awaited(gs, "advance")
         inside = inside or not _traced(gs.step)
         ran = None if inside and self.program.always(turn) else k >= 0
@@ -233,14 +254,14 @@ class CompiledGraph:
         return self.program.run_world(gs, {}, inside)
 
     def report(self) -> dict[str, Any]:
-        """Return what the compiler made of the timelines.
+        """Return figures of the compiled program.
 
         Returns:
-            ``episodes``, ``rows``, ``ticks_per_row`` (n), ``slots`` (the node of each slot of a row),
-            ``supervisor_slots``, ``supervisor_steps``, ``longest_gap`` (rows between two steps of the supervisor),
-            ``discarded`` (share of slots whose result is not used), ``rings`` (outputs kept, by node), ``bursts``
-            (``node/input``: the most messages that a step after the first consumes at once, and how many its window
-            holds), ``bytes_per_copy`` (of the state that is carried).
+            ``episodes``, ``rows``, ``ticks_per_row``, ``slots`` (the nodes whose steps a row computes, in order),
+            ``supervisor_slots``, ``supervisor_steps``, ``longest_gap`` (most rows between two steps of the supervisor),
+            ``discarded`` (fraction of the computed steps whose result is not used), ``rings`` (number of outputs kept,
+            by node), ``bursts`` (``node/input`` -> the most messages that one step consumes, the first step left out,
+            and the length of its window), ``bytes_per_copy`` (size of the carried state).
         """
         w = self.wiring
         shapes = jax.eval_shape(self.init, jax.random.key(0))
@@ -265,7 +286,7 @@ class CompiledGraph:
         return self.program.run_world(gs, outputs, inside), outputs
 
     def _awaited(self, gs: GraphState, call: str) -> Any:
-        """Return which step of the supervisor awaits."""
+        """Return the number of the supervisor's step that the caller makes next."""
         if self.supervisor not in gs.seq:
             raise UsageError(
                 f"{call}() needs a state in which a step of the supervisor {self.supervisor!r} awaits",
@@ -286,7 +307,7 @@ class CompiledGraph:
 
 
 def _traced(x: Any) -> bool:
-    """Return whether a value is not known yet, or is one of many."""
+    """Return whether a value is traced, or an array with several values."""
     return isinstance(x, Tracer) or np.ndim(x) > 0
 
 

@@ -1,4 +1,4 @@
-"""One node's data in one episode: what its steps read and replace, the same under both clocks."""
+"""The data of one node in one episode: what its steps read and replace, on either clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim2real.runtime.wiring import EMPTY_AGE_S
 
 
 class Message(NamedTuple):
-    """One message on its way; times in ticks [us], ``leaves`` as ``Format.pack`` returns them."""
+    """A message that was sent; times in ticks [us], ``leaves`` as ``Format.pack`` returns them."""
 
     seq: int
     sent: int
@@ -25,7 +25,12 @@ class Message(NamedTuple):
 
 
 class Format:
-    """The structure, shapes and dtypes of a node's output: those of its default output."""
+    """The structure, shapes and dtypes of a node's output: those of its default output.
+
+    Args:
+        node: The node's name, for errors.
+        default: The default output.
+    """
 
     def __init__(self, node: str, default: Any) -> None:
         self.node = node
@@ -33,10 +38,10 @@ class Format:
         self.default = [np.asarray(leaf) for leaf in leaves]
 
     def pack(self, output: Any) -> list[np.ndarray]:
-        """Return an output's leaves as arrays of their own, which its node cannot change any more.
+        """Return copies of an output's leaves, as arrays that the node cannot change any more.
 
         Raises:
-            UsageError: When it does not look like the node's default output.
+            UsageError: When structure, shapes or dtypes differ from those of the default output.
         """
         leaves, tree = jax.tree_util.tree_flatten(output)
         if tree != self.tree:
@@ -49,7 +54,7 @@ class Format:
         return arrays
 
     def unpack(self, leaves: Sequence[Any]) -> Any:
-        """Return the output with these leaves."""
+        """Return the output that has these leaves."""
         return jax.tree_util.tree_unflatten(self.tree, leaves)
 
     def _differs(self, how: str) -> UsageError:
@@ -62,13 +67,13 @@ class Format:
 class Window:
     """The last messages that one input consumed.
 
-    Arrays are made anew when messages arrive and never written again: a step may keep what it was given, and JAX may
-    use the memory of a numpy argument without copying it.
+    New messages make new arrays, and arrays are never overwritten: a step may keep its inputs, and JAX may use the
+    memory of a numpy argument without copying it.
 
     Args:
         connection: The connection.
-        form: What its messages look like.
-        size: How many messages are kept.
+        form: Format of its messages.
+        size: Number of messages that are kept.
         delay_dist: The trainable delay that steps see in ``InputState.delay_dist``, or None.
     """
 
@@ -81,7 +86,7 @@ class Window:
         self.state = self._build()
 
     def push(self, messages: Sequence[Message]) -> None:
-        """Take in consumed messages, oldest first."""
+        """Append consumed messages, oldest first."""
         last = messages[-self.size :]
         if not last:
             return
@@ -102,16 +107,16 @@ class Window:
 
 
 class NodeData:
-    """What one node carries through an episode.
+    """What one node carries from step to step.
 
     Args:
         node: The node.
-        graph_state: Where it starts.
-        emulate_delays: Whether trainable delays are applied: windows then hold what any delay could deliver. On the
-            wall clock messages have the delays that they have.
+        graph_state: The state at the episode's start.
+        emulate_delays: Whether trainable delays are applied to the windows, which are then longer. False on the wall
+            clock, where the messages' delays are real.
 
     Attributes:
-        carried: ``(rng, params, state, steps made)``, replaced as a whole, so that other threads may read it.
+        carried: ``(rng, params, state, steps made)``; replaced as a whole, so that other threads can read it any time.
     """
 
     def __init__(self, node: BaseNode, graph_state: GraphState, emulate_delays: bool) -> None:
@@ -135,18 +140,18 @@ class NodeData:
         self.carried: tuple[Any, Any, Any, int] = (parts[0], parts[1], parts[2], 0)
 
     def step_state(self, seq: int, tick: int) -> StepState:
-        """Return what step ``seq`` gets when it starts at ``tick``."""
+        """Return the step state of step ``seq``, which starts at ``tick``."""
         rng, params, state, _ = self.carried
         inputs = {name: window.state for name, window in self.windows.items()}
         ts = np.float32(tick / TICKS_PER_S)
         return StepState(rng, state, params, inputs, self._eps, np.int32(seq), ts)
 
     def ages(self, tick: int) -> dict[str, np.ndarray]:
-        """Return the ages of the messages of those inputs whose trainable delay is applied, see ``Window.ages``."""
+        """Return the ages of the messages, for inputs with a trainable delay that is applied; see ``Window.ages``."""
         return {name: self.windows[name].ages(tick) for name in self._emulated}
 
     def keep(self, changed: dict[str, Any]) -> None:
-        """Take over what a step replaced, and count it."""
+        """Keep the fields that a step replaced, and count the step."""
         rng, params, state, steps = self.carried
         self.carried = (
             changed.get("rng", rng),
@@ -157,7 +162,13 @@ class NodeData:
 
 
 def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str) -> GraphState:
-    """Return the graph's state as of each node's last finished step; ``step`` counts the supervisor's."""
+    """Return the graph's state after the last finished step of each node.
+
+    Args:
+        graph_state: The state at the episode's start.
+        data: The nodes' data by name.
+        supervisor: The node whose steps ``GraphState.step`` counts.
+    """
     carried = {name: d.carried for name, d in data.items()}
     return graph_state.replace(  # pyright: ignore[reportAttributeAccessIssue]
         step=np.int32(carried[supervisor][3]),
@@ -169,7 +180,7 @@ def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str
 
 
 def _shift(old: np.ndarray, entries: Sequence[Any]) -> np.ndarray:
-    """Return ``old`` with its first entries dropped and new ones at its end; at most as many as it has."""
+    """Return ``old`` with new entries at its end and as many dropped at its start; at most ``len(old)`` new ones."""
     out = np.empty_like(old)
     count = len(entries)
     out[: len(old) - count] = old[count:]

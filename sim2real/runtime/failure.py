@@ -1,4 +1,4 @@
-"""How a running graph fails: with the name of the node."""
+"""Failures of a running graph; each names the node."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from sim2real.errors import Sim2RealError
 
 
 class NodeFailed(Sim2RealError):  # noqa: N818 - an event, as in sim2real.errors
-    """A node raised something that is no error of the project's own; that error is the cause.
+    """A node raised an exception other than a ``Sim2RealError``; that exception is the cause.
+
+    Args:
+        message: What happened.
+        node: The node's name.
+        hint: What to do next.
 
     Attributes:
         node: The node's name.
@@ -21,22 +26,22 @@ class NodeFailed(Sim2RealError):  # noqa: N818 - an event, as in sim2real.errors
 
 
 class GraphTimeout(Sim2RealError):  # noqa: N818
-    """Something did not happen in time: a startup, a step, an answer, a stop."""
+    """A startup, a step, the caller's reply or a stop took too long."""
 
 
 class Stopped(Exception):  # noqa: N818
-    """Unwinds a node's thread when the graph stops; never reaches a caller."""
+    """Raised in a node's thread to leave it when the graph stops; callers never see it."""
 
 
 def named(error: BaseException, node: str, during: str) -> Sim2RealError:
-    """Return the error that the caller gets for ``error`` raised by ``node``.
+    """Return the error to raise in the caller's thread for ``error``, which ``node`` raised.
 
-    The project's own errors keep type, message and exit code and get a note; others are wrapped.
+    A ``Sim2RealError`` is returned itself, with a note; any other is wrapped in a ``NodeFailed``.
 
     Args:
         error: What was raised.
         node: The node's name.
-        during: Where: ``startup``, ``step 12``, ``stop``.
+        during: What the node was doing, e.g. ``startup``, ``step 12`` or ``stop``.
     """
     if isinstance(error, Sim2RealError):
         error.add_note(f"node {node!r}, {during}")
@@ -48,7 +53,7 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
 
 @contextmanager
 def noted(error: BaseException) -> Iterator[None]:
-    """Make what fails in the block a note of the error that is on its way out, so that it keeps its place."""
+    """Add an exception of the block to ``error`` as a note, in place of raising it: ``error`` is being raised."""
     try:
         yield
     except Exception as other:

@@ -1,4 +1,4 @@
-"""Whether nodes and a timeline make a graph that can be compiled."""
+"""Checks that nodes and timeline fit each other and can be compiled."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timel
     """Return the nodes of a timeline by name.
 
     Raises:
-        UsageError: When two have the same name, or one of the timeline's is missing.
+        UsageError: When two nodes have the same name, or a node of the timeline is missing.
     """
     found = by_name(nodes)
     lost = [n for n in timeline.vertices if n not in found]
@@ -28,10 +28,10 @@ def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timel
 
 
 def supervisor_of(supervisor: Any, nodes: Mapping[str, BaseNode]) -> str:
-    """Return the supervisor's name, given that or the node itself.
+    """Return the supervisor's name; ``supervisor`` is the name or the node.
 
     Raises:
-        UsageError: When it is neither, or another object than the node of its name.
+        UsageError: When it is neither, or is not the object that has its name in the graph.
     """
     if not isinstance(supervisor, str | BaseNode):
         raise UsageError(f"the supervisor is one node, or its name, got {supervisor!r}")
@@ -45,11 +45,11 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
 
     Args:
         nodes: The nodes of the timeline, by name.
-        timeline: What ran when.
-        given: Nodes that do not run, as their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
+        timeline: The timelines.
+        given: Nodes that do not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
     Raises:
-        UsageError: When they do not.
+        UsageError: Naming the first node or connection that does not fit.
     """
     for name, node in nodes.items():
         if not node.jittable and name not in given:

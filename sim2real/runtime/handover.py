@@ -1,4 +1,4 @@
-"""Where the supervisor's thread and the caller meet, one step at a time."""
+"""Synchronises the supervisor's thread with the caller of ``reset`` and ``step``, step by step."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sim2real.runtime.failure import GraphTimeout, Stopped
 
 
 class Reply(NamedTuple):
-    """What the caller does with a step.
+    """The caller's answer to a step state that it was offered.
 
     Attributes:
-        step_state: The step state after the step; None: as it was.
-        leaves: The step's output, packed; None when ``own``.
+        step_state: The step state after the step; None: unchanged.
+        leaves: The step's output, as ``Format.pack`` returns it; None: the node makes the step itself.
     """
 
     step_state: StepState | None = None
@@ -29,10 +29,10 @@ class Reply(NamedTuple):
 
 
 class Handover:
-    """The supervisor offers its step state and waits; the caller looks at it and replies.
+    """The supervisor offers its step state and waits; the caller observes it and replies.
 
     Args:
-        own: Start with the node making its steps itself, without meeting anybody.
+        own: Whether the node makes its steps itself at first, without waiting for a caller.
     """
 
     def __init__(self, own: bool) -> None:
@@ -49,7 +49,7 @@ class Handover:
         return self._own
 
     def set_own(self, own: bool) -> None:
-        """Let the node make its steps itself, the one on offer too, or hand them over again."""
+        """Choose who makes the steps from now on, the one on offer included: the node itself, or the caller."""
         with self._condition:
             self._own = own
             if own:
@@ -57,17 +57,17 @@ class Handover:
             self._condition.notify_all()
 
     def close(self) -> None:
-        """Nobody waits here any more."""
+        """Wake both sides, for good: the graph is stopping."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
 
     def meet(self, step_state: StepState, timeout_s: float) -> Reply:
-        """Offer a step and wait for the reply (the supervisor's side).
+        """Offer a step and wait for the reply; called by the supervisor's thread.
 
         Raises:
             Stopped: When the graph stopped meanwhile.
-            GraphTimeout: When nobody replied in time.
+            GraphTimeout: When there was no reply in time.
         """
         with self._condition:
             if not self._own:
@@ -88,26 +88,26 @@ class Handover:
             return Reply()
 
     def finished(self) -> None:
-        """A step is over: made, sent and recorded (the supervisor's side)."""
+        """Count a step that has been made, sent and recorded; called by the supervisor's thread."""
         with self._condition:
             self._finished += 1
             self._condition.notify_all()
 
     def observe(self, timeout_s: float) -> StepState | None:
-        """Wait for a step on offer; None when the time is up or the graph stopped (the caller's side)."""
+        """Wait for a step on offer and return it; None if the time was up or the graph stopped. For the caller."""
         with self._condition:
             self._condition.wait_for(lambda: self._offered is not None or self._closed, timeout_s)
             return None if self._closed else self._offered
 
     def reply(self, reply: Reply) -> int:
-        """Reply to the step on offer; return how many steps are finished once it is (the caller's side)."""
+        """Reply to the step on offer, for the caller; return the value of ``finished`` once that step is finished."""
         with self._condition:
             self._offered, self._reply = None, reply
             self._condition.notify_all()
             return self._finished + 1
 
     def settle(self, finished: int, timeout_s: float) -> bool:
-        """Wait until that many steps are finished; return whether they are (the caller's side)."""
+        """Wait until ``finished`` steps are finished, for the caller; return whether they are."""
         with self._condition:
             self._condition.wait_for(lambda: self._finished >= finished or self._closed, timeout_s)
             return self._finished >= finished

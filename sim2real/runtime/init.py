@@ -1,4 +1,4 @@
-"""The initial state of a graph: the same for the same seed in every runtime."""
+"""The initial state of a graph; the same key gives the same state in every runtime."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from sim2real.graph.node import BaseNode, phase_ticks
 from sim2real.graph.schedule import waits_for_schedule
 
 OUTPUTS = "outputs"
-"""Key of ``GraphState.aux``: node name -> its default output, drawn once and shared by all its readers."""
+"""Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""
 
 
 def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: BaseNode) -> dict[str, BaseNode]:
-    """Return the nodes by name, the supervisor among them, after checking that they form a graph.
+    """Return the nodes by name, with the supervisor, after checking that they form a graph.
 
     Raises:
-        UsageError: When names clash, a sender is missing, connections form a loop, or ``advance`` cannot work.
+        UsageError: When two nodes have the same name, a sender is missing, connections that are not skipped form a
+            loop, or ``advance`` is set for a node without a blocking input.
     """
     if not isinstance(supervisor, BaseNode):
         raise UsageError(f"the supervisor is one node, got {supervisor!r}", hint="pass the node itself, not its name")
@@ -44,21 +45,21 @@ def init_graph_state(
     params: Mapping[str, Any] | None = None,
     order: Sequence[str] | None = None,
 ) -> GraphState:
-    """Return the state in which a graph starts; pure, so it can be traced and mapped.
+    """Return the state in which a graph starts; a pure function that can be traced and mapped.
 
-    Parameters of all nodes come first, then states, then default outputs (``aux["outputs"]``), then trainable delays
-    (the distributions, at their delay); each ``init_*`` method sees what was made before it. A node's keys depend on
+    The parameters of all nodes are made first, then their states, their default outputs (``aux["outputs"]``) and their
+    trainable delays; each ``init_*`` method gets the graph state with everything made so far. A node's keys depend on
     ``rng`` and its name alone.
 
     Args:
         nodes: The nodes by name; their senders may be left out.
-        supervisor: The node at whose steps the graph is cut, or its name.
-        rng: Key.
-        params: Parameters that are kept as given; nodes without any call ``init_params``.
+        supervisor: The supervisor, or its name.
+        rng: A JAX key.
+        params: Parameters that are used as given; for nodes without an entry ``init_params`` is called.
         order: Names of nodes that are initialised first; then comes the supervisor, then the others.
 
     Raises:
-        UsageError: When ``supervisor``, ``params`` or ``order`` name unknown nodes.
+        UsageError: When ``supervisor``, ``params`` or ``order`` names an unknown node.
     """
     first = supervisor if isinstance(supervisor, str) else supervisor.name
     names = _order(nodes, first, params or {}, order or ())
@@ -83,7 +84,7 @@ def init_graph_state(
 
 
 def default_output(graph_state: GraphState, node: str) -> Any:
-    """Return the message that stands in the windows of a node's readers before its first one arrives."""
+    """Return a node's default output: the message in its readers' windows before its first message arrives."""
     outputs = graph_state.aux.get(OUTPUTS, {})
     if node not in outputs:
         raise UsageError(f"the graph state has no default output of {node!r}", hint="make graph states with init()")
@@ -110,7 +111,7 @@ def _delays(node: BaseNode, key: jax.Array, state: GraphState) -> dict[str, Trai
 
 
 def _fixed(node: BaseNode, tree: Any) -> Any:
-    """Give leaves a strong dtype; a node in plain Python keeps its own objects."""
+    """Return arrays without JAX's weak types; a node in plain Python keeps its own objects."""
     return jax.tree_util.tree_map(_strong, tree) if node.jittable else tree
 
 

@@ -1,4 +1,4 @@
-"""Whether what a step returns looks like what it got: nothing becomes another type on the way unnoticed."""
+"""Checks that trees have equal structure, shapes and dtypes, e.g. a step's state before and after."""
 
 from __future__ import annotations
 
@@ -12,9 +12,17 @@ from sim2real.errors import UsageError
 
 
 def matched(node: str, what: str, got: Any, reference: str, like: Any) -> Any:
-    """Return ``got`` with the dtypes of ``like``, after ``check_match``: no value changes.
+    """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``; no value changes.
 
-    Args and raises: as ``check_match``.
+    Args:
+        node: The node's name.
+        what: Description of ``got``, for errors.
+        got: Arrays.
+        reference: Description of ``like``, for errors.
+        like: Arrays, or shapes and dtypes.
+
+    Raises:
+        UsageError: As ``check_match``.
     """
     check_match(node, what, got, reference, like)
 
@@ -26,20 +34,20 @@ def matched(node: str, what: str, got: Any, reference: str, like: Any) -> Any:
 
 
 def check_match(node: str, what: str, got: Any, reference: str, like: Any) -> None:
-    """Check that structures, shapes and dtypes are equal.
+    """Check that two trees have equal structures, shapes and dtypes.
 
-    Only what JAX itself takes for the same dtype may differ: a Python number becomes what it meets (``0`` a float, but
-    ``0.5`` no integer), and a double is a float32 unless 64 bits are enabled.
+    Dtypes may differ where JAX converts without loss: a Python number takes the dtype of ``like`` (``0`` may become a
+    float, ``0.5`` not an integer), and float64 counts as float32 unless 64 bits are enabled.
 
     Args:
         node: The node's name.
-        what: What is checked, in words.
-        got: What that is: arrays, or shapes and dtypes.
-        reference: What it must look like, in words.
-        like: What that is.
+        what: Description of ``got``, for errors.
+        got: Arrays, or shapes and dtypes.
+        reference: Description of ``like``, for errors.
+        like: Arrays, or shapes and dtypes.
 
     Raises:
-        UsageError: When they differ, naming the leaf.
+        UsageError: When they differ, naming the first leaf that does.
     """
     where = f"node {node!r}: {what} differs from {reference}"
     trees = [jax.tree_util.tree_structure(t) for t in (got, like)]
@@ -59,7 +67,7 @@ def check_match(node: str, what: str, got: Any, reference: str, like: Any) -> No
 
 
 def _describe(leaf: Any) -> Any:
-    """Return shape and dtype of a leaf; None if it is no array or number."""
+    """Return shape and dtype of a leaf; None if it is neither an array nor a number."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     try:

@@ -1,4 +1,4 @@
-"""The thread of one node on the wall clock: startup, steps by the timing rules, stop."""
+"""The thread of one node on the wall clock: its startup, its steps by the timing rules, its stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,16 @@ from sim2real.runtime.stepper import Result, Stepper, overwritten
 
 
 class Shared:
-    """What the threads of one episode have in common: its clock, its end and its first failure."""
+    """What the threads of one episode share: the clock, the signal to stop, and the first failure.
+
+    Args:
+        clock: The episode's clock.
+        recorder: Receives all steps and messages, or None.
+        graph_state: The state at the episode's start.
+        wake: Called when the graph stops: wakes threads that wait for messages or for the caller.
+        spin: How long before each step a thread polls the clock instead of sleeping [ticks].
+        answer_timeout_s: How long the supervisor waits for its caller [s].
+    """
 
     def __init__(
         self,
@@ -44,12 +53,12 @@ class Shared:
         self._delivered = False
 
     def stop(self, timeout_s: float) -> None:
-        """Make every thread leave its loop; nodes have ``timeout_s`` for their ``stop``."""
+        """Tell every thread to end; each node's ``stop`` gets ``timeout_s`` [s]."""
         self.timeout_s = timeout_s
         self._end()
 
     def fail(self, error: Sim2RealError) -> None:
-        """Stop the graph because of an error; later ones become notes of the first."""
+        """Stop the graph because of an error; later errors are added to the first as notes."""
         with self._lock:
             if self.failure is None:
                 self.failure = error
@@ -58,7 +67,7 @@ class Shared:
         self._end()
 
     def deliver(self) -> Sim2RealError | None:
-        """Return the failure, once."""
+        """Return the failure at the first call; None if there is none, or at later calls."""
         with self._lock:
             failure = None if self._delivered else self.failure
             self._delivered = self._delivered or failure is not None
@@ -71,26 +80,26 @@ class Shared:
 
 
 class NodeThread(threading.Thread):
-    """Startup, steps and stop of a node all run here, so that ``stop`` never overtakes the last step.
+    """Runs a node's startup, steps and stop in one thread, so that ``stop`` comes after the last step.
 
-    Unless one of them hangs: then ``stop`` is called from outside, and here once more should the node ever come back,
-    as what it did meanwhile may have undone the first.
+    If the startup or a step hangs, another thread calls ``stop``. Should the hanging call return later, this thread
+    calls ``stop`` again, as that call may have switched something on.
 
     Args:
         stepper: The node's prepared stepper.
-        data: Its data.
-        inputs: Its channels by input name.
-        outputs: The channels of its readers.
+        data: The node's data.
+        inputs: The node's channels by input name.
+        outputs: The channels to its readers.
         shared: What all threads share.
-        handover: Where the supervisor meets its caller; None for the other nodes.
+        handover: Synchronises the supervisor with its caller; None for the other nodes.
 
     Attributes:
-        ready: Set once the startup is over, one way or another.
-        over: Set when there is nothing more to wait for: the thread has ended, or its step hangs.
-        made_safe: Whether the node's ``stop`` was called from outside.
+        ready: Set once the startup has succeeded or failed.
+        over: Set when nobody needs to wait for the thread any more: it has ended, or its step hangs.
+        made_safe: Whether another thread has called the node's ``stop``.
         failed: Whether the graph stopped because a step of this node hangs.
-        during: What the thread does: ``startup``, ``step 12`` or ``stop``.
-        since_s: Since when startup or a step runs, on the machine's monotonic clock [s]; None while neither does.
+        during: What the thread is doing: ``startup``, ``step 12`` or ``stop``.
+        since_s: When the running startup or step began, on the machine's monotonic clock [s]; None while neither runs.
     """
 
     def __init__(
@@ -113,16 +122,16 @@ class NodeThread(threading.Thread):
         self._safe_lock = threading.Lock()
 
     def run(self) -> None:
-        """Run until the graph stops; whatever happens, the ``stop`` of a node that was started up is called."""
+        """Run until the graph stops; the ``stop`` of a node whose startup was called is called in every case."""
         try:
-            if not self.shared.stopping.is_set():  # else nothing has been switched on, and nothing shall be
+            if not self.shared.stopping.is_set():  # stopped before the startup: nothing was switched on
                 self._live()
         finally:
             self.ready.set()
             self.over.set()
 
     def make_safe_from_outside(self, timeout_s: float) -> None:
-        """Call the node's ``stop`` although its thread is busy, and wait for that for a while."""
+        """Call the node's ``stop`` from a helper thread, as this one is busy, and wait for it up to ``timeout_s``."""
         self.made_safe = True
         helper = threading.Thread(target=self._make_safe, args=(True,), daemon=True)
         helper.start()
@@ -148,7 +157,7 @@ class NodeThread(threading.Thread):
     def _make_safe(self, from_outside: bool) -> None:
         with self._safe_lock:
             if from_outside and self.during == "stop":
-                return  # it came back
+                return  # the node's own thread is no longer busy and calls stop itself
             try:
                 if not self.node.stop(self.shared.timeout_s):
                     raise Sim2RealError(f"the stop of node {self.node.name!r} did not succeed")
@@ -190,7 +199,7 @@ class NodeThread(threading.Thread):
     def _step(self, k: int, begin: int) -> Result:
         given = self.data.step_state(k, begin)
         reply = self.handover.meet(given, self.shared.answer_timeout_s) if self.handover else Reply()
-        self.since_s = time.monotonic()  # not before: the caller may take its time
+        self.since_s = time.monotonic()  # only now: the caller's time does not count
         return self.stepper.answer(self.data, given, {}, reply)
 
     def _record(self, record: StepRecord, result: Result) -> None:

@@ -1,8 +1,9 @@
-"""In which row, and in which slot of it, each step of a timeline is computed.
+"""Chooses where in the compiled program each step of a timeline is computed: in which row, and in which slot of it.
 
-A world ticks on a fixed grid and always runs. Between the last tick that a step sees and the first tick that its output
-touches there is slack, so the step can be computed at any tick in between. A **row** is one boundary, where steps of
-the other nodes run in **slots**, followed by n world ticks. Pure numpy, ahead of time.
+The program is a loop over **rows**. A row is one boundary, at which steps of the nodes are computed in a fixed sequence
+of **slots**, followed by n world ticks. The world ticks on a fixed grid and always runs. A step may be computed at any
+time after the last tick whose output it sees and before the first tick that its own output affects, so there is
+usually a boundary in between, also if boundaries are several ticks apart. Pure numpy, before anything is compiled.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from sim2real.graph.windows import newest_message
 from sim2real.runtime.slots import Heard, Steps, arrange
 
 _UNREAD = np.int64(2**40)
+"""Tick at which an output is needed that nobody reads: later than any."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +29,11 @@ class Placement:
     """Where the steps are computed.
 
     Attributes:
-        ticks: World ticks in a row; 1 without a world.
-        rows: Rows in an episode.
-        row: Each step's row; steps whose row lies behind the last one are not computed.
-        slot: Each step's slot at the boundary of its row.
-        slots: The node of every slot of a boundary, in the order in which they run.
+        ticks: Number of world ticks in a row; 1 without a world.
+        rows: Number of rows in an episode.
+        row: Each step's row; steps with a row after the last one are not computed.
+        slot: Each step's slot in its row.
+        slots: The node of each slot, in the order in which slots run.
     """
 
     ticks: int
@@ -46,16 +48,16 @@ class Placer:
 
     Args:
         nodes: The nodes by name.
-        supervisor: The node whose rate sets the longest row.
-        timeline: What ran when.
+        supervisor: The supervisor's name; a row is at most as long as its period.
+        timeline: The timelines.
         given: Nodes whose outputs are known beforehand, so that they are not computed.
 
     Attributes:
         nodes: The nodes of the timeline, senders before readers.
-        world: The node that ticks in every row: the fastest world; None without one.
-        others: The nodes that are computed at boundaries.
+        world: Name of the world that ticks in every row, the fastest one; None without a world.
+        others: The nodes whose steps are computed in slots.
         edges: The connections between nodes of the timeline.
-        newest: The newest message that each step has consumed, by connection.
+        newest: Connection -> the newest message that each step has consumed, shape ``(E, N)``; -1: none.
     """
 
     def __init__(
@@ -73,7 +75,7 @@ class Placer:
         """Place all steps.
 
         Raises:
-            UsageError: When the timeline holds no row, or steps of it cannot be put in an order.
+            UsageError: When the timeline is shorter than one row, or steps wait for each other's messages.
         """
         if self.world is None:
             row = self._rows_of_supervisor()
@@ -94,17 +96,17 @@ class Placer:
         return self.steps(name) < self.timeline.vertices[name].count[:, None]
 
     def live(self) -> Iterator[tuple[str, Edge, np.ndarray]]:
-        """Yield reader, edge and newest messages of each connection between nodes that run, by reader."""
+        """Yield (reader, edge, newest) of each connection between nodes that are computed, ordered by reader."""
         order = list(self.nodes)
         keys = [k for k, e in self.edges.items() if e.sender not in self.given and k[0] not in self.given]
         for key in sorted(keys, key=lambda k: order.index(k[0])):
             yield key[0], self.edges[key], self.newest[key]
 
     def _cheapest(self, world_ticks: int) -> Placement:
-        """Return the placement with the fewest slots of the supervisor; of these, that with the fewest slots a tick.
+        """Return the placement with the fewest slots for the supervisor; among those, the fewest slots per tick.
 
-        A supervisor that makes one step in a row can be trained row by row. The largest row that fits is not always the
-        best: three steps in ten ticks fit rows of four ticks with two slots each, and rows of three with one.
+        Training row by row needs a supervisor with one slot. The longest row is not always the best: three steps in ten
+        ticks need two slots in rows of four ticks, and one in rows of three.
         """
         rate = self.nodes[self.world or ""].rate
         most = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
@@ -120,17 +122,20 @@ class Placer:
         return min(found, key=lambda p: (p.slots.count(self.supervisor), len(p.slots) / p.ticks))
 
     def _fill(self, ticks: int, rows: int, row: Steps) -> Placement:
-        """Return the placement of steps in given rows; steps behind the last row need no slot."""
+        """Return the placement for given rows of the steps; steps after the last row need no slot."""
         counted = {n: self.valid(n) & (row[n] < rows) for n in self.others}
         heard = [Heard(n, e.sender, at) for n, e, at in self.live() if self.world not in (n, e.sender)]
         slots, slot = arrange(self.supervisor, rows, {n: row[n] for n in self.others}, counted, heard)
         return Placement(ticks, rows, row, slot, slots)
 
     def _earliest(self) -> Steps:
-        """Return for each step how many world ticks it has seen the output of, directly or not."""
+        """Return the earliest boundary for each step, in ticks: the number of ticks that it depends on.
+
+        Through other nodes' messages as well as directly.
+        """
         earliest = {n: np.zeros_like(self.steps(n)) for n in self.others}
         changed = True
-        while changed:  # one pass carries a bound over one connection; loops run through skipped ones and are short
+        while changed:  # each pass carries bounds over one more connection; a few passes are enough
             changed = False
             for reader, edge, newest in self.live():
                 if reader == self.world:
@@ -142,10 +147,10 @@ class Placer:
         return earliest
 
     def _latest(self, lowest: Steps, slack: int) -> Steps:
-        """Return for each step the first world tick that its output touches, directly or not.
+        """Return the latest boundary for each step, in ticks: the first tick that depends on its output.
 
-        A step whose output comes to the world late or never could wait forever, and what it reads would have to be kept
-        for it: it waits for at most ``slack`` ticks from its start.
+        Through other nodes' messages as well as directly. Limited to ``slack`` ticks after the step's start: the
+        program must keep a step's inputs until it is computed, and some outputs reach the world late or never.
         """
         ticks = self.timeline.vertices[self.world or ""].start
         latest = {}
@@ -167,7 +172,7 @@ class Placer:
         return latest
 
     def _rows(self, lowest: Steps, highest: Steps, n: int) -> Steps:
-        """Return the row of each step: as early as it can be, one step of a node in a row where the slack allows it."""
+        """Return the row of each step, for rows of ``n`` ticks: early, but one step of a node a row where possible."""
         rows = {o: -(-lowest[o] // n) for o in self.others}
         changed = True
         while changed:
@@ -185,12 +190,12 @@ class Placer:
         return rows
 
     def _rows_of_supervisor(self) -> Steps:
-        """Without a world a row is one step of the supervisor; the others run as early as their inputs allow."""
+        """Return the row of each step without a world: one row for each step of the supervisor, other steps early."""
         starts = self.timeline.vertices[self.supervisor].start
         rows = {n: search_rows(starts, np.ascontiguousarray(self.timeline.vertices[n].start)) for n in self.others}
         rows[self.supervisor] = self.steps(self.supervisor).copy()
         changed = True
-        while changed:  # a step never runs in a row before those of the steps that it hears
+        while changed:  # a step must not be in an earlier row than the steps whose messages it consumes
             changed = False
             for reader, edge, newest in self.live():
                 if reader == self.supervisor:
@@ -202,5 +207,8 @@ class Placer:
 
 
 def _heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:
-    """Return a number of the newest message that each step has consumed; 0 where there is none."""
+    """Look up a value of the sender's step that made the newest message of each reader's step; 0 without a message.
+
+    ``of_sender`` has a value for each step of the sender.
+    """
     return np.where(newest >= 0, np.take_along_axis(of_sender, newest.clip(0), 1), 0)

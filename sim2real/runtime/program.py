@@ -1,4 +1,4 @@
-"""One row of a compiled graph: steps computed in slots, the world's ticks, and what is carried from one to the next."""
+"""One row of a compiled graph: the steps in its slots, then the world's ticks."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sim2real.runtime.wiring import SlotTable, Wiring
 
 
 class Rollout(NamedTuple):
-    """What a node did in a rollout, in the order of rows.
+    """A node's steps in a rollout, in order; C is the number of rows times the node's slots (or ticks) per row.
 
     Attributes:
-        seq: Shape ``(C,)``, int32: the node's step in each place; -1 where it made none.
+        seq: Shape ``(C,)``, int32: number of the step; -1 where a slot made no step.
         output: Leaves ``(C, ...)``; meaningless where ``seq`` is -1.
     """
 
@@ -27,26 +27,26 @@ class Rollout(NamedTuple):
 
 
 class RowProgram:
-    """Traces rows: tables are constants, a graph state's ``eps`` and ``step`` say where in them it stands.
+    """Traces rows; the tables are constants, looked up at the graph state's ``eps`` and ``step``.
 
     Args:
         nodes: The nodes by name.
         wiring: The tables.
         given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
-        episodes: E.
+        episodes: Number of episodes E.
     """
 
     def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any], episodes: int) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
-        # (R, E, ...): what the episodes look up in one row lies side by side.
+        # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
 
     def check_given(self, outputs: Mapping[str, Any]) -> None:
-        """Check that recorded outputs look like the default ``outputs`` of their nodes."""
+        """Check that recorded outputs have the form of their nodes' default outputs."""
         for name, recorded in self._given.items():
             one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
             check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
@@ -58,9 +58,14 @@ class RowProgram:
     def run_slots(
         self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]], inside: bool = False
     ) -> GraphState:
-        """Run the slots ``begin`` to ``end`` of the row, adding to ``outputs``; behind the last row nothing changes.
+        """Run some slots of the row; after the last row nothing changes.
 
-        ``inside`` promises that the row is none of those, which saves selecting.
+        Args:
+            gs: The graph's state.
+            begin: First slot.
+            end: Slot after the last.
+            outputs: Node -> its steps; those of these slots are appended.
+            inside: Promise that this is not after the last row, which saves masking every update.
         """
         for i in range(begin, end):
             name = self.wiring.slots[i]
@@ -72,7 +77,13 @@ class RowProgram:
         return gs
 
     def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]], inside: bool = False) -> GraphState:
-        """Run the world's ticks, adding to ``outputs``, and go to the next row; see ``run_slots``."""
+        """Run the world's ticks and go to the next row; after the last row nothing changes.
+
+        Args:
+            gs: The graph's state.
+            outputs: Node -> its steps; the world's ticks are appended.
+            inside: As in ``run_slots``.
+        """
         name, before, here = self.wiring.world, gs, None if inside else gs.step < self.wiring.rows
         if name is not None:
 
@@ -81,7 +92,8 @@ class RowProgram:
                 new, output = self.call(name, step_state)
                 return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
 
-            # A loop keeps a GPU waiting. On a CPU it costs the pendulum nothing, and MuJoCo compiles in half the time.
+            # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
+            # worlds compile in half the time.
             unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
             gs, made = jax.lax.scan(tick, gs, _at(self._world, gs), unroll=unroll)
             if here is not None:
@@ -93,7 +105,7 @@ class RowProgram:
         return gs if here is None else select(here, gs, before)
 
     def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
-        """Trace a node's step; an error in it names the node."""
+        """Call a node's step; an exception gets a note with the node's name."""
         try:
             return self.nodes[name].step(step_state)
         except Exception as error:
@@ -101,19 +113,33 @@ class RowProgram:
             raise
 
     def step_state(self, gs: GraphState, slot: int, inside: bool = False) -> StepState:
-        """Return what the step of a slot gets; its ``seq`` is -1 where no step is made, and behind the last row."""
+        """Return the step state of a slot's step; ``seq`` is -1 if the slot makes no step.
+
+        Args:
+            gs: The graph's state.
+            slot: The slot.
+            inside: Promise that this is not after the last row, where ``seq`` is -1 too.
+        """
         table = _at(self._tables[slot], gs)
         if not inside:
             table["seq"] = self.seq(gs, slot)
         return self._step_state(gs, self.wiring.slots[slot], table)
 
     def seq(self, gs: GraphState, slot: int) -> Any:
-        """Return which step a slot makes; -1 for none, and behind the last row."""
+        """Return the number of the step that a slot makes; -1 if it makes none, and after the last row."""
         inside = gs.step < self.wiring.rows
         return jnp.where(inside, self._tables[slot]["seq"][gs.step, gs.eps], -1)
 
     def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Any) -> GraphState:
-        """Take over the results of a node's step where it ``ran``; None: everywhere."""
+        """Put the results of a node's step into the graph's state.
+
+        Args:
+            gs: The graph's state.
+            name: The node's name.
+            new: The step state that the step returned.
+            output: The output that it returned.
+            ran: Bool scalar, whether the step counts; None: it does, which saves masking.
+        """
 
         def merge(field: str, fresh: Any, old: Any) -> Any:
             if fresh is old:
@@ -155,7 +181,7 @@ class RowProgram:
         return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
 
     def _look_up(self, gs: GraphState, sender: str, seq: Any) -> Any:
-        """Return recorded messages by seq; the default output where a slot is empty."""
+        """Return the recorded messages with these ``seq (W,)``; the default output where it is -1."""
 
         def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
             filled = seq.reshape(-1, *[1] * default.ndim) >= 0
@@ -165,10 +191,10 @@ class RowProgram:
 
 
 def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
-    """Return ``width`` of a node's last outputs, oldest first, that end ``age`` before its newest.
+    """Return a window of ``width`` of a node's last outputs, oldest first; ``age`` newer ones are left out.
 
-    The outputs are kept one by one and chosen by selects: both fuse into one elementwise program, where a stacked ring
-    costs a GPU a concatenation, a copy and a gather a leaf.
+    The outputs are kept as separate arrays and chosen by selects, which XLA fuses with other elementwise operations.
+    One stacked array would cost a GPU a concatenation, a copy and a gather per leaf.
     """
     spare = len(kept) - width
     window = list(kept[spare:])
@@ -178,7 +204,15 @@ def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
 
 
 def select(mask: Any, new: Any, old: Any) -> Any:
-    """Select ``new`` where the scalar ``mask`` is true, leaf by leaf; MJX's data knows itself which leaves to merge."""
+    """Return ``new`` if ``mask`` is true, else ``old``, leaf by leaf.
+
+    MJX's data is one leaf: its own ``where`` skips fields that need no merging.
+
+    Args:
+        mask: Bool scalar.
+        new: A tree.
+        old: A tree of the same structure.
+    """
 
     def one(a: Any, b: Any) -> Any:
         if a is b:

@@ -1,4 +1,4 @@
-"""A graph on the simulated clock: timelines first, then every step in the order of events, on the caller's thread."""
+"""A graph on the simulated clock: runs the steps of a timeline in order, on the caller's thread."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class _Link:
         return self._told[self._told_bounds[k] : self._told_bounds[k + 1]].tolist()
 
     def put(self, m: int, leaves: list[np.ndarray]) -> None:
-        """Keep message ``m`` if a step will consume it."""
+        """Keep message ``m``, if a step will consume it."""
         if self.seq_in[m] >= 0:
             self.waiting[m] = leaves
 
 
 class _Player:
-    """One node's place in the timeline."""
+    """One node's steps in the timeline; ``k`` is the next one."""
 
     def __init__(self, stepper: Stepper, data: NodeData, timeline: Timeline, episode: int) -> None:
         node = stepper.node
@@ -80,11 +80,11 @@ class _Player:
         self.outputs: list[_Link] = []
         self.k = 0
         self.drift = 0
-        # Of a trainable delay the step itself picks the message: the timeline does not know which.
+        # With a trainable delay the step itself picks the message; the timeline does not say which.
         self.log = StepLog(n for n, c in node.inputs.items() if not c.trainable)
 
     def blocked(self, k: int) -> int:
-        """Return the last arrival among the messages that step ``k`` waited for, 0 if there are none [ticks]."""
+        """Return the last arrival among the messages that step ``k`` waited for [ticks]; 0 if there are none."""
         awaited = [link for name, link in self.links.items() if self.stepper.node.inputs[name].blocking]
         return max((link.received[m] for link in awaited for m in link.consumed(k)[-1:]), default=0)
 
@@ -115,12 +115,12 @@ class SimulatedRun:
         supervisor: The supervisor's name.
         steppers: Prepared steppers by name.
         data: The nodes' data by name.
-        graph_state: Where the episode starts.
-        recorder: Takes records, or None.
+        graph_state: The state at the episode's start.
+        recorder: Receives all steps and messages, or None.
         own: Whether the supervisor makes its steps itself.
-        timeline: What happens when.
-        episode: Which of its episodes.
-        real_time_factor: Simulated seconds a second, at most; 0: as fast as possible.
+        timeline: The timelines.
+        episode: Index of the episode to play.
+        real_time_factor: Largest number of simulated seconds per second; 0: no limit.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class SimulatedRun:
     ) -> None:
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
         self._graph_state, self._recorder, self._own, self._factor = graph_state, recorder, own, real_time_factor
-        # In the order of the graph: of two steps at one time, a sender comes before its reader.
+        # Senders before readers: of two steps that start at the same time, the sender's comes first.
         self._players = {n: _Player(steppers[n], data[n], timeline, episode) for n in topological(nodes)}
         for player in self._players.values():
             for link in player.links.values():
@@ -157,7 +157,7 @@ class SimulatedRun:
 
     @property
     def alive(self) -> list[str]:
-        """Nodes whose threads have not ended: there are none."""
+        """Nodes whose threads have not ended: none, as this runtime has no threads."""
         return []
 
     def begin(self, timeout_s: float) -> None:
@@ -204,7 +204,7 @@ class SimulatedRun:
         """Do nothing: a step is finished when ``reply`` returns."""
 
     def run_for(self, duration_s: float) -> None:
-        """Run all steps that start within the next seconds, the supervisor making its own."""
+        """Run all steps that start within the next ``duration_s``, the supervisor making its own."""
         self._run_until(self._now + to_ticks(duration_s), None)
 
     def wait(self, timeout_s: float | None) -> bool:
@@ -236,11 +236,11 @@ class SimulatedRun:
         return snapshot(self._graph_state, self._data, self._supervisor)
 
     def statistics(self) -> dict[str, NodeStatistics]:
-        """Return how well each node kept its (simulated) times."""
+        """Return timing statistics of each node, in simulated time."""
         return {name: self._players[name].log.summary() for name in self._nodes}
 
     def _run_until(self, limit: int, deadline: float | None) -> bool:
-        """Run all steps that start before ``limit`` [ticks]; return False when ``deadline`` [s] came first."""
+        """Run all steps that start before ``limit`` [ticks]; return False if ``deadline`` [s] came first."""
         own, self._own = self._own, True
         try:
             if self._pending is not None:
@@ -255,14 +255,14 @@ class SimulatedRun:
         return True
 
     def _event(self) -> None:
-        """Make the next step of all, or offer it if it is the caller's; do nothing once the graph is stopped."""
+        """Make the step that comes next in time, or offer it to the caller; do nothing once the graph is stopped."""
         ready = [p for p in self._players.values() if p.begins[p.k] < _NEVER and p.ready(self._players)]
         if not ready:
             raise Sim2RealError(
                 "no node can step: the timeline has steps that wait for messages which nobody sends",
                 hint="draw it with sim2real.graph.schedule.draw for these nodes",
             )
-        player = min(ready, key=lambda p: p.begins[p.k])  # the first of several at one time
+        player = min(ready, key=lambda p: p.begins[p.k])  # of equals, the first in the graph's order
         begin = player.begins[player.k]
         self._now = max(self._now, begin)
         if self._factor > 0:

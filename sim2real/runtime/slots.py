@@ -1,8 +1,8 @@
-"""Which slots a boundary has, and in which of them each step is computed.
+"""Finds the sequence of slots that all rows share, and the slot of each step.
 
-All rows share one sequence of slots, and each slot belongs to one node. The steps of a row must fit into it in an order
-in which every step comes after those that it hears, and after its node's step before: a common supersequence of all
-rows, as short as possible, as a slot is computed in every row whether or not a step stands in it. Pure numpy.
+Each slot belongs to one node. The steps of every row must fit into the sequence such that each step comes after the
+steps whose messages it consumes, and after its node's previous step. The sequence should be short, because every row
+computes every slot, with or without a step in it: this is a shortest common supersequence problem. Pure numpy.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 from sim2real.errors import UsageError
 
 STEPS = 256
-"""Steps of one node at one boundary, at most."""
+"""Largest number of steps of one node in a row."""
 
 Steps = dict[str, np.ndarray]
-"""Node -> a number for each of its steps, shape ``(E, N)``, int64."""
+"""Node name -> an int64 for each of its steps, shape ``(E, N)``."""
 
 
 class Heard(NamedTuple):
@@ -30,11 +30,11 @@ class Heard(NamedTuple):
 
 
 class _Patterns(NamedTuple):
-    """The P different rows that there are.
+    """The P distinct patterns of steps in a row; rows with the same pattern are treated together.
 
     Attributes:
-        counts: Shape ``(P, n)``: how many steps of each node.
-        needs: For each node, shape ``(P, M, n)``: how many steps of each node must come before its step m of the row.
+        counts: Shape ``(P, n)``: number of steps of each of the n nodes.
+        needs: For each node, shape ``(P, M, n)``: how many steps of each node come before its m-th step in the row.
         of_row: Shape ``(E * R,)``: the pattern of each row.
     """
 
@@ -46,20 +46,20 @@ class _Patterns(NamedTuple):
 def arrange(
     supervisor: str, rows: int, row: Steps, counted: Steps, heard: Sequence[Heard]
 ) -> tuple[tuple[str, ...], Steps]:
-    """Return the node of every slot of a boundary, and the slot of each step.
+    """Return the node of each slot, and the slot of each step.
 
-    The supervisor gets as many slots as it makes steps in its fullest row, and no more; the others as few as a greedy
-    search finds.
+    The supervisor gets as many slots as it has steps in its fullest row, never more. The number of the other nodes'
+    slots is kept small by a greedy search.
 
     Args:
-        supervisor: The node whose slots are the dearest.
-        rows: How many rows there are.
-        row: Row of each step; the order of the nodes decides where nothing else does.
-        counted: Which steps are computed, shape ``(E, N)``, bool.
-        heard: What steps wait for.
+        supervisor: The node that must not get more slots than necessary.
+        rows: Number of rows.
+        row: Row of each step. Ties are decided by the order of the nodes in this dictionary.
+        counted: Node -> which of its steps are computed, shape ``(E, N)``, bool.
+        heard: The messages that steps consume.
 
     Raises:
-        UsageError: When a node makes too many steps in a row, or steps of a row wait for each other.
+        UsageError: When a node makes more than ``STEPS`` steps in a row, or steps of a row wait for each other.
     """
     names = list(row)
     index = {n: _index_in_row(r) for n, r in row.items()}
@@ -80,7 +80,7 @@ def arrange(
 
 
 def _index_in_row(row: np.ndarray) -> np.ndarray:
-    """Return how many steps of the same node come before each step in its row."""
+    """Return for each step how many steps of the same node come before it in its row."""
     step = np.broadcast_to(np.arange(row.shape[1], dtype=np.int64), row.shape)
     opens = np.ones(row.shape, bool)
     opens[:, 1:] = row[:, 1:] != row[:, :-1]
@@ -111,9 +111,9 @@ def _patterns(
 
 
 def _distinct(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Do ``np.unique`` of rows: the first place of each different row, and which of them each row is.
+    """Return what ``np.unique(axis=0)`` does: the first index of each distinct row, and for each row which it is.
 
-    Columns are folded into one number a row: of 400,000 rows that takes 0.03 s, where ``axis=0`` takes 0.8 s.
+    The columns are first combined into one integer per row: 0.03 s for 400,000 rows, against 0.8 s for ``axis=0``.
     """
     label, size = np.zeros(len(columns), np.int64), 1
     for column in columns.T[columns.any(axis=0)]:
@@ -127,12 +127,12 @@ def _distinct(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _merge(patterns: _Patterns, names: list[str], supervisor: int) -> tuple[list[int], list[np.ndarray]]:
-    """Return one sequence of nodes in which every pattern finds its steps, and the place of each step in it.
+    """Find one sequence of nodes that contains the steps of every pattern in a valid order (greedy search).
 
-    Slots are added one by one, and every row takes one as soon as it can. The next one goes to a node of which every
-    row with the most steps left has one ready: what must come gets shorter. Where there is none, a slot more than the
-    fullest row needs is spent, on the node that most patterns have ready, but never on the supervisor: where a step of
-    it has to wait, there is one that it waits for.
+    Slots are added one by one; every pattern with a step of that node ready puts it there. The next slot goes to a node
+    whose step is ready in all the patterns that have the most steps of it left, as such a slot is needed in any case.
+    If there is no such node, an extra slot goes to the node whose step is ready in most patterns. It never goes to the
+    supervisor: a step of the supervisor that is not ready waits for another node's step, which comes first.
 
     Returns:
         The sequence; and for each node, shape ``(P, M)``, the slots of the steps of each pattern.

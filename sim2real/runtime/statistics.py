@@ -1,4 +1,4 @@
-"""How well a graph kept its times."""
+"""Timing statistics of a running graph."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Quantiles(NamedTuple):
-    """Of a time [s]: median, 99 % and the largest; NaN where there is nothing."""
+    """Median, 0.99 quantile and maximum of a time [s]; NaN without samples."""
 
     p50: float
     p99: float
@@ -18,17 +18,16 @@ class Quantiles(NamedTuple):
 
 
 class NodeStatistics(NamedTuple):
-    """How well one node kept its times.
+    """Timing statistics of one node.
 
     Attributes:
-        steps: Finished steps.
-        period_s: From one step's awakening to the next.
-        lateness_s: From a step's start by the rules to its awakening.
-        overruns: Steps that could not start when they were due and had what they wait for, as the step before had not
-            ended.
-        age_s: By input: how long before a step's start the newest message that it used was sent. Where this grows, a
-            policy acts on old data, whoever was slow. Inputs are missing of which no step has used a message yet, and
-            those with a trainable delay on the simulated clock, where the step itself picks what has arrived.
+        steps: Number of finished steps.
+        period_s: Time from one step's wake-up to the next one's.
+        lateness_s: Time from a step's start by the timing rules to its wake-up.
+        overruns: Number of steps that started late only because the previous step had not ended.
+        age_s: Input -> how long before a step's start the newest message that it used was sent: how old the data are
+            that a policy acts on, whichever node was slow. Inputs without any message are left out; on the simulated
+            clock also those with a trainable delay, as there the step itself picks the message.
     """
 
     steps: int
@@ -39,10 +38,10 @@ class NodeStatistics(NamedTuple):
 
 
 class StepLog:
-    """Collects one node's times: 16 bytes a step, and 8 for each input.
+    """Collects the times of one node's steps: 16 bytes per step, and 8 more per input.
 
     Args:
-        inputs: Names of the inputs whose messages are looked at.
+        inputs: Names of the inputs whose messages' ages are collected.
     """
 
     def __init__(self, inputs: Iterable[str] = ()) -> None:
@@ -53,9 +52,12 @@ class StepLog:
         self._overruns = 0
 
     def read(self, name: str, begin: int, sent: int | None) -> None:
-        """Take in what a step that starts at ``begin`` finds at an input: when its newest message was sent [ticks].
+        """Add the age of the newest message that a step finds on an input.
 
-        None when none has come since the step before: it then goes on with the one that it had.
+        Args:
+            name: The input's name.
+            begin: The step's start [ticks].
+            sent: When the newest message was sent [ticks]; None: no new message, the step uses the previous one again.
         """
         if sent is not None:
             self._sent[name] = sent
@@ -63,14 +65,20 @@ class StepLog:
             self._ages[name].append(begin - self._sent[name])
 
     def add(self, begin: int, woken: int, overrun: bool) -> None:
-        """Take in one finished step; times in ticks [us]."""
+        """Add a finished step.
+
+        Args:
+            begin: Its start by the timing rules [ticks].
+            woken: When it was woken [ticks].
+            overrun: Whether it started late because the previous step had not ended.
+        """
         self._woken.append(woken)
         self._late.append(woken - begin)
         self._overruns += overrun
 
     def summary(self) -> NodeStatistics:
         """Return the statistics so far."""
-        count = len(self._late)  # read once: the node's thread may be adding
+        count = len(self._late)  # read once: the node's thread may add more meanwhile
         return NodeStatistics(
             steps=count,
             period_s=quantiles(np.diff(self._woken[:count])),

@@ -1,4 +1,4 @@
-"""Calling a node's step: compiled ahead of time, or as plain Python, with the same checks."""
+"""Calls a node's step, compiled ahead of time or in plain Python, with the same checks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _CARRIED = ("rng", "params", "state")
 
 
 class Result(NamedTuple):
-    """What a step did.
+    """The results of a step.
 
     Attributes:
-        changed: Those of ``rng``, ``params`` and ``state`` that it replaced.
-        ts: The start that it set itself [s], or None.
-        leaves: Its output, packed.
+        changed: Those of ``rng``, ``params`` and ``state`` that the step replaced.
+        ts: The start that the step set itself [s], or None.
+        leaves: The output, as ``Format.pack`` returns it.
     """
 
     changed: dict[str, Any]
@@ -35,7 +35,11 @@ class Result(NamedTuple):
 
 
 class Stepper:
-    """Runs the steps of one node, over any number of episodes."""
+    """Runs the steps of one node, for any number of episodes; compiles when the first is prepared.
+
+    Args:
+        node: The node.
+    """
 
     def __init__(self, node: BaseNode) -> None:
         self.node = node
@@ -43,10 +47,14 @@ class Stepper:
         self._signature: Any = None
 
     def prepare(self, data: NodeData, jit: bool) -> None:
-        """Compile the step for data like these, unless that is done; nothing is run that has side effects.
+        """Compile the step for data of this form, unless it is compiled already; a step with side effects is not run.
+
+        Args:
+            data: The node's data at the start of an episode.
+            jit: Whether to compile; nodes with ``jittable = False`` never are.
 
         Raises:
-            UsageError: When the step's results do not fit the node's state or default output.
+            UsageError: When the step's results do not have the form of the node's state or default output.
         """
         jit = jit and self.node.jittable
         arguments = (data.step_state(0, 0), data.ages(0))
@@ -63,12 +71,18 @@ class Stepper:
 
             traced = jax.jit(call).trace(*arguments)
             self._compiled = traced.lower().compile()
-            if not traced.jaxpr.effects:  # pure: a first call fills caches, its result is dropped
+            if not traced.jaxpr.effects:  # no side effects: a first call, whose result is dropped, fills caches
                 jax.block_until_ready(self._compiled(*arguments))
         self._signature = signature
 
     def run(self, data: NodeData, step_state: StepState, ages: Mapping[str, np.ndarray]) -> Result:
-        """Run one step to its end."""
+        """Run one step and wait for its results.
+
+        Args:
+            data: The node's data.
+            step_state: What the step gets.
+            ages: Input name -> ages of its messages [s], shape ``(W,)``, for inputs whose trainable delay is applied.
+        """
         if self._compiled is not None:
             changed, output = jax.block_until_ready(self._compiled(step_state, dict(ages)))
             leaves = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(output)]
@@ -80,7 +94,14 @@ class Stepper:
         return Result(changed, changed.pop("ts", None), leaves)
 
     def answer(self, data: NodeData, given: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> Result:
-        """Return the result of a step that the caller made, or changed before the node makes it."""
+        """Return the results of a step to which a caller has replied; the node is run if the caller gave no output.
+
+        Args:
+            data: The node's data.
+            given: What the step gets.
+            ages: As in ``run``.
+            reply: The caller's reply.
+        """
         before = {} if reply.step_state is None else _changed(given, reply.step_state)
         if reply.leaves is not None:
             return Result(before, before.pop("ts", None), reply.leaves)
@@ -97,7 +118,7 @@ class Stepper:
         return _changed(step_state, result[0]), result[1]
 
     def _matched(self, given: StepState, changed: dict[str, Any], output: Any, default: Any) -> tuple[dict, Any]:
-        """Return a step's results in the types that the node's state and default output have."""
+        """Return a step's results in the dtypes of the node's state and default output."""
         name = self.node.name
         for field in _CARRIED:
             if field in changed:
@@ -107,13 +128,13 @@ class Stepper:
 
 
 def overwritten(ts: Any, begin: int, now: int, node: str) -> int:
-    """Return the start that a step set itself [ticks], or -1 if it left its start alone (rule 4).
+    """Return the start that a step has set itself [ticks]; -1 if it has not changed it (rule 4).
 
-    Compared in float32, as that is how the step got its start.
+    Times are compared in float32, the type of ``StepState.ts``.
 
     Args:
-        ts: What the step left in ``ts`` [s]; None if it left it alone.
-        begin: Its start [ticks].
+        ts: The step's ``ts`` afterwards [s]; None if it was not replaced.
+        begin: The step's start [ticks].
         now: The time after the step [ticks].
         node: The node's name.
 
@@ -134,7 +155,7 @@ def overwritten(ts: Any, begin: int, now: int, node: str) -> int:
 
 
 def _changed(given: StepState, new: StepState) -> dict[str, Any]:
-    """Return the fields that a step replaced: what it leaves alone need not leave the compiled program."""
+    """Return the fields that a step replaced; the others need not be outputs of the compiled program."""
     return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(given, f)}
 
 

@@ -1,4 +1,4 @@
-"""An interpreter of index tables in plain Python: what the compiled program does, without compiling it."""
+"""An interpreter of the index tables in plain Python: does what the compiled program does, to test the tables."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sim2real.graph.testing.nodes import hash_step
 from sim2real.runtime.wiring import SlotTable, Wiring
 
 Windows = dict[str, tuple[list[int], list[Any]]]
-"""Input name -> seq and value of each message in the window, oldest first."""
+"""Input name -> (seq of each message in the window, value of each), oldest first."""
 
 
 class TableError(AssertionError):
-    """The tables of a wiring contradict themselves."""
+    """The tables of a wiring contradict each other."""
 
 
 def interpret(
@@ -27,21 +27,21 @@ def interpret(
     defaults: Mapping[str, Any],
     given: Mapping[str, list[Any]] | None = None,
 ) -> dict[str, list[Any]]:
-    """Play one episode of a wiring and return the outputs of each node, by seq.
+    """Play one episode and return the outputs of each node, by seq.
 
-    Messages are found as the compiled program finds them: by their age in a ring of the sender's last outputs. The
-    tables say apart from that which messages they are, so every one is checked.
+    Messages are looked up as in the compiled program, by their age in a buffer of the sender's last outputs, and each
+    is checked against the ``seq`` that the tables also have.
 
     Args:
         nodes: The nodes by name.
         wiring: The tables.
-        episode: Which episode.
-        step: Makes a step: node, seq, windows -> output.
+        episode: Index of the episode.
+        step: Makes a step: (node, seq, windows) -> output.
         defaults: Default output of each node.
         given: Outputs of nodes that do not run.
 
     Raises:
-        TableError: When a window holds another message than the table says, or a node's steps are not in order.
+        TableError: When a window has another message than the table says, or a node's steps are not in order.
     """
     rings = {n: [(-1, defaults[n])] * length for n, length in wiring.rings.items()}
     made: dict[str, list[Any]] = {n: [] for n in nodes}
@@ -92,7 +92,7 @@ def interpret_hashes(
     Args:
         nodes: Hash nodes (``sim2real.graph.testing``) without trainable delays, by name.
         wiring: The tables.
-        episode: Which episode.
+        episode: Index of the episode.
         states: Initial states.
         outputs: Default outputs, numbers.
 

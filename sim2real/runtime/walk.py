@@ -1,4 +1,4 @@
-"""From one step of the supervisor to its next one: what ``CompiledGraph.reset`` and ``step`` do between their hands."""
+"""Runs a compiled graph from one step of the supervisor to its next one, for ``CompiledGraph.reset`` and ``step``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from sim2real.runtime.program import RowProgram, select
 
 
 class Walk:
-    """Where in the rows the supervisor makes its steps, and how to get from one to the next.
+    """Knows where in the rows the supervisor makes its steps, and runs from one to the next.
+
+    The supervisor may have several slots in a row; its i-th one is called turn i.
 
     Args:
-        program: The rows.
-        supervisor: The node at whose steps ``reset`` and ``step`` hand over.
+        program: Runs the rows.
+        supervisor: The supervisor's name.
 
     Attributes:
-        turns: Slots of the supervisor at a boundary.
+        turns: The supervisor's slots.
+        places: Shape ``(E, K)``: place of each of its steps, ``row * number of turns + turn``.
+        end: The place after the last row, also used for steps that an episode does not have.
     """
 
     def __init__(self, program: RowProgram, supervisor: str) -> None:
@@ -29,7 +33,6 @@ class Walk:
         self.program, self.supervisor, self.rows = program, supervisor, wiring.rows
         self.turns = [i for i, n in enumerate(wiring.slots) if n == supervisor]
         self.end = self.rows * len(self.turns)
-        # Place of each of the supervisor's steps, (E, K): row * turns + turn; behind the last row where there is none.
         self.places = np.full((program.episodes, 0), 0)
         if self.turns:
             seq = np.stack([wiring.tables[i].seq for i in self.turns], axis=-1).reshape(program.episodes, -1)
@@ -39,12 +42,12 @@ class Walk:
 
     @property
     def counts(self) -> np.ndarray:
-        """How many steps of the supervisor each episode has, shape ``(E,)``."""
+        """Number of the supervisor's steps in each episode, shape ``(E,)``."""
         return (self.places < self.end).sum(axis=1)
 
     @property
     def longest_gap(self) -> int:
-        """The most rows between two steps of the supervisor."""
+        """Largest number of rows from one step of the supervisor to the next."""
         return int(np.diff(self.places // max(1, len(self.turns)), axis=1).max(initial=1))
 
     def first_turn(self) -> int:
@@ -63,7 +66,7 @@ class Walk:
         raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
 
     def only_turn(self) -> int:
-        """Return the supervisor's one slot.
+        """Return the supervisor's only slot.
 
         Raises:
             UsageError: When it has none, or several.
@@ -83,27 +86,33 @@ class Walk:
         return self._stand(*self._search(gs, jnp.int32(0), found, int(self.places[:, 0].max())))
 
     def turn_of(self, gs: GraphState, k: Any) -> Any:
-        """Return at which of its turns the supervisor makes step ``k``."""
+        """Return the turn at which the supervisor makes step ``k``."""
         return jnp.asarray(self.places)[gs.eps, jnp.maximum(k, 0)] % len(self.turns)
 
     def to_next(self, gs: GraphState, turn: Any, ended: Any) -> tuple[GraphState, StepState]:
-        """Run from behind the supervisor's step at ``turn`` to its next one; an episode that has ``ended`` stays."""
+        """Run to the supervisor's next step.
+
+        Args:
+            gs: The graph's state, with the supervisor's step done.
+            turn: The turn of that step.
+            ended: Bool scalar: the episode has no further step, and the state stays as it is.
+        """
         return self._stand(*self._search(gs, turn, ended, int(np.diff(self.places, axis=1).max(initial=1))))
 
     def seen(self, gs: GraphState, turn: Any) -> StepState:
-        """Return what the supervisor sees at a turn; ``seq`` is -1 where it makes no step."""
+        """Return what the supervisor sees at a turn; ``seq`` is -1 if it makes no step there."""
         step_state = self.program.step_state(gs, self.turns[0])
         for i, slot in enumerate(self.turns[1:], start=1):
             step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
         return step_state
 
     def _stand(self, gs: GraphState, turn: Any) -> tuple[GraphState, StepState]:
-        """Return the state that awaits a step of the supervisor, and what it sees."""
+        """Return the state with the supervisor's next step noted in ``seq``, and what the supervisor sees."""
         step_state = self.seen(gs, turn)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state  # pyright: ignore[reportAttributeAccessIssue]
 
     def _hop(self, gs: GraphState, i: int) -> GraphState:
-        """Run from the supervisor's turn ``i`` of a row to its next turn, in this row or the next one."""
+        """Run from turn ``i`` to the next turn, in this row or the next one."""
         slots = len(self.program.wiring.slots)
         if i + 1 < len(self.turns):
             return self.program.run_slots(gs, self.turns[i] + 1, self.turns[i + 1], {}, inside=True)
@@ -112,10 +121,10 @@ class Walk:
         return self.program.run_slots(gs, 0, self.turns[0], {})
 
     def _search(self, gs: GraphState, turn: Any, found: Any, hops: int) -> tuple[GraphState, Any]:
-        """Hop on until the supervisor makes a step, ``hops`` times at most; return the state and its turn.
+        """Run from turn to turn until the supervisor makes a step; return the state and the turn.
 
-        What is computed behind the step that was found, and behind the last row, is selected away. A loop, and not row
-        after row: the program is as large as one row, however many lie between two steps.
+        Always runs ``hops`` turns, the most that any step needs: once the step is found, and after the last row, the
+        state is masked. As a loop, so that the program has the size of one row however many are run.
         """
         turns = len(self.turns)
 

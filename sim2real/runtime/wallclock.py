@@ -1,4 +1,4 @@
-"""A graph on the wall clock: one thread a node, the timing rules with measured times."""
+"""A graph on the wall clock: one thread per node, and the timing rules with measured times."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class WallClockRun:
         supervisor: The supervisor's name.
         steppers: Prepared steppers by name.
         data: The nodes' data by name.
-        graph_state: Where the episode starts.
-        recorder: Takes records, or None.
+        graph_state: The state at the episode's start.
+        recorder: Receives all steps and messages, or None.
         own: Whether the supervisor makes its steps itself.
-        spin_s: How long threads poll before a step instead of sleeping [s].
+        spin_s: How long before each step a thread polls the clock instead of sleeping [s].
         timeout_s: How long the supervisor waits for its caller [s].
         step_timeout_s: How long a step may take, see ``step_limits``.
     """
@@ -74,7 +74,7 @@ class WallClockRun:
 
     @property
     def ended(self) -> bool:
-        """Whether the graph has stopped, or is about to."""
+        """Whether the graph has stopped, or is stopping."""
         return self._shared.stopping.is_set()
 
     @property
@@ -83,15 +83,15 @@ class WallClockRun:
         return [n for n, t in self._threads.items() if t.is_alive()]
 
     def begin(self, timeout_s: float) -> None:
-        """Start the nodes up, each in its thread, and then the clock."""
+        """Call the nodes' startups, each in its thread, and then start the clock."""
         self._shared.timeout_s = timeout_s
         with self._stop_lock:
             self._refuse_if_stopped()
-            # Before the startups, which may switch torque on: collecting garbage holds every thread up, for half a
-            # second in a large process, and a servo's watchdog would trip.
+            # Before the startups, which may switch torque on: a garbage collection stops all threads, for 0.5 s in a
+            # large process, and a servo's watchdog would trip.
             self._process.enter_context(realtime())
             deadline = time.monotonic() + timeout_s
-            # Under the lock: a stop from another thread waits until all that will ever start has started, and ends it.
+            # Under the lock: stop() in another thread then finds either no thread started or all of them.
             self._watchdog.start()
             for thread in self._threads.values():
                 thread.start()
@@ -120,7 +120,7 @@ class WallClockRun:
             raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
 
     def check(self) -> None:
-        """Stop and raise the failure, if there was one that nobody has heard of."""
+        """Stop the graph and raise its failure, if it has one that was not raised yet."""
         if self._shared.failure is not None:
             self.stop(self._shared.timeout_s)
 
@@ -138,18 +138,18 @@ class WallClockRun:
         return step_state
 
     def reply(self, reply: Reply) -> int:
-        """Give the step on offer back to the supervisor; return how many steps are finished once it is."""
+        """Reply to the step on offer; return how many steps are finished once that one is."""
         return self._handover.reply(reply)
 
     def settle(self, finished: int, timeout_s: float) -> None:
-        """Wait until the supervisor has finished that many steps."""
+        """Wait until the supervisor has finished ``finished`` steps."""
         done = self._handover.settle(finished, timeout_s)
         self.check()
         if not done:
             self._missing(f"the supervisor {self._supervisor!r} has not finished its step after {timeout_s:g} s")
 
     def run_for(self, duration_s: float) -> None:
-        """Let the graph run, the supervisor making its own steps; return early when it is stopped."""
+        """Let the graph run for ``duration_s``, the supervisor making its own steps; return early if it is stopped."""
         self._handover.set_own(True)
         self._shared.stopping.wait(duration_s)
         self.check()
@@ -157,17 +157,17 @@ class WallClockRun:
             self._handover.set_own(False)
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Wait for the graph's end; return whether it came."""
+        """Wait until the graph stops; return False if the time was up before."""
         ended = self._shared.stopping.wait(timeout_s)
         self.check()
         return ended
 
     def stop(self, timeout_s: float) -> None:
-        """Stop all nodes and make them safe; raise the first failure that nobody has heard of."""
+        """Stop all nodes and make them safe; raise the graph's failure, if it has one that was not raised yet."""
         deadline = time.monotonic() + timeout_s
         self._shared.stop(timeout_s)
         if threading.current_thread() in self._threads.values():
-            return  # a node that stops its own graph; whoever else calls stop() waits for it
+            return  # a node stops its own graph: its thread cannot wait for itself
         with self._stop_lock:
             if not self._stopped:
                 self._stopped = True
@@ -181,11 +181,11 @@ class WallClockRun:
         return snapshot(self._graph_state, self._data, self._supervisor)
 
     def statistics(self) -> dict[str, NodeStatistics]:
-        """Return how well each node kept its times."""
+        """Return timing statistics of each node."""
         return {name: thread.log.summary() for name, thread in self._threads.items()}
 
     def _wake(self) -> None:
-        """Wake everybody who waits for something that will not come."""
+        """Wake threads that wait for messages or for the caller: neither will come any more."""
         self._handover.close()
         for channel in self._channels.values():
             channel.stop()
@@ -225,7 +225,7 @@ class WallClockRun:
                         self._recorder.message(record)
         except Sim2RealError as error:
             self._shared.fail(error)
-        except Exception as error:  # the nodes' own failure, if there is one, must still reach the caller
+        except Exception as error:  # as a note, if a node has failed: that failure must still reach the caller
             self._shared.fail(Sim2RealError(f"the recorder failed at the end: {type(error).__name__}: {error}"))
 
     def _missing(self, what: str) -> NoReturn:

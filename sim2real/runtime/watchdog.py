@@ -1,4 +1,4 @@
-"""Who looks after the threads of the nodes: a step that does not end, a startup that outlives the stop."""
+"""Watches the nodes' threads for a step that hangs, and for a startup that goes on after the graph has stopped."""
 
 from __future__ import annotations
 
@@ -11,27 +11,30 @@ from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.nodethread import NodeThread, Shared
 
 LEAST_S, PERIODS = 1.0, 10.0
-"""By default a step hangs after so many of its node's periods, but not before so many seconds: a busy laptop may well
-hold a step up for a few hundred milliseconds."""
+"""By default a step counts as hanging after ``PERIODS`` periods of its node, but not before ``LEAST_S`` [s]: on a busy
+laptop a step may well be delayed by a few hundred milliseconds."""
 LAST_RESORT_S = 1.0
-"""How long a call of a node's ``stop`` from outside may take before nobody waits for it any more [s]."""
+"""How long to wait for a node's ``stop`` that is called from another thread than the node's [s]."""
 _GRACE_S = 0.2
-"""A startup that still runs so long after the graph was stopped is not waited for [s]."""
+"""How long a startup may go on after the graph was stopped, before the node's ``stop`` is called [s]."""
 
 
 def step_limits(nodes: Mapping[str, BaseNode], limit_s: float | None) -> dict[str, float]:
-    """Return how long a step of each node may take [s]: ``limit_s`` for all, 0 for ever, None for the default."""
+    """Return how long a step of each node may take [s].
+
+    ``limit_s`` is the limit for all nodes; 0: no limit; None: the default, ten periods of the node but at least 1 s.
+    """
     if limit_s is None:
         return {name: max(LEAST_S, PERIODS / node.rate) for name, node in nodes.items()}
     return dict.fromkeys(nodes, limit_s or float("inf"))
 
 
 class Watchdog(threading.Thread):
-    """Fails the graph when a step takes too long, and makes a node safe whose own thread cannot.
+    """Stops the graph when a step takes too long, and calls ``stop`` of a node whose own thread is busy.
 
     Args:
-        threads: The threads of the nodes.
-        limits: How long a step of each may take [s], by name.
+        threads: The nodes' threads.
+        limits: Node name -> how long a step may take [s].
         shared: What all threads share.
     """
 
@@ -41,7 +44,7 @@ class Watchdog(threading.Thread):
         self._quit = threading.Event()
 
     def run(self) -> None:
-        """Look whenever a thread that runs now, or starts to run now, could have run for too long."""
+        """Check the threads; sleep between checks until the earliest time at which one could exceed its limit."""
         shared, stopped_s = self._shared, 0.0
         while not self._quit.is_set():
             now = time.monotonic()
@@ -53,19 +56,19 @@ class Watchdog(threading.Thread):
             waiting.wait(min(rest, threading.TIMEOUT_MAX))
 
     def finish(self) -> None:
-        """End: the graph has stopped, and its threads have ended or have had their time."""
+        """End the watchdog, after the graph has stopped."""
         self._quit.set()
         if self.ident is not None:
             self.join()
 
     def _look(self, thread: NodeThread, now: float, stopped_s: float) -> float:
-        """Deal with a thread that has run too long; return how long it, or what it does next, may run [s]."""
+        """Act if a thread has exceeded its limit; return how long it may still go on before the next check [s]."""
         limit = self._limits[thread.node.name]
         since, during = thread.since_s, thread.during
         if since is None:
             return limit
         if during == "startup" and not stopped_s:
-            return limit  # it has a timeout of its own
+            return limit  # startups have their own timeout, in WallClockRun.begin
         rest = stopped_s + _GRACE_S - now if during == "startup" else since + limit - now
         if rest > 0 or thread.since_s != since:
             return rest
@@ -78,6 +81,6 @@ class Watchdog(threading.Thread):
                 )
             )
         thread.make_safe_from_outside(LAST_RESORT_S)
-        if during != "startup":  # which may well come back, and then stops by itself
+        if during != "startup":  # a startup may still end, after which its thread calls stop and ends
             thread.over.set()
         return limit

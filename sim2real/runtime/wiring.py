@@ -1,7 +1,8 @@
-"""From timelines to index tables: what runs in which row of the compiled program, and which messages it reads.
+"""Turns timelines into index tables: which step each slot of each row computes, and which messages the step reads.
 
-A row is one boundary, where steps of the nodes run in **slots**, followed by n world ticks; ``placement.py`` decides
-which step runs where. Pure numpy, ahead of time; ``sim2real.runtime.testing`` interprets the tables.
+A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks;
+``placement.py`` decides which step is computed where. Pure numpy, before anything is compiled;
+``sim2real.runtime.testing`` interprets the tables for tests.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ EMPTY_AGE_S = 1e6
 
 @dataclass(frozen=True)
 class InputTable:
-    """Which messages an input shows, for every episode, row (and tick of the row, for a world).
+    """The messages in an input's window, for every episode and row (and tick of the row, for a world).
 
     Attributes:
-        age: Shape ``(E, R, ...)``, int32: how many messages of the sender are newer than the newest one shown.
+        age: Shape ``(E, R, ...)``, int32: how many outputs the sender has made since the newest message in the window.
         seq: Shape ``(E, R, ..., W)``, int32: -1 in empty slots.
         sent: Like ``seq``, float32 [s].
         received: Like ``seq``, float32 [s].
-        lead: Like ``seq``, float32: reader's start minus time of sending [s].
+        lead: Like ``seq``, float32: reader's start minus sent time [s]; ``EMPTY_AGE_S`` in empty slots.
     """
 
     age: np.ndarray
@@ -42,7 +43,13 @@ class InputTable:
 
 @dataclass(frozen=True)
 class SlotTable:
-    """The steps of one slot: ``seq`` int32 (-1: none) and ``ts`` float32 [s], shape ``(E, R, ...)``, and the inputs."""
+    """The steps that one slot computes, for every episode and row (and tick of the row, for a world).
+
+    Attributes:
+        seq: Shape ``(E, R, ...)``, int32: number of the step; -1: no step.
+        ts: Like ``seq``, float32: the step's start [s].
+        inputs: Input name -> the messages that the step reads.
+    """
 
     seq: np.ndarray
     ts: np.ndarray
@@ -54,15 +61,15 @@ class Wiring:
     """The tables of a compiled graph.
 
     Attributes:
-        world: The node that ticks in every row; None without a world.
-        ticks: World ticks in a row.
-        rows: Rows.
-        slots: Node of each slot of a boundary, in the order in which they run.
+        world: Name of the world that ticks in every row; None without a world.
+        ticks: Number of world ticks in a row.
+        rows: Number of rows.
+        slots: The node of each slot, in the order in which slots run.
         tables: One for each slot.
         world_table: The world's; arrays ``(E, R, ticks, ...)``.
         rings: Node -> how many of its last outputs are kept.
-        discarded: Share of slot computations whose result is not used.
-        bursts: (node, input) -> the most messages that one step after the first consumes at once.
+        discarded: Fraction of the slots, over all rows, that compute no step.
+        bursts: (node, input) -> the most messages that one step consumes, the first step left out.
     """
 
     world: str | None
@@ -83,13 +90,13 @@ def wire(
 
     Args:
         nodes: The nodes by name.
-        supervisor: The node whose rate sets the longest row.
-        timeline: What ran when.
-        given: Nodes whose outputs are known beforehand: they take no slot, and readers look their messages up by seq.
+        supervisor: The supervisor's name; a row is at most as long as its period.
+        timeline: The timelines.
+        given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
 
     Raises:
-        UsageError: When the supervisor is not in the timeline, the timeline holds no row, or messages come in a burst
-            that a window with a trainable delay does not hold.
+        UsageError: When the supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
+            trainable delay is too short for a burst of messages.
     """
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
@@ -99,13 +106,13 @@ def wire(
 
 
 class _Tables:
-    """Writes the tables of one placement."""
+    """Makes the tables of one placement."""
 
     def __init__(self, placer: Placer, placement: Placement) -> None:
         self.placer, self.placement = placer, placement
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
-        # When each step is done: by row and slot, as the program runs.
+        # When the program computes each step, as a number that increases with row and slot.
         self.done = {
             n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
             for n in placer.others
@@ -155,7 +162,10 @@ class _Tables:
         return SlotTable(split(flat.seq), split(flat.ts), inputs)
 
     def _table(self, name: str, seq: np.ndarray, moment: np.ndarray, ticks: np.ndarray) -> SlotTable:
-        """Return the table of steps ``seq`` ``(E, C)`` at moments ``(C,)``: the world has made ``ticks``, ``(C,)``."""
+        """Return the table of steps ``seq (E, C)``.
+
+        ``moment (C,)`` is when the program computes each, ``ticks (C,)`` how many ticks the world has then made.
+        """
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
         inputs = {}
         for key, edge in self.placer.edges.items():
@@ -173,7 +183,11 @@ class _Tables:
     def _input_table(
         self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, made: np.ndarray | None
     ) -> InputTable:
-        """Return what steps see on an input when its sender has made ``made`` steps; None: its outputs are given."""
+        """Return the messages that steps read on an input.
+
+        ``seq (E, C)`` and ``ts (E, C)`` [ticks] are the steps and their starts; ``made (E, C)`` is how many steps the
+        sender has then made, None if its outputs are given.
+        """
         connection, edge = self.nodes[key[0]].inputs[key[1]], self.placer.edges[key]
         sender: Vertex = self.timeline.vertices[edge.sender]
         newest = np.take_along_axis(self.placer.newest[key], seq.clip(0), 1)
