@@ -23,32 +23,32 @@ from sim2real.policy.runner import BACKENDS, OBSERVATION_CLIP, NumpyBackend, Onn
 FORMAT_VERSION = 1
 WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
 PARITY = 1e-5
-"""Largest difference between numpy and ONNX that an export may have, as a share of the action range."""
+"""Largest difference between the actions of numpy and ONNX that an export accepts, as a fraction of their range."""
 
 
 LARGEST = 1e6
-"""Largest magnitude in a policy's weights and normaliser: trained ones stay below 1e3."""
+"""Largest magnitude accepted in a policy's weights and normaliser; those of trained policies are below 1e3."""
 LEAST_STD = 1e-6
-"""Smallest standard deviation of a normaliser: trained ones are at least 1e-3."""
+"""Smallest standard deviation accepted in a normaliser; those of trained policies are at least 1e-3."""
 
 
 def save_bundle(
     folder: str | Path, weights: Mapping[str, np.ndarray], contract: PolicyContract, samples: np.ndarray | None = None
 ) -> Path:
-    """Write a bundle; ``policy.json`` comes last, so that a folder with one is complete.
+    """Write a bundle; ``policy.json`` is written last, so that a folder that has it is complete.
 
     Args:
-        folder: Where to; made if it is not there. A bundle that is there already is replaced.
+        folder: The folder; made if it does not exist. A bundle in it is replaced.
         weights: As ``Policy.to_weights`` returns them.
-        contract: What the policy expects and promises.
-        samples: Shape ``(n, O)``: observations, logged ones if there are any, on which numpy and ONNX are compared
-            where onnxruntime is installed. Without any, drawn from the normaliser.
+        contract: Observations, actions and rate of the policy.
+        samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared if
+            onnxruntime is installed. None: drawn from the normaliser.
 
     Returns:
         The folder.
 
     Raises:
-        Sim2RealError: Weights and contract do not fit together, or numpy and ONNX disagree.
+        Sim2RealError: Weights and contract do not fit each other, or numpy and ONNX give different actions.
     """
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract)
@@ -78,14 +78,17 @@ def save_bundle(
 
 
 def load_bundle(folder: str | Path, backend: str = "numpy") -> PolicyRunner:
-    """Open a bundle.
+    """Read a bundle.
 
     Args:
-        folder: What ``save_bundle`` wrote.
-        backend: ``"numpy"``, or ``"onnx"`` where onnxruntime is installed.
+        folder: A folder that ``save_bundle`` has written.
+        backend: ``"numpy"``, or, if onnxruntime is installed, ``"onnx"``.
+
+    Returns:
+        The policy, ready to run.
 
     Raises:
-        UsageError: There is no such backend.
+        UsageError: The backend is unknown or not installed.
         Sim2RealError: A file is missing, damaged or of a format that this version does not know.
     """
     if backend not in BACKENDS:
@@ -101,7 +104,7 @@ def load_bundle(folder: str | Path, backend: str = "numpy") -> PolicyRunner:
 
 
 def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
-    """Return the weights in a bundle, as ``Policy.from_weights`` takes them.
+    """Return the weights of a bundle, as ``Policy.from_weights`` takes them.
 
     Raises:
         Sim2RealError: A file is missing, damaged or of a format that this version does not know.
@@ -115,7 +118,7 @@ def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_about(folder: Path) -> dict[str, Any]:
-    """Return what ``policy.json`` says, once its format version is known to be ours."""
+    """Return the content of ``policy.json``, after checking its format version."""
     path = folder / CONTRACT
     try:
         about = json.loads(path.read_text())
@@ -140,7 +143,7 @@ def _read_about(folder: Path) -> dict[str, Any]:
 
 
 def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
-    """Return the bytes of a file, once they are those that were written."""
+    """Return the bytes of a file, after checking its hash."""
     try:
         content = (folder / name).read_bytes()
     except FileNotFoundError as error:
@@ -159,7 +162,7 @@ def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
 
 
 def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> None:
-    """Raise unless the weights are finite, chain up and match the contract's sizes and bounds."""
+    """Raise unless the weights are finite and their shapes fit each other and the contract's sizes and bounds."""
     layers = layers_of(weights)
     size, actions = contract.observation_size, len(contract.action)
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}

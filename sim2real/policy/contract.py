@@ -1,4 +1,4 @@
-"""What a policy expects to see and promises to send."""
+"""The contract of a policy: its observations, actions, rate and limits."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class ObservationTerm:
     """A part of the observation vector.
 
     Attributes:
-        name: What it is, e.g. ``"past_actions"``.
-        units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` has none.
-        history: How many steps of it the vector holds, newest step first.
+        name: Its name, e.g. ``"past_actions"``.
+        units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` stands for no unit.
+        history: Number of steps that the vector has of it, newest step first.
     """
 
     name: str
@@ -25,7 +25,7 @@ class ObservationTerm:
     history: int = 1
 
     def __post_init__(self) -> None:
-        """Check that the term has entries."""
+        """Check that the term has at least one entry."""
         if isinstance(self.units, str) or not self.units or self.history < 1:
             raise UsageError(
                 f"observation term {self.name!r} needs at least one unit and one step of history, "
@@ -41,7 +41,14 @@ class ObservationTerm:
 
 @dataclasses.dataclass(frozen=True)
 class ActionTerm:
-    """One entry of the action vector: its name, unit and bounds [unit]."""
+    """One entry of the action vector.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit; ``"1"`` stands for none.
+        low: Lower bound [unit].
+        high: Upper bound [unit].
+    """
 
     name: str
     unit: str
@@ -58,7 +65,7 @@ class ActionTerm:
 
 @dataclasses.dataclass(frozen=True)
 class PolicyContract:
-    """What a robot must give a policy and may expect of it.
+    """What a policy must be given and what it returns.
 
     Attributes:
         observation: The terms of the observation vector in their order.
@@ -66,7 +73,7 @@ class PolicyContract:
         rate_hz: Policy steps per second.
         delays_s: Name -> expected delay that the policy was trained with [s], e.g. ``{"sensor -> agent": 0.012}``.
         limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
-        hashes: Name -> sha256 of what it was made from, e.g. of the log and the identified parameters.
+        hashes: Name -> sha256 of the files that it was made from, e.g. the log and the identified parameters.
     """
 
     observation: tuple[ObservationTerm, ...]
@@ -77,7 +84,7 @@ class PolicyContract:
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that there is something to see, something to do, and a rate."""
+        """Check that there are observations and actions with unique names, and that rate and delays are valid."""
         if not self.observation or not self.action:
             raise UsageError("a policy needs at least one observation term and one action")
         for kind, terms in (("observation term", self.observation), ("action", self.action)):
@@ -98,7 +105,7 @@ class PolicyContract:
 
     @property
     def observation_names(self) -> list[str]:
-        """One name per entry, e.g. ``past_actions[1][0]``: the action before the newest of these."""
+        """One name per entry: term, step before the newest, and index, e.g. ``past_actions[1][0]``."""
         return [
             f"{term.name}[{step}][{i}]"
             for term in self.observation
@@ -115,10 +122,10 @@ class PolicyContract:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicyContract:
-        """Return the contract that ``to_dict`` was called on.
+        """Return the contract from the data that ``to_dict`` returns.
 
         Raises:
-            Sim2RealError: A part is missing or of the wrong kind.
+            Sim2RealError: A part is missing or of the wrong type.
         """
         try:
             return cls(

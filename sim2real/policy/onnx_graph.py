@@ -1,4 +1,4 @@
-"""A policy as an ONNX graph: normaliser, network and action bounds in one file that any runtime loads."""
+"""A policy as an ONNX graph: normaliser, network and action bounds in one file for any ONNX runtime."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import OBSERVATION_CLIP, layers_of
 
 OPSET = 17
-IR_VERSION = 8  # of the release that brought opset 17: older runtimes on a robot still load it
+IR_VERSION = 8  # that of the ONNX release with opset 17, not the newest, so that older runtimes on a robot load it
 
 
 def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> bytes:
     """Return the serialised model: ``observation (1, O)`` -> ``action (1, A)``, float32.
 
-    The batch axis is there because a Gemm takes matrices only. The contract travels along as metadata.
+    The batch axis is there because ONNX's Gemm takes matrices only. The contract is stored in the model's metadata.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 

@@ -1,4 +1,4 @@
-"""Running a policy on the robot: numpy or onnxruntime, no JAX."""
+"""Runs a policy on the robot with numpy or onnxruntime, without JAX."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.policy.contract import PolicyContract
 
 OBSERVATION_CLIP = 10.0
-"""Normalised observations beyond this many standard deviations are clipped: part of the bundle's format."""
+"""Normalised observations are clipped to this many standard deviations, which is part of the bundle's format."""
 
 BACKENDS = ("numpy", "onnx")
 
@@ -42,7 +42,7 @@ def layers_of(weights: Mapping[str, Any]) -> list[tuple[Any, Any]]:
 
 
 class NumpyBackend:
-    """The network in numpy: nothing to install, nothing to warm up.
+    """The network in numpy: needs no other package and no warm-up.
 
     Args:
         weights: As ``Policy.to_weights`` returns them, float32.
@@ -63,14 +63,14 @@ class NumpyBackend:
 
 
 class OnnxBackend:
-    """The network in onnxruntime, on one thread: at these sizes more threads only add jitter.
+    """The network in onnxruntime, on one thread, as more threads only add jitter for networks of this size.
 
     Args:
         model: The bytes of ``policy.onnx``.
 
     Raises:
         UsageError: onnxruntime is not installed.
-        Sim2RealError: The bytes are no model that it can run.
+        Sim2RealError: onnxruntime cannot load the model.
     """
 
     def __init__(self, model: bytes) -> None:
@@ -97,7 +97,7 @@ class PolicyRunner:
     """A policy as a function of the observation.
 
     Args:
-        contract: What the policy expects and promises.
+        contract: Observations, actions and rate of the policy.
         backend: The network.
     """
 
@@ -132,4 +132,5 @@ class PolicyRunner:
         if not np.isfinite(action).all():
             names = [term.name for term, ok in zip(self.contract.action, np.isfinite(action), strict=True) if not ok]
             raise SafetyStop(f"the policy's action {', '.join(names)} is not finite", hint="train the policy again")
-        return np.clip(action, self._low, self._high)  # a graph may be anything: the contract is what holds
+        # An ONNX file may come from elsewhere: the contract's bounds hold in any case.
+        return np.clip(action, self._low, self._high)

@@ -15,13 +15,13 @@ from sim2real.train.protocol import Step
 
 
 class TaskEnvironment:
-    """One copy of a task on MJX; the observation is a vector of all its observables, in their order.
+    """A composed task on MJX as an environment; the observation is the vector of all its observables, in their order.
 
     Args:
-        environment: The task as a pure environment, with a time limit unless its episodes end by themselves.
+        environment: The task; it needs a time limit unless its episodes end by themselves.
 
     Raises:
-        UsageError: When actions are no vector with bounds.
+        UsageError: When the action is not a vector with bounds.
     """
 
     def __init__(self, environment: MjxEnvironment) -> None:
@@ -37,12 +37,18 @@ class TaskEnvironment:
         self.action_low, self.action_high = bounds
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
-        """Return a copy at the start of an episode and what it observes."""
+        """Return the state at the start of an episode and the first observation."""
         state = self.environment.reset(key)
         return state, _vector(state)
 
     def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
-        """Take a control step; randomness is the copy's own."""
+        """Make one control step.
+
+        Args:
+            state: What ``reset`` or ``step`` returned.
+            action: Shape ``(A,)`` [the actuators' units].
+            key: Not used: the state has a key of its own.
+        """
         del key
         new = self.environment.step(state, action)
         ends = new.done & ~new.truncated
@@ -50,5 +56,6 @@ class TaskEnvironment:
 
 
 def _vector(state: Any) -> jax.Array:
+    """Return all observables as one vector, shape ``(O,)``."""
     values = [jnp.ravel(value) for value in state.observation.values()]
     return jnp.concatenate(values) if values else jnp.zeros(0)

@@ -1,4 +1,4 @@
-"""How PPO trains; every field is a flag of the command line."""
+"""The settings of PPO; every field is also a flag of the command line."""
 
 from __future__ import annotations
 
@@ -12,53 +12,54 @@ from sim2real.errors import UsageError
 class PPOConfig:
     """Settings of PPO.
 
-    The defaults were tuned on a pendulum swing-up with one step of delay each way: on two CPU cores few copies and many
-    small minibatches reach a success rate in the fewest seconds. On a GPU take more copies (1024 and up).
+    The defaults were tuned for the shortest training time of a pendulum swing-up with delays on two CPU cores: few
+    copies and many small minibatches. On a GPU use more copies (1024 and up).
     """
 
     num_seeds: int = 1
-    """Policies trained side by side from different random numbers; the best one is kept."""
+    """Number of policies that are trained in parallel with different random numbers; the best one is kept."""
     num_envs: int = 256
-    """Copies of the environment per seed."""
+    """Number of copies of the environment per seed."""
     rollout_steps: int = 32
-    """Rows that every copy plays between two updates."""
+    """Number of rows (environment steps) that each copy plays between two updates."""
     total_steps: int = 1_000_000
-    """Environment rows per seed, all copies together; rounded up to whole updates and evaluations."""
+    """Total number of rows per seed, over all copies; rounded up to whole updates and evaluations."""
     epochs: int = 4
-    """Passes over the rows of a rollout in one update."""
+    """Number of passes over the rows of a rollout in one update."""
     minibatches: int = 32
-    """Parts that each pass is cut into, by copies: it must divide num_envs."""
+    """Number of minibatches in a pass; the copies are divided among them, so it must divide num_envs."""
     learning_rate: float = 2e-3
-    """Adam's step size at the start; it falls linearly to 5 % of this."""
+    """Adam's step size at the start; it falls linearly to 5 % of this value."""
     gamma: float = 0.99
     """Discount per policy step."""
     gae_lambda: float = 0.95
-    """Weight of long against short advantage estimates, 0 to 1."""
+    """Lambda of generalised advantage estimation, 0 to 1: at 0 one-step estimates, at 1 the sum of all rewards."""
     clip: float = 0.2
-    """How far the probability ratio may move away from 1 within an update."""
+    """Clip range of the probability ratio around 1."""
     value_clip: float = 5.0
-    """How far a value may move within an update [scaled reward]; narrow clips slow learning down."""
+    """Clip range of a value's change within an update [scaled reward]; small ranges slow learning down."""
     entropy_coef: float = 0.0
     """Weight of the entropy bonus."""
     value_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
-    """Gradients longer than this are shortened to it."""
+    """Largest norm of a gradient; longer ones are scaled down to it."""
     reward_scale: float = 0.05
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of actor and value network."""
     log_std_init: float = -0.5
-    """Logarithm of the exploration noise at the start, relative to half the action range."""
+    """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10
-    """How often the policy is evaluated and progress reported, the last time at the end."""
+    """Number of evaluations, evenly spaced, the last one at the end; progress is reported after each."""
     eval_envs: int = 128
-    """Copies in an evaluation, each of which plays one episode without exploration noise."""
+    """Number of copies in an evaluation; each plays one episode without exploration noise."""
     eval_steps: int = 250
-    """Rows of an evaluation; no episode may be longer. Also the rows over which first episodes are staggered."""
+    """Number of rows of an evaluation; no episode may be longer. The first training episodes are cut after different
+    numbers of rows up to this one, so that the copies are not all at the same time of their episodes."""
 
     def __post_init__(self) -> None:
-        """Check ranges; the command line and pipelines build this before anything is compiled."""
+        """Check that all values are in their ranges."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(field.default, int) and (not isinstance(value, int) or value < 1):
@@ -85,15 +86,15 @@ class PPOConfig:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment rows per seed between two updates."""
+        """Number of rows per seed between two updates."""
         return self.num_envs * self.rollout_steps
 
     @property
     def updates_per_evaluation(self) -> int:
-        """Updates between two evaluations."""
+        """Number of updates between two evaluations."""
         return -(-self.total_steps // (self.steps_per_update * self.evaluations))
 
     @property
     def updates(self) -> int:
-        """Updates in all."""
+        """Total number of updates."""
         return self.updates_per_evaluation * self.evaluations

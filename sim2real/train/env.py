@@ -1,4 +1,4 @@
-"""A compiled graph as an environment for PPO: one row of the graph is one step."""
+"""A compiled graph as an environment for PPO: one row of the graph is one environment step."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sim2real.train.protocol import Step
 
 
 class Task(Protocol):
-    """What a pipeline says about training: who acts, from what, for which reward.
+    """The training task of a pipeline: observation, action, reward and success.
 
     Attributes:
-        supervisor: The node that the policy acts for.
-        observation_size: Entries of an observation.
-        action_low: Shape ``(A,)`` [the command's unit].
-        action_high: Shape ``(A,)`` [the command's unit].
+        supervisor: Name of the node whose steps the policy makes.
+        observation_size: Number of entries of an observation.
+        action_low: Shape ``(A,)``: lower bounds of the action [the command's unit].
+        action_high: Shape ``(A,)``: upper bounds of the action [the command's unit].
     """
 
     supervisor: str
@@ -33,30 +33,30 @@ class Task(Protocol):
         ...
 
     def observe(self, step_state: StepState) -> jax.Array:
-        """Return what the policy sees, shape ``(observation_size,)``."""
+        """Return the policy's observation, shape ``(observation_size,)``, from the supervisor's step state."""
         ...
 
     def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, Any]:
-        """Return the results of the supervisor's step for an action, shape ``(A,)``."""
+        """Return the supervisor's new step state and its output for an action, shape ``(A,)``."""
         ...
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        """Return the reward of the row that has just ended."""
+        """Return the reward of a row, shape ``()``, from the graph's state after it and the action."""
         ...
 
     def success(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the state after a row is one that the task wants, bool."""
+        """Return whether the task is fulfilled in the graph's state after a row, bool of shape ``()``."""
         ...
 
 
 class EnvState(NamedTuple):
-    """The environment between two policy steps.
+    """The state of a ``GraphEnvironment``.
 
     Attributes:
-        graph: The graph, with everything before the supervisor's step of this row done.
+        graph: The graph's state, run up to the supervisor's step of this row.
         step_state: What the supervisor sees.
         total: Sum of the rewards so far.
-        good: Rows of the second half of the episode in which the task was fulfilled.
+        good: Number of rows in the second half of the episode in which the task was fulfilled.
     """
 
     graph: GraphState
@@ -66,12 +66,13 @@ class EnvState(NamedTuple):
 
 
 class GraphEnvironment:
-    """A graph over its timelines, each episode on a timeline of its own, with parameters of its own.
+    """A graph as an environment; each episode has a random one of the graph's timelines, and its own parameters.
 
-    An episode is over where its timeline is, and before that where a composed task in it ends.
+    An episode is truncated at the end of its timeline. If the graph has a world of a composed task, that task may end
+    the episode earlier.
 
     Args:
-        graph: The compiled graph; its supervisor must be the task's.
+        graph: The compiled graph, with the task's supervisor.
         task: The pipeline's task.
 
     Raises:
@@ -82,12 +83,12 @@ class GraphEnvironment:
         self.graph, self.task = graph, task
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high
-        # The last row's observation would lie behind the end of the tables. As episodes end before it, no row has to
-        # ask whether it is inside: physics run unmasked.
+        # One row less than the tables have, as the observation after an episode's last row is looked up in them too.
+        # So no row is past their end, and no state has to be masked.
         self.length = graph.rows - 1
-        # Traced once each, for shapes, rollouts and evaluations alike: of MuJoCo's worlds that takes 5 s every time.
+        # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
-        # Worlds of composed tasks say themselves when an episode is over; importing them here would import MuJoCo.
+        # Worlds of composed tasks have a method `ends`. Looked up by name: importing their class would import MuJoCo.
         found: dict[str, Any] = {name: getattr(node, "ends", None) for name, node in graph.nodes.items()}
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
 
@@ -101,7 +102,7 @@ class GraphEnvironment:
         return state, self.task.observe(step_state)
 
     def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
-        """Act, run the world, and run up to the next policy step."""
+        """Make the supervisor's step with the policy's action, then run the graph up to its next step."""
         del key
         valid = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)

@@ -1,7 +1,8 @@
-"""The policy, a pytree that fits into a node's parameters, and the small networks it is made of.
+"""The policy and its networks.
 
-Plain functions over tuples of arrays: a multilayer perceptron needs no module system, and this way a policy crosses
-jit, vmap, donation and files as the arrays it is. All of them take one observation; ``jax.vmap`` makes them take more.
+A policy is a pytree of arrays, so it can be a node's parameters and pass through jit, vmap and files. Networks are
+plain functions over tuples of arrays, as a multilayer perceptron needs no module system. All functions take one
+observation; use ``jax.vmap`` for more.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ Layers = tuple[tuple[jax.Array, jax.Array], ...]
 
 
 def init_mlp(rng: np.random.Generator, sizes: tuple[int, ...], last_gain: float) -> Layers:
-    """Draw orthogonal kernels (gain sqrt(2), ``last_gain`` in the last layer) and zero biases.
+    """Draw orthogonal kernels (gain sqrt(2), in the last layer ``last_gain``) and zero biases.
 
-    On the host: a QR decomposition that runs once is not worth compiling.
+    In numpy, as compiling a QR decomposition that runs once takes longer.
 
     Args:
         rng: Source of the kernels.
@@ -38,14 +39,14 @@ def init_mlp(rng: np.random.Generator, sizes: tuple[int, ...], last_gain: float)
     layers = []
     for n_in, n_out, gain in zip(sizes[:-1], sizes[1:], gains, strict=True):
         q, r = np.linalg.qr(rng.normal(size=(max(n_in, n_out), min(n_in, n_out))))
-        q = q * np.sign(np.diagonal(r))  # QR's choice of signs would make the draw non-uniform
+        q = q * np.sign(np.diagonal(r))  # QR's choice of signs would make the distribution non-uniform
         kernel = gain * (q if n_in >= n_out else q.T)
         layers.append((kernel.astype(np.float32), np.zeros(n_out, np.float32)))
     return tuple(layers)
 
 
 def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
-    """Return the output, shape ``(n_out,)``, of tanh layers and a linear last one for ``x``, shape ``(n_in,)``."""
+    """Return the output ``(n_out,)`` of tanh layers and a linear last layer for an input ``x (n_in,)``."""
     for kernel, bias in layers[:-1]:
         x = jnp.tanh(x @ kernel + bias)
     kernel, bias = layers[-1]
@@ -53,29 +54,37 @@ def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
 
 
 def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Return the log density, shape ``()``, of ``u`` under a normal distribution; all arguments of shape ``(A,)``.
+    """Return the log density of ``u`` under a normal distribution with a diagonal covariance.
 
-    Written out, as importing a distribution library would take longer than compiling the whole trainer.
+    Written out, as importing a distribution library takes longer than compiling the trainer.
+
+    Args:
+        u: Shape ``(A,)``.
+        mean: Shape ``(A,)``.
+        log_std: Shape ``(A,)``: logarithms of the standard deviations.
+
+    Returns:
+        Shape ``()``.
     """
     z = (u - mean) * jnp.exp(-log_std)
     return -jnp.sum(0.5 * z**2 + log_std + 0.5 * math.log(2.0 * math.pi))
 
 
 def entropy(log_std: jax.Array) -> jax.Array:
-    """Return the entropy [nat], shape ``()``, of a normal with ``log_std``, shape ``(A,)``."""
+    """Return the entropy [nat], shape ``()``, of a normal distribution with ``log_std (A,)``."""
     return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
 
 
 @struct.dataclass
 class Policy(Base):
-    """A Gaussian policy: observation -> normalised -> tanh layers -> mean in [-1, 1] -> action in [low, high].
+    """A Gaussian policy: the observation is normalised, tanh layers give the mean, which is clipped and scaled.
 
-    Clipping the mean trains faster than squashing it with tanh: a swing-up wants the full action, which tanh reaches
-    only for huge means.
+    The mean is clipped to [-1, 1], not squashed by tanh: tasks such as a swing-up need full actions, which tanh reaches
+    only for very large means, and train more slowly with it.
 
     Attributes:
         layers: One pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
-        log_std: Shape ``(A,)``: logarithm of the exploration noise, relative to half the action range.
+        log_std: Shape ``(A,)``: logarithm of the exploration noise, in units of half the action range.
         mean: Shape ``(O,)``: the observation's mean.
         std: Shape ``(O,)``: the observation's standard deviation.
         low: Shape ``(A,)``: lower bound of the action.
@@ -94,11 +103,11 @@ class Policy(Base):
         return jnp.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
     def get_mean(self, observation: jax.Array) -> jax.Array:
-        """Return the mean of the Gaussian, shape ``(A,)``, before the action's bounds."""
+        """Return the mean of the Gaussian, shape ``(A,)``, before clipping and scaling."""
         return apply_mlp(self.layers, self.normalise(observation))
 
     def to_action(self, u: jax.Array) -> jax.Array:
-        """Map ``u``, shape ``(A,)``, from [-1, 1], and what lies beyond, into [low, high]."""
+        """Clip ``u``, shape ``(A,)``, to [-1, 1] and scale it to [low, high]."""
         return self.low + 0.5 * (self.high - self.low) * (jnp.clip(u, -1.0, 1.0) + 1.0)
 
     def get_action(self, observation: jax.Array, rng: jax.Array | None = None) -> jax.Array:
@@ -106,7 +115,7 @@ class Policy(Base):
 
         Args:
             observation: In the units that the policy was trained with.
-            rng: Key of the exploration noise; without one the action is the deterministic mean.
+            rng: JAX key of the exploration noise; None: no noise.
         """
         u = self.get_mean(observation)
         if rng is not None:
@@ -114,10 +123,10 @@ class Policy(Base):
         return self.to_action(u)
 
     def to_weights(self) -> dict[str, np.ndarray]:
-        """Return the policy as the arrays of a bundle: ``layers.<i>.kernel``, ``layers.<i>.bias``, ``log_std``, ...
+        """Return the arrays of a policy bundle: ``layers.<i>.kernel``, ``layers.<i>.bias``, ``log_std``, ...
 
         Raises:
-            Sim2RealError: The policy still has a seed axis.
+            Sim2RealError: This is a batch of policies: its leaves have a leading seed axis.
         """
         if np.ndim(self.log_std) != 1:
             raise Sim2RealError(
@@ -131,7 +140,7 @@ class Policy(Base):
 
     @classmethod
     def from_weights(cls, weights: dict[str, np.ndarray]) -> Policy:
-        """Return the policy that ``to_weights`` was called on.
+        """Return the policy from the arrays that ``to_weights`` returns.
 
         Raises:
             Sim2RealError: An array is missing.

@@ -1,8 +1,8 @@
-"""Proximal policy optimisation: several seeds at once, one compiled program, progress after every evaluation.
+"""Proximal policy optimisation (PPO) of several seeds in one compiled program.
 
-The program ("epoch") holds everything from one evaluation to the next: rollouts, updates and the evaluation, for
-all seeds. The host calls it ``evaluations`` times with donated state, so there is one compilation, nothing waits for
-the host in between, and progress costs one transfer of a few numbers.
+The program does everything from one evaluation to the next, for all seeds: rollouts, updates and the evaluation. The
+host calls it ``evaluations`` times. So there is one compilation, nothing waits for the host in between, and only a few
+numbers are transferred.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from sim2real.train.update import Normaliser, TrainState, keys, make_optimiser, 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """What is known after an evaluation.
+    """Progress of the training at an evaluation.
 
     Attributes:
         evaluation: Number of this evaluation, from 1.
-        evaluations: How many there will be.
-        env_steps: Environment rows so far, per seed.
+        evaluations: Number of evaluations in all.
+        env_steps: Number of rows so far, per seed.
         elapsed_s: Time since ``train`` was called, compilation included [s].
         values: Name -> shape ``(num_seeds,)``: ``return``, the environment's metrics, losses.
     """
@@ -45,16 +45,16 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """What training leaves behind.
+    """The result of a training.
 
     Attributes:
         policies: The policies at the end; leaves have a leading seed axis.
-        best: The policy with the highest success rate, then return, over all seeds and evaluations.
+        best: The policy with the highest success rate over all seeds and evaluations; of equals, the highest return.
         best_seed: Its seed.
-        history: Name -> shape ``(evaluations, num_seeds)``.
-        env_steps: Shape ``(evaluations,)``: environment rows per seed at each evaluation.
+        history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``.
+        env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
         elapsed_s: Shape ``(evaluations,)``: time since ``train`` was called [s].
-        env_steps_per_s: Training rows of all seeds per second of ``train_s``.
+        env_steps_per_s: Rows of all seeds per second of ``train_s``, those of evaluations not counted.
         compile_s: Time to trace and compile [s].
         train_s: Time to train and evaluate [s].
     """
@@ -78,12 +78,12 @@ def train(
     Args:
         env: One copy of the environment.
         config: Settings.
-        key: Source of all randomness, of ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
-        on_progress: Called after every evaluation; what it raises ends the training.
+        key: Source of all randomness, from ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
+        on_progress: Called after every evaluation; an exception that it raises ends the training.
 
     Raises:
         UsageError: The environment breaks its protocol, or no evaluation episode ended within ``eval_steps``.
-        Sim2RealError: An observation, a reward or a loss is no number.
+        Sim2RealError: An observation, a reward or a loss is not finite.
     """
     start = time.perf_counter()
     check_environment(env)
@@ -120,7 +120,7 @@ def train(
 
 
 def _epoch(env: Environment, config: PPOConfig, state: TrainState) -> tuple[TrainState, Policy, dict[str, jax.Array]]:
-    """Train one seed up to its next evaluation, and evaluate it with the normaliser held."""
+    """Train one seed up to its next evaluation, and evaluate it."""
     state, stats = jax.lax.scan(
         lambda state, _: update(env, config, state), state, length=config.updates_per_evaluation
     )
@@ -131,9 +131,9 @@ def _epoch(env: Environment, config: PPOConfig, state: TrainState) -> tuple[Trai
 
 
 def _init(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:
-    """Return the states before the first update, leaves with a leading seed axis, without compiling anything.
+    """Return the states before the first update, with a leading seed axis; compiles nothing.
 
-    The copies are blank: the first rollout replaces them by fresh starts.
+    The environments' states are zeros; the first rollout resets them.
     """
     count, size, actions = config.num_envs, env.observation_size, np.shape(env.action_low)[0]
     keys = jnp.stack([jax.random.fold_in(key, seed) for seed in range(config.num_seeds)])
@@ -158,7 +158,7 @@ def _init(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:
 
 
 def _blank(shapes: Any, leading: tuple[int, ...]) -> Any:
-    """Return zeros of the given shapes and types after leading axes; by numpy, as jnp.zeros compiles for each shape."""
+    """Return zeros of given shapes and dtypes, with leading axes; in numpy, as jnp.zeros compiles for each shape."""
 
     def leaf(struct: jax.ShapeDtypeStruct) -> jax.Array | np.ndarray:
         is_key = jnp.issubdtype(struct.dtype, jax.dtypes.prng_key)
@@ -168,7 +168,7 @@ def _blank(shapes: Any, leading: tuple[int, ...]) -> Any:
 
 
 def _best(history: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Return evaluation and seed with the highest success, then return; the latest evaluation among equals."""
+    """Return the index of the best evaluation and seed: by success, then by return, then the latest."""
     returns = history["return"]
     success = history.get("success", np.zeros_like(returns))
     evaluations, seeds = returns.shape
@@ -177,7 +177,7 @@ def _best(history: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig) -> None:
-    """Raise if an episode never ended or something is no number, naming the first culprit in the order of cause."""
+    """Raise if a value is not finite or no episode ended; causes are checked before their consequences."""
     for seed in range(config.num_seeds):
         when = f"(seed {seed}, within {env_steps} rows)"
         entries = np.flatnonzero(~values["finite_observation"][seed])

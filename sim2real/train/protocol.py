@@ -1,7 +1,7 @@
-"""What PPO trains on: one copy of an environment, as pure functions.
+"""The environments that PPO trains on: pure functions of one copy.
 
-One row is one call of ``step``. A policy step happens in the rows that are marked ``valid``; in the others the action
-is ignored and the observation is that of the policy step still to come::
+One call of ``step`` is called a row. The policy makes a step only in rows marked ``valid``; in the others its action is
+ignored, and the observation is already that of the next policy step::
 
     row          0        1        2        3
     valid        yes      no       yes      yes
@@ -9,8 +9,8 @@ is ignored and the observation is that of the policy step still to come::
     reward       r0       r1       r2       r3       r1 is added to r0, without a discount
     terminated   no       no       no       yes      row 3's observation is the final one; reset before the next row
 
-An episode ends in a row with ``terminated`` (nothing follows: its value is 0) or ``truncated`` (it was cut: what would
-have followed is worth the value of the observation returned in that row). Both at once counts as terminated.
+An episode ends in a row with ``terminated`` (the value of what follows is 0) or ``truncated`` (it is the value of the
+observation that is returned in that row). If both are set, the row counts as terminated.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from sim2real.errors import UsageError
 
 
 class Step(NamedTuple):
-    """The outcome of one row.
+    """The result of one row.
 
     Attributes:
         state: The environment's next state, a pytree of arrays with the structure that ``reset`` returned.
-        observation: Shape ``(O,)``: what the next policy step sees; after the last row what it would have seen.
+        observation: Shape ``(O,)``: observation of the next policy step, also after the episode's last row.
         reward: Shape ``()``: reward of this row.
         terminated: Shape ``()``, bool: the episode ended by itself.
-        truncated: Shape ``()``, bool: the episode was cut.
-        valid: Shape ``()``, bool: a policy step happened in this row.
-        metrics: Name -> shape ``()``: values of the whole episode, read only in the row that ends it.
+        truncated: Shape ``()``, bool: the episode was cut, e.g. by a time limit.
+        valid: Shape ``()``, bool: the policy made a step in this row.
+        metrics: Name -> shape ``()``: values of the whole episode; used only in the row that ends it.
     """
 
     state: Any
@@ -68,15 +68,21 @@ class Environment(Protocol):
         ...
 
     def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
-        """Advance by one row under ``action``, shape ``(A,)``, within the bounds."""
+        """Play one row.
+
+        Args:
+            state: What ``reset`` or ``step`` returned.
+            action: Shape ``(A,)``, within the bounds [the action's units].
+            key: JAX key of the row's randomness.
+        """
         ...
 
 
 def check_environment(env: Environment) -> None:
-    """Check shapes and types of everything that ``env`` returns; traces it, compiles and runs nothing.
+    """Check shapes and dtypes of everything that ``env`` returns, by tracing it; nothing is compiled or run.
 
     Raises:
-        UsageError: Naming the part that differs from the protocol.
+        UsageError: Naming the part that does not follow the protocol.
     """
     size, low, high = env.observation_size, np.asarray(env.action_low), np.asarray(env.action_high)
     if low.ndim != 1 or low.shape != high.shape or not (np.isfinite([low, high]).all() and (low < high).all()):

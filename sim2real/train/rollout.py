@@ -1,4 +1,4 @@
-"""Playing an environment: rows to learn from, and evaluation episodes."""
+"""Plays environments: training rollouts and evaluation episodes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Copies(NamedTuple):
     """N copies of an environment between two rows.
 
     Attributes:
-        state: The environment's state; leaves of shape ``(N, ...)``.
-        observation: Shape ``(N, O)``.
+        state: Their states; leaves of shape ``(N, ...)``.
+        observation: Shape ``(N, O)``: their observations.
     """
 
     state: Any
@@ -25,12 +25,12 @@ class Copies(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What T rows of N copies leave behind; see ``protocol.Step``.
+    """T rows of N copies; see ``protocol.Step``.
 
     Attributes:
-        observation: Shape ``(T, N, O)``: what the policy saw.
-        u: Shape ``(T, N, A)``: what it drew, before the action bounds.
-        reward: Shape ``(T, N)``, scaled.
+        observation: Shape ``(T, N, O)``: the policy's observation.
+        u: Shape ``(T, N, A)``: the policy's sample, before it is clipped and scaled to an action.
+        reward: Shape ``(T, N)``: the reward times ``reward_scale``.
         terminated: Shape ``(T, N)``.
         truncated: Shape ``(T, N)``.
         valid: Shape ``(T, N)``.
@@ -47,7 +47,13 @@ class Rows(NamedTuple):
 
 
 def select(mask: jax.Array, new: Any, old: Any) -> Any:
-    """Return ``new`` where ``mask``, shape ``(N,)``, is true, else ``old``; leaves of shape ``(N, ...)``."""
+    """Return ``new`` where ``mask`` is true, else ``old``, for each of N copies.
+
+    Args:
+        mask: Shape ``(N,)``, bool.
+        new: Leaves of shape ``(N, ...)``.
+        old: Like ``new``.
+    """
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
@@ -60,17 +66,21 @@ def collect(
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
-    Resets may cost more than rows, so one fresh start per copy is drawn for the whole rollout; before the first update
-    every copy takes it. First episodes are cut after staggered numbers of rows: copies that all reach the end of their
-    episodes in the same update would show the networks one phase of the task at a time.
+    As a reset may cost more than a row, each copy has one reset state for the whole rollout, from which all its new
+    episodes start. In the first rollout every copy starts with a reset. The first episodes are cut after different
+    numbers of rows; otherwise all copies would stay at the same time of their episodes, and each update would see only
+    one phase of the task.
 
     Args:
-        env: One copy; vmapped here.
+        env: The environment; vmapped here.
         config: Numbers of copies and rows.
-        policy: Held for the whole rollout.
-        copies: Where the last rollout stopped; ignored if ``update`` is 0.
-        update: Shape ``()``, int32: updates so far.
-        key: Source of starts, noise and the environment's own randomness.
+        policy: The policy; it does not change during the rollout.
+        copies: The copies after the last rollout; ignored if ``update`` is 0.
+        update: Shape ``()``, int32: number of updates so far.
+        key: Source of resets, noise and the environment's own randomness.
+
+    Returns:
+        The copies after the rollout, and the rows.
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
@@ -102,11 +112,17 @@ def collect(
 
 
 def evaluate(env: Environment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
-    """Play one episode per copy without noise and average over those that ended.
+    """Play one episode per copy without exploration noise, and average over the episodes that ended.
+
+    Args:
+        env: The environment; vmapped here.
+        config: Numbers of copies and rows.
+        policy: The policy.
+        key: Source of resets and the environment's own randomness.
 
     Returns:
-        ``return`` (sum of the unscaled rewards, unless the environment reports its own), the environment's metrics, and
-        ``finished``: the share of the episodes that ended within ``eval_steps`` rows. Each of shape ``()``.
+        ``return`` (sum of the unscaled rewards, unless the environment's metrics have one), the environment's metrics,
+        and ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows. Each of shape ``()``.
     """
     key_reset, key_step = jax.random.split(key)
     copies = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs)))

@@ -1,4 +1,4 @@
-"""One PPO update: play rows, estimate advantages, take minibatch steps."""
+"""One PPO update: a rollout, advantage estimates, and minibatch steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ from sim2real.train.rollout import Copies, Rows, collect
 
 
 class Normaliser(NamedTuple):
-    """Running mean and variance of the observations: ``count`` of shape ``()``, the others ``(O,)``."""
+    """Running mean and variance of the observations.
+
+    Attributes:
+        count: Shape ``()``: number of observations so far.
+        mean: Shape ``(O,)``.
+        var: Shape ``(O,)``.
+    """
 
     count: jax.Array
     mean: jax.Array
@@ -31,8 +37,8 @@ class TrainState(NamedTuple):
         optimiser: State of the optimiser.
         normaliser: Statistics of the observations so far.
         copies: The environments.
-        update: Shape ``()``, int32: updates so far.
-        key: The seed's key; it never changes, ``keys`` makes those of an update.
+        update: Shape ``()``, int32: number of updates so far.
+        key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
     """
 
     params: dict[str, Any]
@@ -48,11 +54,11 @@ class Batch(NamedTuple):
 
     Attributes:
         x: Shape ``(..., O)``: normalised observations.
-        u: Shape ``(..., A)``: what the policy drew.
-        log_prob: Its log density then.
-        value: The value then.
+        u: Shape ``(..., A)``: the policy's samples.
+        log_prob: Shape ``(...)``: log density of ``u`` under the policy that drew it.
+        value: Shape ``(...)``: value estimates before the update.
         advantage: Shape ``(...)``.
-        weight: 1 where a policy step happened, else 0.
+        weight: Shape ``(...)``: 1 in rows with a policy step, else 0.
     """
 
     x: jax.Array
@@ -66,7 +72,7 @@ class Batch(NamedTuple):
 def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
     """Return Adam with gradient clipping and a step size that falls linearly to 5 %.
 
-    Over one flat vector: a dozen small arrays would take longer to compile and to step.
+    It acts on one flat vector, which compiles and runs faster than a dozen small arrays.
     """
     steps = config.updates * config.epochs * config.minibatches
     rate = optax.linear_schedule(config.learning_rate, 0.05 * config.learning_rate, steps)
@@ -74,7 +80,13 @@ def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def make_policy(env: Environment, params: dict[str, Any], normaliser: Normaliser) -> Policy:
-    """Return the policy that the parameters and the statistics so far make."""
+    """Return the policy with the given parameters and normaliser.
+
+    Args:
+        env: Gives the action bounds.
+        params: As in ``TrainState``.
+        normaliser: Statistics of the observations.
+    """
     return Policy(
         layers=params["actor"],
         log_std=params["log_std"],
@@ -86,7 +98,7 @@ def make_policy(env: Environment, params: dict[str, Any], normaliser: Normaliser
 
 
 def update_normaliser(normaliser: Normaliser, rows: Rows) -> Normaliser:
-    """Merge the observations of the valid rows into the statistics (Chan et al. 1979, parallel variance)."""
+    """Return the statistics with the valid rows' observations added (parallel variance, Chan et al. 1979)."""
     weight = rows.valid.astype(jnp.float32)[..., None]
     count = jnp.maximum(weight.sum(), 1.0)
     mean = (weight * rows.observation).sum((0, 1), keepdims=True) / count
@@ -98,27 +110,27 @@ def update_normaliser(normaliser: Normaliser, rows: Rows) -> Normaliser:
 
 
 def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_lambda: float) -> jax.Array:
-    """Return generalised advantage estimates (Schulman et al. 2016) that pass through rows without a policy step.
+    """Return generalised advantage estimates (Schulman et al. 2016) of rows, some of which have no policy step.
 
-    The reward of an invalid row belongs to the policy step before it, undiscounted; the discount applies once from one
-    policy step to the next. An episode's end cuts the sum: after termination nothing follows, after truncation the
-    value of the final observation.
+    The reward of a row without a policy step is added, undiscounted, to the reward of the policy step before it; the
+    discount applies once per policy step. At an episode's end the sum stops; after truncation the value of the final
+    observation is added.
 
     Args:
         rows: T rows of N copies.
         value: Shape ``(T, N)``: value of ``rows.observation``.
         following: Shape ``(T, N)``: value of ``rows.following``.
         gamma: Discount per policy step.
-        gae_lambda: Weight of long estimates.
+        gae_lambda: Lambda of the estimator, 0 to 1.
 
     Returns:
-        Shape ``(T, N)``; meaningless in invalid rows.
+        Shape ``(T, N)``; meaningless in rows without a policy step.
     """
 
     def back(
         carry: tuple[jax.Array, jax.Array, jax.Array], x: tuple[Rows, jax.Array, jax.Array]
     ) -> tuple[Any, jax.Array]:
-        later_advantage, later_value, later_reward = carry  # of the next policy step, and of invalid rows before it
+        later_advantage, later_value, later_reward = carry  # of the next policy step, and of the rows before it
         row, value, following = x
         end = row.terminated | row.truncated
         later_value = jnp.where(end, jnp.where(row.terminated, 0.0, following), later_value)
@@ -137,7 +149,16 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
 
 
 def loss(params: dict[str, Any], batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows, and its parts; shapes ``()``."""
+    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows.
+
+    Args:
+        params: As in ``TrainState``.
+        batch: The rows, with one leading axis.
+        config: Clip ranges and weights.
+
+    Returns:
+        The loss, and its parts by name; each of shape ``()``.
+    """
     weight = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
     centred = batch.advantage - jnp.sum(weight * batch.advantage)
     advantage = centred / jnp.sqrt(jnp.sum(weight * centred**2) + 1e-8)
@@ -163,7 +184,17 @@ def loss(params: dict[str, Any], batch: Batch, config: PPOConfig) -> tuple[jax.A
 
 
 def prepare(params: dict[str, Any], policy: Policy, rows: Rows, config: PPOConfig) -> Batch:
-    """Evaluate both networks on all rows at once; returns leading axes ``(N, T)``."""
+    """Return the batch of a rollout: normalised observations, values, log densities and advantages.
+
+    Args:
+        params: As in ``TrainState``; the value network is used.
+        policy: The policy that played the rows.
+        rows: T rows of N copies.
+        config: Discount and lambda.
+
+    Returns:
+        The batch with leading axes ``(N, T)``.
+    """
 
     def over_rows(function: Callable[..., jax.Array], *leaves: jax.Array) -> jax.Array:
         return jax.vmap(jax.vmap(function))(*leaves)
@@ -183,22 +214,27 @@ def prepare(params: dict[str, Any], policy: Policy, rows: Rows, config: PPOConfi
 
 
 def keys(state: TrainState) -> jax.Array:
-    """Return the keys ``(3,)`` of the update that comes next: to play, to shuffle, and to evaluate just before it.
+    """Return three keys of the next update: for its rollout, for its shuffles, and for an evaluation before it.
 
-    They depend on the seed and the number of the update alone: how often one evaluates does not change the training.
+    They depend on the seed and the number of the update alone, so the number of evaluations does not affect training.
     """
     return jax.random.split(jax.random.fold_in(state.key, state.update), 3)
 
 
 def update(env: Environment, config: PPOConfig, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
-    """Play one rollout and learn from it.
+    """Play one rollout and update the networks and the normaliser.
 
-    Minibatches are drawn by copies, not by rows: shuffling N indices is cheap, and a copy's rows lie side by side.
-    The normaliser moves after the networks have, so that the noise's density is the one that the rows were drawn with.
+    Each minibatch has all rows of some of the copies: shuffling N indices is cheap, and a copy's rows are adjacent in
+    memory. The normaliser is updated after the networks: log densities are those of the policy that played the rows.
+
+    Args:
+        env: The environment.
+        config: Settings.
+        state: The state before.
 
     Returns:
-        The next state, and figures of the update: the parts of the loss, mean ``reward`` and ``value`` (unscaled) per
-        row, each of shape ``()``, and ``finite_observation``, shape ``(O,)``.
+        The next state, and figures of the update: the parts of the loss and the mean ``reward`` and ``value`` per row,
+        unscaled, each of shape ``()``; and ``finite_observation``, shape ``(O,)``, bool.
     """
     key_play, key_shuffle, _ = keys(state)
     policy = make_policy(env, state.params, state.normaliser)

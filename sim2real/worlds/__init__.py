@@ -1,1 +1,1 @@
-"""Simulated worlds as nodes of a graph."""
+"""Simulated worlds: graph nodes that integrate a robot's dynamics."""

@@ -1,4 +1,4 @@
-"""What an encoder says of an angle."""
+"""A model of an angle encoder."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from sim2real.graph.base import Base
 
 @struct.dataclass
 class Encoder(Base):
-    """An encoder that was zeroed and mounted a little off.
+    """An encoder with a zero offset and an eccentric mount.
 
     It reads ``angle + offset + eccentricity * sin(angle + phase)``.
 
     Attributes:
-        offset: What it reads at angle 0 [rad].
-        eccentricity: Distance of its centre from the axis, over its radius [rad].
-        phase: Direction of that [rad].
+        offset: Zero offset [rad].
+        eccentricity: Amplitude of the error of the mount: distance of the disc's centre from the axis, divided by the
+            disc's radius [rad].
+        phase: Direction of that displacement [rad].
     """
 
     offset: Any = 0.0
@@ -31,11 +32,11 @@ class Encoder(Base):
         return angle + self.offset + self.eccentricity * jnp.sin(angle + self.phase)
 
     def rate(self, angle: Any, velocity: Any) -> Any:
-        """Return how fast the reading changes [rad/s]."""
+        """Return the rate of change of the reading [rad/s] at an angle [rad] and a velocity [rad/s]."""
         return velocity * (1.0 + self.eccentricity * jnp.cos(angle + self.phase))
 
     def angle(self, reading: Any) -> Any:
-        """Return the angle [rad] of a reading [rad], by three steps of a contraction: exact to eccentricity^4."""
+        """Return the angle [rad] for a reading [rad]: three fixed-point iterations, error of order eccentricity^4."""
         angle = reading - self.offset
         for _ in range(3):
             angle = reading - self.offset - self.eccentricity * jnp.sin(angle + self.phase)

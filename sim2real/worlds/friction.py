@@ -1,6 +1,6 @@
-"""Friction of motors and gears, each term a few lines; a term without a coefficient is not there, and costs nothing.
+"""Friction of motors and gears as a sum of terms.
 
-Which terms a robot has is a matter of data: those whose coefficients are numbers.
+A robot has the terms whose coefficients are numbers; terms whose coefficient is None are left out and cost nothing.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from sim2real.graph.base import Base
 
 @struct.dataclass
 class FrictionParams(Base):
-    """Coefficients, per unit of inertia: accelerations for a joint in [rad]; None leaves a term out.
+    """Coefficients of friction divided by the joint's inertia; None leaves a term out.
 
     Attributes:
-        viscous: Proportional to speed [1/s].
-        drag: Proportional to the square of speed [1/rad].
-        coulomb: Independent of speed and load [rad/s^2].
-        static: What breaking loose takes on top of ``coulomb`` (Stribeck, in Tustin's form) [rad/s^2].
-        stribeck_rad_s: Speed at which a share 1/e of that is left [rad/s].
-        load: Share of the load that rubs: of gears and bearings [1].
+        viscous: Friction proportional to the speed [1/s].
+        drag: Friction proportional to the square of the speed [1/rad].
+        coulomb: Friction independent of speed and load [rad/s^2].
+        static: Friction at standstill in excess of ``coulomb`` (Stribeck effect, Tustin's form) [rad/s^2].
+        stribeck_rad_s: Speed at which the excess has dropped to 1/e of ``static`` [rad/s].
+        load: Friction of gears and bearings, as a fraction of the load on them [1].
     """
 
     viscous: Any = None
@@ -35,19 +35,24 @@ class FrictionParams(Base):
 
 
 def damping(p: FrictionParams, velocity: Any) -> Any:
-    """Return the friction proportional to speed, per speed [1/s]: viscous and drag."""
+    """Return the friction of the viscous and drag terms divided by the speed [1/s].
+
+    Args:
+        p: Coefficients.
+        velocity: [rad/s].
+    """
     terms = [] if p.viscous is None else [p.viscous]
     terms += [] if p.drag is None else [p.drag * jnp.abs(velocity)]
     return sum(terms, start=0.0)
 
 
 def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
-    """Return the largest dry friction [rad/s^2]: Coulomb, Stribeck and load-dependent.
+    """Return the largest dry friction: the Coulomb, Stribeck and load-dependent terms [rad/s^2].
 
     Args:
         p: Coefficients.
         velocity: [rad/s].
-        load: What presses the rubbing faces together [rad/s^2]; its sign does not matter.
+        load: Load on gears and bearings [rad/s^2]; its sign does not matter.
     """
     terms = [] if p.coulomb is None else [p.coulomb]
     terms += [] if p.static is None else [p.static * jnp.exp(-jnp.abs(velocity) / p.stribeck_rad_s)]
@@ -56,13 +61,21 @@ def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
 
 
 def smooth(velocity: Any, width_rad_s: float) -> Any:
-    """Return a differentiable sign of the velocity: it creeps where real friction sticks, see ``stopped``."""
+    """Return a differentiable sign function of the velocity, for friction that is a smooth function of it.
+
+    With such a friction a loaded joint creeps, where a real one sticks; ``stopped`` does stick.
+
+    Args:
+        velocity: [rad/s].
+        width_rad_s: Speed at which the value reaches tanh(1) = 0.76 [rad/s].
+    """
     return jnp.tanh(velocity / width_rad_s)
 
 
 def stopped(velocity: Any, most: Any) -> Any:
-    """Return the velocity after dry friction took up to ``most`` of it away, in either direction; it sticks at 0.
+    """Return the velocity after dry friction: its magnitude is reduced by ``most`` [rad/s], but not below 0.
 
-    Exact for a friction that is constant over the step, at any step: nothing chatters, and nothing creeps.
+    Exact for a friction that is constant during the step, whatever the step's length: the joint sticks without
+    chattering or creeping.
     """
     return jnp.sign(velocity) * jnp.maximum(jnp.abs(velocity) - most, 0.0)

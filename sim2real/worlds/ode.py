@@ -1,4 +1,4 @@
-"""Worlds whose dynamics are an ordinary differential equation."""
+"""Worlds whose dynamics are given as an ordinary differential equation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim2real.worlds.stepped import SteppedWorld
 
 
 class OdeWorld(SteppedWorld):
-    """Integrates ``derivative`` over a tick with the classical Runge-Kutta method of order four.
+    """A world that integrates ``derivative`` with the classical Runge-Kutta method of order four.
 
     Args:
         name: Unique in the graph.
@@ -28,7 +28,16 @@ class OdeWorld(SteppedWorld):
 
     @abstractmethod
     def derivative(self, params: Any, state: Any, command: Any) -> Any:
-        """Return the time derivative of ``state``, a tree of the same structure [state's unit/s]."""
+        """Return the time derivative of the state.
+
+        Args:
+            params: The node's parameters.
+            state: The state.
+            command: The command, constant during the tick.
+
+        Returns:
+            A tree with the structure of ``state`` [the state's units per second].
+        """
 
     def limit(self, params: Any, state: Any) -> Any:
         """Return the state inside its limits; called after every substep."""
@@ -36,7 +45,13 @@ class OdeWorld(SteppedWorld):
         return state
 
     def integrate(self, params: Any, state: Any, command: Any) -> Any:
-        """Return the state one tick later, under a command that is held."""
+        """Return the state one tick later.
+
+        Args:
+            params: The node's parameters.
+            state: The state.
+            command: The command, constant during the tick.
+        """
 
         def substep(x: Any, h: float) -> Any:
             f = lambda y: self.derivative(params, y, command)  # noqa: E731
@@ -51,4 +66,5 @@ class OdeWorld(SteppedWorld):
 
 
 def _axpy(x: Any, direction: Any, factor: float) -> Any:
+    """Return ``x + factor * direction``, leaf by leaf."""
     return jax.tree_util.tree_map(lambda a, b: a + factor * b, x, direction)

@@ -1,4 +1,4 @@
-"""Nodes of a recording that are not run: what they sent is in the log."""
+"""Nodes that stand for a recorded sender: they do not run, as their outputs are in the log."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from sim2real.graph.node import BaseNode
 
 @struct.dataclass
 class CommandDelay(Base):
-    """Delay from a command's time stamp to its effect [s]; None leaves the connection's own."""
+    """Parameters of a recorded actuator.
+
+    Attributes:
+        delay: Delay from a command's time stamp to its effect [s]; None: that of the connection.
+    """
 
     delay: Any = None
 
 
 class RecordedActuator(BaseNode):
-    """What sent the recorded commands.
+    """The node that sent the recorded commands.
 
     Args:
         name: Unique in the graph.
-        rate: Commands per second at most [Hz].
-        message: A command, as an example.
+        rate: Largest number of commands per second [Hz].
+        message: A command; it is the node's default output.
     """
 
     def __init__(self, name: str, rate: float, message: Any) -> None:
@@ -32,17 +36,17 @@ class RecordedActuator(BaseNode):
         self._message = message
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> CommandDelay:
-        """Return no delay of its own."""
+        """Return parameters without a delay."""
         del rng, graph_state
         return CommandDelay()
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the example."""
+        """Return the command that the node was made with."""
         del rng, graph_state
         return jax.tree_util.tree_map(lambda leaf: leaf, self._message)
 
 
 def command_delay(graph_state: GraphState | None, actuator: str = "actuator") -> dict[str, Any]:
-    """Return the delays of a world's inputs: that of the actuator, where its parameters set one."""
+    """Return what a world's ``init_delays`` returns: the actuator's delay [s], if its parameters have one."""
     delay = getattr((graph_state or GraphState()).params.get(actuator), "delay", None)
     return {} if delay is None else {actuator: delay}

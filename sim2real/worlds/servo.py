@@ -1,4 +1,4 @@
-"""What a servo makes of a command: position loop, duty limit, back-EMF, a torque that saturates, gears with play."""
+"""Parts of a servo model: position loop, duty limit, motor torque with back-EMF and saturation, gears with play."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import jax.numpy as jnp
 
 
 def saturated(error: Any, limit: Any) -> Any:
-    """Return an error that counts no more than ``limit`` either way: a position loop at full duty."""
+    """Return a position error clipped to ``[-limit, limit]``: beyond it the position loop is at full duty."""
     return jnp.clip(error, -limit, limit)
 
 
 def position_duty(goal: Any, position: Any, gain: Any, counts_per_unit: float, full: float) -> Any:
-    """Return the duty, in [-1, 1], of a firmware that works on whole counts, as DYNAMIXEL's position loop does.
+    """Return the duty, in [-1, 1], of a position loop that works on integers, like that of DYNAMIXEL's firmware.
 
     Args:
-        goal: [rad].
-        position: [rad].
+        goal: Goal position [rad].
+        position: Present position [rad].
         gain: PWM steps per count of error.
         counts_per_unit: Encoder counts per radian.
         full: PWM steps at full duty.
@@ -32,14 +32,20 @@ def motor_torque(duty: Any, velocity: Any, stall: Any, back_emf: Any, softness: 
     Args:
         duty: In [-1, 1].
         velocity: [rad/s].
-        stall: Torque at full duty and standstill, before it saturates [N m].
-        back_emf: What a speed takes off [N m s/rad].
-        softness: How early the torque saturates: it never exceeds ``1 / softness`` [1/(N m)].
+        stall: Torque at full duty and standstill, without saturation [N m].
+        back_emf: Torque lost to back-EMF per speed [N m s/rad].
+        softness: Saturation: the torque stays below ``1 / softness`` [1/(N m)].
     """
     linear = stall * duty - back_emf * velocity
     return linear / (1.0 + softness * jnp.abs(linear))
 
 
 def play(driver: Any, follower: Any, gap: Any) -> Any:
-    """Return where a driven part is: it stays until the driver takes it along, ``gap`` [rad] of play in all."""
+    """Return the position of a part that is driven with play: it rests until the driver has crossed the gap.
+
+    Args:
+        driver: Position of the driving part [rad].
+        follower: Position of the driven part before [rad].
+        gap: Total play [rad].
+    """
     return jnp.clip(follower, driver - 0.5 * gap, driver + 0.5 * gap)

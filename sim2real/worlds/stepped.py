@@ -1,4 +1,4 @@
-"""Worlds that integrate their state over a tick in equal substeps, under a command that is held."""
+"""Worlds that integrate their state over a tick in equal substeps, with a constant command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim2real.graph.node import BaseWorld
 
 
 class SteppedWorld(BaseWorld):
-    """What such worlds share; what happens in a substep is theirs.
+    """Base class of worlds that divide a tick into substeps; subclasses integrate.
 
     Args:
         name: Unique in the graph.
@@ -36,11 +36,17 @@ class SteppedWorld(BaseWorld):
 
     @abstractmethod
     def command(self, step_state: StepState) -> Any:
-        """Return the command that is held during this tick."""
+        """Return the command, which is constant during this tick."""
 
     @abstractmethod
     def integrate(self, params: Any, state: Any, command: Any) -> Any:
-        """Return the state one tick later, under a command that is held."""
+        """Return the state one tick later.
+
+        Args:
+            params: The node's parameters.
+            state: The state.
+            command: The command, constant during the tick.
+        """
 
     def output(self, params: Any, state: Any) -> Any:
         """Return the message that leaves at the end of the tick; default: the state."""
@@ -55,10 +61,15 @@ class SteppedWorld(BaseWorld):
         return new, self.output(params, state)
 
     def over_substeps(self, substep: Callable[[Any, float], Any], state: Any) -> Any:
-        """Return the state after a tick of substeps ``(state, seconds) -> state``."""
+        """Return the state after one tick.
+
+        Args:
+            substep: Maps a state and a substep's length [s] to the state after it.
+            state: The state at the start of the tick.
+        """
         h = 1.0 / (self.rate * self.substeps)
-        # A loop costs a GPU a kernel launch a substep. On a CPU the unrolled pendulum took 5 times as long to compile
-        # and 6 times as long to run as the loop (2 cores, jax 0.10.2, five substeps).
+        # Unrolled on a GPU, where a loop costs a kernel launch per substep. On a CPU, unrolling the pendulum's five
+        # substeps made it compile 5 times and run 6 times as long (2 cores, jax 0.10.2).
         unroll = 1 if jax.default_backend() == "cpu" else self.substeps
         start = jax.tree_util.tree_map(jnp.asarray, state)
         return jax.lax.scan(lambda x, _: (substep(x, h), None), start, length=self.substeps, unroll=unroll)[0]
