@@ -1,4 +1,4 @@
-"""Logs: one MCAP file a session, written while the robot runs and readable after any crash."""
+"""Logs: one MCAP file per session, written while the robot runs and readable after a crash."""
 
 from sim2real.log.importer import import_file as import_file
 from sim2real.log.mapping import ImportMapping as ImportMapping

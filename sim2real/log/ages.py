@@ -1,4 +1,4 @@
-"""How old the messages were that a node's steps used, from what a log says of every message."""
+"""The age of the messages that a node's steps used, computed from a log."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sim2real.graph.node import TICKS_PER_S
 def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
     """Return how long before each step's start the newest message that it used was sent, by input.
 
-    What a hiccup leaves behind shows here: steps may be punctual and yet use old messages.
+    This shows the effect of a hiccup that step times alone do not show: punctual steps that use old messages.
 
     Args:
         episode: A log.
         node: The reader.
 
     Returns:
-        Input -> ages ``(N,)`` [s]; NaN before the first message. No inputs where steps are missing between those that
-        the log holds: which step used what cannot be told then.
+        Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if steps are missing in the log, as it is then
+        not known which step used which message.
     """
     log = episode.metadata.get("log", {})
     if log.get("missing_steps", {}).get(node):
@@ -33,13 +33,13 @@ def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
         used = (messages.seq_in >= 0) & (row >= 0) & (row < len(start))
         newest = np.full(len(start), -np.inf)
         np.maximum.at(newest, row[used], messages.sent[used])
-        newest = np.maximum.accumulate(newest)  # a step without a new message goes on with the one before
+        newest = np.maximum.accumulate(newest)  # a step without a new message uses the previous one again
         ages[name] = np.where(np.isfinite(newest), (start - newest) / TICKS_PER_S, np.nan)
     return ages
 
 
 def oldest_input(episode: Episode, node: str) -> np.ndarray:
-    """Return the age of each step's oldest input ``(M,)`` [s], of those steps that had a message at every input."""
+    """Return the largest age among each step's inputs, ``(M,)`` [s], for steps that had a message on every input."""
     ages = list(input_ages(episode, node).values())
     if not ages:
         return np.zeros(0)

@@ -1,7 +1,7 @@
-"""CDR, the byte layout of ROS 2 messages, for messages whose sizes are all known beforehand.
+"""CDR, the encoding of ROS 2 messages, for message types of fixed size.
 
-Written as plain CDR (XCDR1), little-endian: four bytes of encapsulation, then the fields in order, each aligned to its
-own element size, counted from behind those four bytes (OMG DDS-XTypes 1.3, section 7.4.1).
+Plain CDR (XCDR1), little-endian: four bytes of encapsulation, then the fields in order, each aligned to its element
+size relative to the first byte after the encapsulation (OMG DDS-XTypes 1.3, section 7.4.1).
 """
 
 from __future__ import annotations
@@ -25,7 +25,12 @@ _CODES = dict(zip(("b1", "f4", "f8", *(f"{k}{s}" for k in "iu" for s in (1, 2, 4
 
 @dataclass(frozen=True)
 class Constant:
-    """Bytes that are the same in every message."""
+    """Bytes that are the same in every message.
+
+    Attributes:
+        data: The bytes.
+        alignment: Their alignment [bytes].
+    """
 
     data: bytes
     alignment: int
@@ -33,7 +38,14 @@ class Constant:
 
 @dataclass(frozen=True)
 class Field:
-    """A value that changes: a scalar (shape ``()``) or an array of fixed shape, in row-major order."""
+    """A value that differs between messages: a scalar, or an array of fixed shape in row-major order.
+
+    Attributes:
+        name: Its name.
+        dtype: Type of its elements.
+        shape: Its shape; ``()`` for a scalar.
+        code: The element type's code in the module ``struct``.
+    """
 
     name: str
     dtype: np.dtype[Any]
@@ -59,18 +71,18 @@ class Field:
 
 
 def text(value: str) -> Constant:
-    """Return a string that never changes."""
+    """Return a constant string as a part of a message."""
     data = value.encode() + b"\0"
     return Constant(struct.pack("<I", len(data)) + data, 4)
 
 
 def length(count: int) -> Constant:
-    """Return the element count that stands before a sequence; its elements follow as parts of their own."""
+    """Return the element count of a sequence; its elements must follow as further parts."""
     return Constant(struct.pack("<I", count), 4)
 
 
 def read_text(data: bytes, position: int) -> tuple[str, int]:
-    """Return the string in a message at or after a position, and the position behind it."""
+    """Return the string at the next aligned position of a message, and the position after the string."""
     position += -(position - len(ENCAPSULATION)) % 4
     (count,) = struct.unpack_from("<I", data, position)
     end = position + 4 + count
@@ -78,17 +90,17 @@ def read_text(data: bytes, position: int) -> tuple[str, int]:
 
 
 class Layout:
-    """Where every byte of a message is.
+    """The byte layout of a message type.
 
-    ``pack`` encodes one message; ``np.frombuffer(data, layout.dtype)`` decodes any number that stand in a row.
+    ``pack`` encodes one message; ``np.frombuffer(data, layout.dtype)`` decodes any number of adjacent ones.
 
     Args:
         parts: The message's fields and constants, in order.
 
     Attributes:
         fields: The fields among the parts, in the order in which ``pack`` takes their values.
-        dtype: A structured dtype of one whole message, encapsulation included.
-        size: Bytes of a message.
+        dtype: A structured dtype of one message, encapsulation included.
+        size: Size of a message [bytes].
     """
 
     def __init__(self, parts: Iterable[Constant | Field]) -> None:
@@ -127,10 +139,10 @@ class Layout:
         """Encode one message.
 
         Args:
-            values: One number or array for each of ``fields``, of its shape.
+            values: A number or array for each of ``fields``, of the field's shape.
 
         Raises:
-            Sim2RealError: When a value has another shape, or a kind that would lose information (a float for an
+            Sim2RealError: When a value has another shape, or converting it would lose information (a float for an
                 integer, a number out of range).
         """
         if len(values) != len(self.fields):
@@ -147,7 +159,7 @@ class Layout:
             raise Sim2RealError(f"{self._culprit(values)}: {error}") from error
 
     def _culprit(self, values: Sequence[Any]) -> str:
-        """Name the scalar that could not be packed."""
+        """Return a description of the scalar that could not be encoded."""
         for part, value in zip(self.fields, values, strict=True):
             if not part.shape:
                 try:

@@ -1,4 +1,4 @@
-"""What a log file holds, found in one walk from its first byte to its last, sorted by channel, not yet decoded."""
+"""Reads a log file once, from beginning to end, and sorts its messages by channel; decodes them on request."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ from sim2real.log.records import (
 )
 from sim2real.log.session_file import LIBRARY
 
-# A message record: opcode and length; then channel, sequence, log time, publish time and the message itself.
+# Bytes in a message record before its content (opcode, length), and before the message's own data (channel, sequence,
+# log time, publish time).
 _PREFIX_BYTES, _DATA_AT = 9, 31
 _MESSAGE = int(Opcode.MESSAGE)  # a plain number: it is compared for every message
-# Role -> what the metadata of a channel in that role must have.
+# Role of a channel -> keys that its metadata must have.
 _ROLES = {
     "step": {"node"},
     "output": {"node", "fields"},
@@ -47,13 +48,18 @@ _DIGITS = 19
 
 @dataclass(frozen=True)
 class Range:
-    """A range of time [s from the episode's start], from ``start_s`` to just before ``end_s``; None: no limit."""
+    """A half-open time range.
+
+    Attributes:
+        start_s: Its start [s from the episode's start]; None: no limit.
+        end_s: Its end, which does not belong to it [s]; None: no limit.
+    """
 
     start_s: float | None = None
     end_s: float | None = None
 
     def log_times(self, epoch_ns: int) -> tuple[int, int]:
-        """Return the range in log time [ns]."""
+        """Return start and end in log time [ns]."""
         begin = 0 if self.start_s is None else max(0, epoch_ns + round(self.start_s * 1e6) * 1000)
         end = 2**63 if self.end_s is None else max(0, epoch_ns + round(self.end_s * 1e6) * 1000)
         return begin, end
@@ -61,19 +67,19 @@ class Range:
 
 @dataclass
 class Contents:
-    """What a walk found.
+    """The content of a log file.
 
     Attributes:
-        library: Who wrote the file, by its header.
-        session: The session's metadata; None where damaged.
-        end: What was written when the session ended; None after a crash.
+        library: The library that wrote the file, according to its header.
+        session: The session's metadata; None if damaged.
+        end: The metadata written at the session's end; None after a crash.
         attachments: File name -> content.
-        epoch_ns: The wall clock at the episode's time 0 [ns]; 0 if it never started.
+        epoch_ns: Wall clock at the episode's time 0 [ns]; 0 if the episode never started.
         channels: Channel number -> channel.
-        messages: Channel number -> message records, in the file's order; only where the walk was to open chunks.
-        indexed: Channel number -> messages, by the chunks' indices.
-        chunks: How many chunks there are.
-        last_log_time: The last time in any chunk [ns].
+        messages: Channel number -> message records, in the order of the file; empty unless chunks were opened.
+        indexed: Channel number -> number of messages, according to the chunks' indices.
+        chunks: Number of chunks.
+        last_log_time: Latest log time of any chunk [ns].
         damage: What could not be read.
     """
 
@@ -90,20 +96,20 @@ class Contents:
     damage: Damage = field(default_factory=Damage)
 
     def with_role(self, role: str) -> dict[int, Channel]:
-        """Return the channels that hold steps, outputs, inputs or events."""
+        """Return the channels with a role: ``step``, ``output``, ``input``, ``events`` or ``joint_states``."""
         return {number: c for number, c in self.channels.items() if c.metadata["role"] == role}
 
     def columns(self, channel: int, layout: Layout, span: Range) -> np.ndarray:
-        """Decode a channel's messages of fixed layout.
+        """Decode the messages of a channel, whose type has a fixed size.
 
         Args:
-            channel: Its number.
-            layout: The layout of its messages.
-            span: Which log times to keep.
+            channel: The channel's number.
+            layout: Layout of its messages.
+            span: Range of log times to keep.
 
         Returns:
-            Shape ``(N,)``: columns ``sequence``, ``log_time`` and ``publish_time`` [ns], and ``data`` with the
-            message's fields; by sequence.
+            A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
+            [ns], and ``data`` with the fields of the message.
         """
         dtype = np.dtype(
             {
@@ -122,21 +128,22 @@ class Contents:
         return rows[np.argsort(rows["sequence"], kind="stable")]
 
     def payloads(self, channel: int, span: Range) -> list[tuple[int, bytes]]:
-        """Return the log time [ns] and the undecoded bytes of a channel's messages."""
+        """Return log time [ns] and encoded bytes of a channel's messages within a range."""
         begin, end = span.log_times(self.epoch_ns)
         found = [(int.from_bytes(m[15:23], "little"), m[_DATA_AT:]) for m in self.messages[channel]]
         return [(time, payload) for time, payload in found if begin <= time < end]
 
 
 def walk(path: str | Path, span: Range | None = None) -> Contents:
-    """Go through a log once.
+    """Read a log file once.
 
     Args:
         path: The file.
-        span: Open the chunks of this range, for their messages; None: open none.
+        span: Range whose chunks are opened for their messages; None: none is opened.
 
     Raises:
-        Sim2RealError: When the file is missing, no MCAP, no log of ours or cut before the end of its session metadata.
+        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
+            its session metadata.
     """
     found = Contents()
     with in_words(path), opened(path) as data:
@@ -162,10 +169,10 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
 
 @contextmanager
 def in_words(path: str | Path) -> Iterator[None]:
-    """Turn what a file's bytes make the block raise into an error about the file: they may be anything.
+    """Convert exceptions that damaged bytes cause in the block, of whatever type, into an error about the file.
 
     Raises:
-        Sim2RealError: When the file is damaged beyond what the block can pass over.
+        Sim2RealError: When the block raised one of them.
     """
     try:
         yield
@@ -185,7 +192,7 @@ def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | 
     if span is None:
         return
     begin, end = span.log_times(found.epoch_ns)
-    # The channels stand before the first chunk, where nothing guards them, and in it, where a checksum does.
+    # The first chunk is always opened: it repeats the channels' definitions with a checksum.
     if found.chunks > 1 and found.channels and (last < begin or first >= end):
         return
     content = chunk_content(data, record, found.damage)

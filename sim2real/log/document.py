@@ -1,4 +1,4 @@
-"""The session's metadata records: one JSON document each, with a checksum, and its plain values beside it."""
+"""Encoding of the session's metadata records: a JSON document with a checksum, and its plain values for viewers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ FORMAT = 1
 
 
 def encode(name: str, document: Mapping[str, Any]) -> dict[str, str]:
-    """Return an MCAP metadata record's strings for a document.
+    """Encode a document as the strings of an MCAP metadata record.
 
-    ``json`` holds all of it; ``crc32`` guards that, because MCAP has no checksum over metadata; every top-level text,
-    number and truth value also stands under its own name, for other viewers.
+    ``json`` is the whole document, and ``crc32`` its checksum, as MCAP has none for metadata. Top-level strings,
+    numbers and booleans are stored under their own names too, for other viewers.
+
+    Args:
+        name: The record's name, for errors.
+        document: The document.
 
     Raises:
         Sim2RealError: When a value cannot be written as JSON.
@@ -39,10 +43,10 @@ def encode(name: str, document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def decode(record: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the document of a metadata record, or None where it is damaged.
+    """Return the document of a metadata record; None if it is damaged.
 
     Raises:
-        Sim2RealError: When a newer version wrote it.
+        Sim2RealError: When it was written in a newer format.
     """
     text = record.get("json")
     if text is None or record.get("crc32") != f"{zlib.crc32(text.encode()):08x}":
@@ -54,12 +58,13 @@ def decode(record: Mapping[str, str]) -> dict[str, Any] | None:
         )
     try:
         found = json.loads(text)
-    except (ValueError, RecursionError):  # a checksum guards against accidents, not against intent
+    except (ValueError, RecursionError):  # the checksum is right, yet it is not JSON: the file was made so on purpose
         return None
     return found if isinstance(found, dict) else None
 
 
 def _plain(value: Any) -> Any:
+    """Convert a value that JSON does not know."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, PathLike):

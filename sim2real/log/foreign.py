@@ -1,4 +1,4 @@
-"""Files of other recorders: npz, JSON, CSV, and the episodes of LeRobot data sets; their signals by name."""
+"""Reads the files of other recorders: npz, JSON, CSV, and episodes of LeRobot data sets (Parquet)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import numpy as np
 from sim2real.errors import UsageError
 
 SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"}
-"""Suffix -> format, where none is named."""
+"""File suffix -> format, used unless a format is given."""
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
-# What libraries raise at bytes that make no sense, once the file itself is open.
+# What the libraries raise for damaged content.
 _DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _WHOLE = "check that the file is complete, and of the format that its name or --format says"
 
@@ -32,8 +32,8 @@ class ForeignFile:
     Attributes:
         path: The file.
         format: One of the values of ``SUFFIXES``.
-        keys: What it holds, by name.
-        load: Name -> value; raises KeyError where there is none.
+        keys: Names of its signals.
+        load: Returns a signal by name; raises KeyError if there is none.
     """
 
     path: Path
@@ -45,15 +45,15 @@ class ForeignFile:
         """Return a signal.
 
         Args:
-            source: Its name; for JSON the path to it (``meta.kp``, ``entries[].position``); with ``[:,0]`` or
-                ``[:,1:3]`` behind it for columns of it.
-            column: Column of a two-dimensional signal; None: all of it.
+            source: Its name; in a JSON file the path to it (``meta.kp``, ``entries[].position``). ``[:,0]`` or
+                ``[:,1:3]`` after the name selects columns.
+            column: Column of a two-dimensional signal; None: all columns.
 
         Returns:
-            Shape ``(N,)`` or ``(N, ...)``, or ``()`` for a number: float64, float32 or, for whole numbers, int64.
+            Shape ``(N,)`` or ``(N, ...)``, or ``()`` for a single number: float64, float32, or int64 for integers.
 
         Raises:
-            UsageError: When there is no such signal or column, or it holds no numbers.
+            UsageError: When there is no such signal or column, or it does not consist of numbers.
         """
         chosen: int | slice | None = column
         match = None if source in self.keys else _COLUMNS.fullmatch(source)
@@ -89,10 +89,10 @@ def open_foreign(path: Path, format: str | None = None) -> ForeignFile:
 
     Args:
         path: The file.
-        format: One of the values of ``SUFFIXES``; None: by the file's suffix.
+        format: One of the values of ``SUFFIXES``; None: chosen by the file's suffix.
 
     Raises:
-        UsageError: When there is no such file, it is empty, or it is not of this format.
+        UsageError: When the file does not exist, is empty, or does not have this format.
     """
     formats = ", ".join(_READERS)
     if format is None:
@@ -116,12 +116,12 @@ def open_foreign(path: Path, format: str | None = None) -> ForeignFile:
 
 
 def _read_npz(path: Path) -> ForeignFile:
-    # Anything else than a ZIP archive makes numpy look for a pickle.
+    # numpy would try to read anything but a ZIP archive as a pickle.
     if not zipfile.is_zipfile(path):
         raise UsageError(f"{path} is no npz file, or is cut off", hint=_WHOLE)
 
     def load(name: str) -> Any:
-        # Opened for each signal: one that holds Python objects must not keep the others from being read.
+        # Opened again for each signal, so that one with Python objects does not prevent reading the others.
         try:
             with np.load(path, allow_pickle=False) as data:
                 return data[name]
@@ -200,7 +200,7 @@ def _read_lerobot(path: Path) -> ForeignFile:
     except (pyarrow.ArrowException, *_DAMAGED) as error:
         raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
     columns = list(file.schema_arrow.names)
-    # data/chunk-000/episode_000000.parquet lies beside meta/info.json, which has what is the same for all episodes.
+    # For DIR/data/chunk-000/episode_000000.parquet, DIR/meta/info.json has what all episodes share.
     infos = [folder / "meta" / "info.json" for folder in path.absolute().parents[2:3]]
     facts = [_read_json(info) for info in infos if info.is_file()]
 
@@ -231,7 +231,7 @@ def _numbers(raw: Any, what: str) -> np.ndarray:
     """Return a value as an array of float64, float32 or int64."""
     try:
         values = np.asarray(raw)
-        if values.dtype == object:  # None is what JSON and Parquet have for a value that is missing: it becomes a NaN
+        if values.dtype == object:  # JSON and Parquet have None for a missing value, which becomes NaN
             values = np.asarray(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
@@ -249,7 +249,7 @@ def _index(text: str) -> int | slice:
 
 
 def _walk(value: Any, parts: Sequence[str], path: Path) -> Any:
-    """Follow a path into a JSON document; ``[]`` goes through all elements of a list."""
+    """Return the value at a path in a JSON document; ``[]`` collects it from all elements of a list."""
     if not parts:
         return value
     head, rest = parts[0], parts[1:]
@@ -271,7 +271,7 @@ def _walk(value: Any, parts: Sequence[str], path: Path) -> Any:
 
 
 def _paths(value: Any, trail: str = "") -> list[str]:
-    """Return the paths to all values of a JSON document; of a list of tables by its first one."""
+    """Return the paths to all values of a JSON document; for a list of objects, those of the first object."""
     if isinstance(value, dict):
         return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."))]
     if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -288,7 +288,7 @@ def _is_number(text: str) -> bool:
 
 
 def _cell(text: str, where: str) -> float:
-    """Return a cell's number; NaN where it is empty."""
+    """Return the number in a CSV cell; NaN if it is empty."""
     if text.strip() and not _is_number(text):
         raise UsageError(f"{where} holds {text!r}, no number", hint="name another source in the mapping")
     return float(text) if text.strip() else float("nan")

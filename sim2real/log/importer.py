@@ -1,4 +1,4 @@
-"""Importing the files of other recorders: their signals become steps and outputs of nodes, and those a log."""
+"""Imports the files of other recorders: turns their signals into steps and outputs of nodes, and writes a log."""
 
 from __future__ import annotations
 
@@ -19,15 +19,22 @@ from sim2real.log.session_file import SessionFile
 
 RECORDED, GENERATED = "recorded", "generated"
 _MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in float64
-# Stamps after September 2001 [us] come from a wall clock; a clock that starts with the machine never gets there.
+# Stamps from here on [us since 1970: September 2001] come from a wall clock; clocks that start at boot are far lower.
 _WALL_CLOCK = 10**15
-# A first stamp up to here is the recorder's own start; a later one counts from somewhere else [us].
+# With a first stamp up to here [us], stamps count from the recording's start; otherwise time 0 is the first sample.
 _OWN_START = 1_000_000
 
 
 @dataclass(frozen=True)
 class _Signals:
-    """The signals of one node: fields and stamps of shape ``(N, ...)``, or ``()`` for a constant."""
+    """The signals of one node.
+
+    Attributes:
+        fields: Field -> values, shape ``(N, ...)``, or ``()`` for a constant.
+        stamps: Shape ``(N,)``: recorded time stamps; None without any.
+        count: Number of samples N.
+        rate_hz: Rate from which stamps are generated [Hz]; None with recorded stamps.
+    """
 
     fields: Mapping[str, np.ndarray]
     stamps: np.ndarray | None
@@ -38,22 +45,23 @@ class _Signals:
 def import_file(
     path: str | Path, mapping: ImportMapping | str | Path, samples: slice | None = None, format: str | None = None
 ) -> Episode:
-    """Read a file of another recorder as an episode, in memory.
+    """Read a file of another recorder as an episode.
 
-    Each sample is a step that starts and ends at its stamp. Stamps that were recorded are kept, to the microsecond:
-    time 0 is the file's own where the first stamp lies within a second after it, else the first sample. Other stamps
-    are generated from the rate. The metadata says which (``stamps``: node -> ``recorded`` or ``generated``) and has
-    ``pipeline``, ``source``, ``units``, ``graph`` and ``mapping``.
+    Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are kept, rounded to
+    microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
+    sample. Without recorded stamps, they are generated from the node's rate. The episode's metadata has ``stamps``
+    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``units``, ``graph``, ``mapping`` and
+    ``versions``.
 
     Args:
         path: The file.
-        mapping: Which signal is which field; or the mapping file.
-        samples: Which samples to take, of every node alike; None: all.
-        format: ``npz``, ``json``, ``csv`` or ``lerobot``; None: by the file's suffix.
+        mapping: The mapping from signals to fields, or the mapping file.
+        samples: The samples to take, for every node; None: all.
+        format: ``npz``, ``json``, ``csv`` or ``lerobot``; None: chosen by the file's suffix.
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
-            differ in length, a sample is no finite number, or stamps do not increase.
+            differ in length, a sample is not finite, or stamps do not increase.
     """
     if not isinstance(mapping, ImportMapping):
         mapping = load_mapping(mapping)
@@ -98,13 +106,13 @@ def import_file(
 def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> None:
     """Write an imported episode as a log.
 
-    Nodes with the same stamp stand in it in the mapping's order. The log's epoch is 1970 unless the file's stamps come
-    from a wall clock.
+    Steps with the same stamp are written in the order that the mapping gives to nodes. The log's time 0 is 1970 on the
+    wall clock unless the file's stamps come from a wall clock.
 
     Args:
         path: The log; it must not exist.
         episode: What ``import_file`` returned.
-        mapping: What it was imported with.
+        mapping: The mapping that it was imported with.
 
     Raises:
         Sim2RealError: When the log exists or cannot be written, or names collide.
@@ -126,14 +134,14 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
             file.step(record, [values[k] for values in episode.outputs[name].values()])
         file.finish({"status": "finished", "exit_code": OK, "messages": file.counts})
     except BaseException:
-        # Unlike a recording, what is there of an import is worth nothing.
+        # An incomplete import is of no use, unlike an incomplete recording.
         file.abandon()
         Path(path).unlink(missing_ok=True)
         raise
 
 
 def facts(episode: Episode) -> dict[str, Any]:
-    """Return what an import came to, for the table at its end."""
+    """Return the facts about an import that are printed at its end."""
     kinds = episode.metadata["stamps"]
     return {
         "source": episode.metadata["source"]["file"],
@@ -182,7 +190,7 @@ def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
 
 
 def _field(file: ForeignFile, where: str, how: FieldMapping) -> np.ndarray:
-    """Read a field's signal, as it is in the file; more than one are stacked."""
+    """Read a field's signal, unscaled; several sources are stacked along the last axis."""
     parts = [file.signal(source, how.column) for source in how.source]
     if len(parts) == 1:
         return parts[0]
@@ -196,7 +204,7 @@ def _field(file: ForeignFile, where: str, how: FieldMapping) -> np.ndarray:
 
 
 def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) -> tuple[int, int | None]:
-    """Return the first sample to take and the one behind the last; None: all."""
+    """Return the first sample to take, and the one after the last; None: to the end."""
     if samples is None:
         return 0, None
     if samples.step not in (None, 1):
@@ -217,7 +225,7 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
 
 
 def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, first: int, stop: int) -> np.ndarray:
-    """Return a field of the samples from ``first`` on, ``(N, ...)``: a constant for each, scaled and in its shape."""
+    """Return a field's samples ``first`` to ``stop``, scaled, shape ``(N, ...)``; a constant is repeated."""
     values = values[first:stop] if values.ndim else np.broadcast_to(values, (stop - first,))
     _check_finite(file, f"field {where}", values, first)
     dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
@@ -232,9 +240,9 @@ def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMappin
 
 
 def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the stamps of the samples from ``first`` on, shape ``(N,)``, int64 [us]."""
+    """Return the stamps of samples ``first`` to ``stop``, shape ``(N,)``, int64 [us]."""
     if signals.stamps is None:
-        # The grid that the timing rules give to a node of this rate.
+        # The slots that the timing rules give to a node of this rate.
         return np.floor(np.arange(stop - first) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
     stamps = signals.stamps[first:stop]
     what = f"stamps {node.stamps!r} of node {name!r}"
@@ -268,7 +276,7 @@ def _check_finite(file: ForeignFile, what: str, values: np.ndarray, first: int) 
 
 
 def _time_zero(ticks: list[np.ndarray], first: int) -> int:
-    """Return what the file's clock shows at the episode's time 0 [us]."""
+    """Return the file's time stamp at the episode's time 0 [us]."""
     begin = min((int(t[0]) for t in ticks), default=0)
     return 0 if 0 <= begin <= _OWN_START and not first else begin
 
@@ -283,7 +291,7 @@ def _rate_hz(ticks: np.ndarray) -> float | None:
 
 
 def _shared_units(mapping: ImportMapping) -> dict[str, str]:
-    """Return field -> unit as recorded logs have it, without fields that have another unit in another node."""
+    """Return field -> unit, as recorded logs have it; fields with different units in different nodes are left out."""
     pairs = {(field, how.unit) for node in mapping.nodes.values() for field, how in node.fields.items()}
     fields = [field for field, _ in pairs]
     return {field: unit for field, unit in sorted(pairs) if unit and fields.count(field) == 1}

@@ -1,4 +1,4 @@
-"""Mapping files: which signal of somebody else's file is which field of which node, in TOML."""
+"""Mapping files (TOML): say which signal of a file of another recorder is which field of which node."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from sim2real.errors import UsageError
 
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-"""Nanoseconds in each unit that stamps may have."""
+"""Unit of time stamps -> nanoseconds."""
 MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
 _COMMANDING = "actuator"
@@ -26,12 +26,12 @@ class FieldMapping:
     """Where a field of a node's output comes from.
 
     Attributes:
-        source: Name of a signal in the file, with the path to it and a column where needed; several are stacked.
+        source: Name of a signal in the file, as ``ForeignFile.signal`` takes it; several signals are stacked.
         unit: Unit of the field, after scaling.
         scale: The field is ``scale * signal + offset``.
-        offset: See ``scale``; in the field's unit.
-        shape: Shape of one sample; None: as it is in the file.
-        column: Column of a two-dimensional signal; None: all of it.
+        offset: See ``scale`` [the field's unit].
+        shape: Shape of one sample; None: as in the file.
+        column: Column of a two-dimensional signal; None: all columns.
     """
 
     source: tuple[str, ...]
@@ -48,10 +48,11 @@ class NodeMapping:
 
     Attributes:
         fields: Field -> where it comes from.
-        rate_hz: Rate from which stamps are generated [Hz], or the name of a number in the file; None: ``stamps``.
-        stamps: Signal with the stamps that were recorded; None: ``rate_hz``.
-        stamp_unit: One of ``STAMP_UNITS``.
-        order: Of nodes with the same stamp the one with the lower number acted first.
+        rate_hz: Rate from which time stamps are generated [Hz], or the name of a signal that has it; None: use
+            ``stamps``.
+        stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
+        stamp_unit: Unit of the recorded stamps, one of ``STAMP_UNITS``.
+        order: Of messages with equal stamps, those of nodes with a lower number were sent first.
     """
 
     fields: Mapping[str, FieldMapping]
@@ -63,12 +64,12 @@ class NodeMapping:
 
 @dataclass(frozen=True)
 class ImportMapping:
-    """How a foreign file becomes a log.
+    """How the file of another recorder becomes a log.
 
     Attributes:
         pipeline: The pipeline that the log is for.
         nodes: Node -> where its messages come from.
-        path: The mapping file; None where the mapping was made by ``from_dict``.
+        path: The mapping file; None if the mapping was not read from one.
     """
 
     pipeline: str
@@ -81,7 +82,7 @@ class ImportMapping:
         return {n: {f: m.unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
 
     def inputs(self, file: Path) -> dict[str, Path]:
-        """Return what an import of a file reads, by name, for its manifest."""
+        """Return the files that an import reads, by name, for the manifest."""
         return {"source": file} | ({} if self.path is None else {"mapping": self.path})
 
     @staticmethod
@@ -90,11 +91,11 @@ class ImportMapping:
 
         Args:
             tables: The document.
-            pipeline: The pipeline that the log is for; None takes the document's.
-            path: Where the document was read, for messages.
+            pipeline: The pipeline that the log is for; None: the one that the document names.
+            path: The file that the document was read from, for errors.
 
         Raises:
-            UsageError: When a key is unknown, missing or of the wrong kind.
+            UsageError: When a key is unknown, missing or of the wrong type.
         """
         where = "the mapping" if path is None else str(path)
         _known(tables, ("pipeline", "nodes"), where)
@@ -116,12 +117,12 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
     """Read a mapping file.
 
     Args:
-        path: The file; None takes the one in the pipeline's package.
-        pipeline: The pipeline that the log is for; None takes the file's.
-        package: The pipeline's package, which has been imported.
+        path: The file; None: the one in the pipeline's package.
+        pipeline: The pipeline that the log is for; None: the one that the file names.
+        package: Name of the pipeline's package, which must have been imported.
 
     Raises:
-        UsageError: When there is no such file, it is no TOML, or it makes no sense.
+        UsageError: When there is no such file, it is not TOML, or its content is not a valid mapping.
     """
     if path is None and package is not None:
         path = Path(str(sys.modules[package].__file__)).with_name(MAPPING)
@@ -159,7 +160,7 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     unit = _value(table, "stamp_unit", str, where) or "s"
     if unit not in STAMP_UNITS:
         raise UsageError(f"{where}: unknown stamp_unit {unit!r}. Available: {', '.join(STAMP_UNITS)}", hint=_HINT)
-    # A command is computed from the sample that it shares a stamp with, so it was sent after that.
+    # Commands come after samples with the same stamp, as they were computed from them.
     order = _value(table, "order", int, where)
     return NodeMapping(
         fields={f: _field(_table(v, f"{where}.fields.{f}"), f"{where}.fields.{f}") for f, v in fields.items()},
@@ -171,10 +172,10 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
 
 
 def positive(value: float, where: str) -> float:
-    """Return a rate that is a finite number above 0.
+    """Return ``value``, after checking that it is a finite number above 0.
 
     Raises:
-        UsageError: When it is not.
+        UsageError: When it is not; ``where`` says where it was found.
     """
     if not 0.0 < value < math.inf:
         raise UsageError(f"{where} must be above 0, got {value}", hint="it is in samples per second")
@@ -214,9 +215,9 @@ def _table(value: Any, where: str) -> Mapping[str, Any]:
 
 
 def _value(table: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
-    """Return a key's value, or None without the key."""
+    """Return a key's value, after checking its type; None if there is no such key."""
     value = table.get(key)
-    # TOML's truth values are whole numbers to Python.
+    # A boolean counts as an int in Python.
     if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
         raise UsageError(f"{where}: {key} has the wrong kind: {value!r}", hint=_HINT)
     return value

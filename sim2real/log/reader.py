@@ -1,4 +1,4 @@
-"""Reading a log back: the episode with its original names and shapes, whole or damaged."""
+"""Reads logs, whole or damaged, as episodes with the original names and shapes."""
 
 from __future__ import annotations
 
@@ -16,33 +16,35 @@ from sim2real.log.cdr import read_text
 from sim2real.log.contents import Contents, Range, in_words, walk
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields
 
-# Where an event's level stands, and where its name begins before alignment.
+# Positions of an event's level, and of its name before alignment [bytes].
 _LEVEL_AT, _NAME_AT = 12, 13
 
 
 class TruncatedLogWarning(UserWarning):
-    """The log is not whole: its session crashed, or a part of the file is unreadable. What is there is used."""
+    """The log is incomplete: its session crashed, or a part of the file is unreadable. The rest is used."""
 
 
 def read_log(path: str | Path, start_s: float | None = None, end_s: float | None = None) -> Episode:
-    """Read a log, all of it or a range of time.
+    """Read a log, or a time range of it.
 
-    A damaged log is read as far as it goes, with a warning. Beside the session's own entries the episode's metadata
-    has ``log``: ``epoch_ns``; ``session_end`` (None after a crash); ``attachments`` (names); ``events`` (time_s, level,
-    kind, text); ``first_seq``: node -> the seq of its first step in the episode, which is 0 in a whole log;
-    ``missing_steps``: node -> steps lost before or between those; ``skipped``: what was unreadable, in words.
+    What is readable of a damaged log is read, with a warning. The episode's metadata has the session's own entries and
+    ``log``, a dictionary with ``epoch_ns`` (wall clock at time 0), ``session_end`` (None after a crash),
+    ``attachments`` (names), ``events`` (each with time_s, level, kind, text), ``first_seq`` (node -> number of its
+    first step in the episode, 0 in a whole log), ``missing_steps`` (node -> number of steps lost before or between
+    those that were read) and ``skipped`` (descriptions of what was unreadable).
 
     Args:
         path: The file.
-        start_s: Read the steps that ended and the messages that arrived at or after this time [s from the episode's
-            start]; None: from the start.
-        end_s: The same, before this time; None: to the end.
+        start_s: Read steps that ended, and messages that arrived, at this time or later [s from the episode's start];
+            None: from the start.
+        end_s: Read those before this time [s from the episode's start]; None: to the end.
 
     Returns:
-        The episode. ``seq_in`` is -1 where the consuming step is not in it.
+        The episode. ``seq_in`` is -1 if the consuming step is not in the episode.
 
     Raises:
-        Sim2RealError: When the file is missing, no MCAP, no log of ours or cut before the end of its session metadata.
+        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
+            its session metadata.
 
     Warns:
         TruncatedLogWarning: When the session has no end or something was unreadable.
@@ -54,7 +56,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     with in_words(path):
         steps, outputs, sequences = _steps_and_outputs(contents, span)
         messages, events = _connections(contents, span, sequences), _events(contents, span)
-    # A log that starts in the middle lost its beginning, unless only a range was asked for.
+    # Steps before the first one count as lost, unless a range was asked for that starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
         node: int(s[-1]) + 1 - len(s) - (firsts[node] if start_s else 0) for node, s in sequences.items() if len(s)
@@ -79,10 +81,10 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
 
 
 def read_session(path: str | Path) -> dict[str, Any]:
-    """Return what a session says about itself, without reading its data: the recorder's metadata.
+    """Return the session's metadata, without reading steps and messages.
 
     Raises:
-        Sim2RealError: As ``read_log`` does, and when the metadata is damaged.
+        Sim2RealError: As ``read_log``, and when the metadata is damaged.
     """
     session = walk(path).session
     if session is None:
@@ -94,7 +96,7 @@ def read_attachment(path: str | Path, name: str) -> bytes:
     """Return the content of a file that was attached to a log.
 
     Raises:
-        Sim2RealError: As ``read_log`` does, and when there is no such attachment.
+        Sim2RealError: As ``read_log``, and when there is no such attachment.
     """
     attachments = walk(path).attachments
     if name not in attachments:
@@ -103,15 +105,15 @@ def read_attachment(path: str | Path, name: str) -> bytes:
 
 
 def summary(path: str | Path) -> dict[str, Any]:
-    """Return the facts about a log that need no decoding.
+    """Return facts about a log that can be read without decoding messages.
 
     Returns:
-        ``bytes``, ``chunks``, ``epoch_ns``, ``duration_s``, ``complete``, ``session`` (None where damaged),
-        ``session_end`` (None after a crash), ``attachments`` (name -> bytes), ``topics`` (topic -> messages, counted by
-        the chunks' indices) and ``skipped``.
+        ``bytes`` (file size), ``chunks`` (their number), ``epoch_ns``, ``duration_s``, ``complete``, ``session`` (None
+        if damaged), ``session_end`` (None after a crash), ``attachments`` (name -> size in bytes), ``topics`` (topic ->
+        number of messages, according to the chunks' indices) and ``skipped``.
 
     Raises:
-        Sim2RealError: As ``read_log`` does.
+        Sim2RealError: As ``read_log``.
     """
     contents = walk(path)
     return {
@@ -131,7 +133,7 @@ def summary(path: str | Path) -> dict[str, Any]:
 def _steps_and_outputs(
     contents: Contents, span: Range
 ) -> tuple[dict[str, Steps], dict[str, dict[str, np.ndarray]], dict[str, np.ndarray]]:
-    """Return node -> steps, node -> outputs, and node -> the seq of each step."""
+    """Return steps, outputs, and the number of each step, by node."""
     output_channels = {c.metadata["node"]: (n, c) for n, c in contents.with_role("output").items()}
     steps, outputs, sequences = {}, {}, {}
     for number, channel in contents.with_role("step").items():
@@ -142,7 +144,7 @@ def _steps_and_outputs(
             number, channel = output_channels[node]
             described = json.loads(channel.metadata["fields"])
             values = contents.columns(number, layout_of_fields(described), span)
-            # A step and its output may lie in different chunks, of which one may be lost.
+            # A step and its output may be in different chunks, one of which may be lost: keep complete pairs.
             _, in_steps, in_values = np.intersect1d(rows["sequence"], values["sequence"], return_indices=True)
             rows, values = rows[in_steps], values[in_values]
             for entry in described:
@@ -160,7 +162,7 @@ def _steps_and_outputs(
 def _connections(
     contents: Contents, span: Range, sequences: Mapping[str, np.ndarray]
 ) -> dict[tuple[str, str], Messages]:
-    """Return (node, input name) -> messages."""
+    """Return the messages of each connection, by (node, input name)."""
     connections = {}
     for number, channel in contents.with_role("input").items():
         node = channel.metadata["node"]
@@ -189,7 +191,7 @@ def _events(contents: Contents, span: Range) -> list[dict[str, Any]]:
 
 
 def _warn(path: str | Path, contents: Contents, missing: Mapping[str, int]) -> None:
-    """Warn, in the name of the caller of ``read_log``, of what the log lacks."""
+    """Warn of what the log lacks; the warning points to the caller of ``read_log``."""
     lacks = []
     if contents.end is None:
         lacks.append("its session has no end: the process that recorded it crashed or still runs")

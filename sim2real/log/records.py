@@ -1,4 +1,4 @@
-"""The records of an MCAP file, whole or damaged or made to harm: from the first byte on, past whatever is broken."""
+"""Reads the records of an MCAP file in order and skips damaged parts; safe against malicious files."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from sim2real.errors import Sim2RealError
 
 _PREFIX = struct.Struct("<BQ")
 _CHUNK_TIMES = struct.Struct("<QQ")
-# As plain numbers: they are compared for every record of a file.
+# Plain integers, as comparing with them is faster, and it is done for every record.
 _CHUNK, _MESSAGE_INDEX, _DATA_END = int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX), int(Opcode.DATA_END)
 _INDEX_BYTES = struct.Struct("<2xI")
-# What reading can resume at: a chunk, by its compression's name (behind the prefix, two times, a size and a checksum),
-# and the session's end, by its own name (behind the prefix).
+# After damage, reading resumes at a chunk or at the session's end. A chunk is found by the name of its compression,
+# which comes after the prefix, two times, a size and a checksum; the session's end by its name, after the prefix.
 _LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
 _CHUNK_NAME_AT = 37
 _METADATA_NAME_AT = _PREFIX.size
-# LZ4 cannot pack tighter than 255 to 1. What claims to is no log, and unpacking it would fill the memory.
+# LZ4 compresses at most 255 to 1. A chunk that claims more is no log, and decompressing it could fill the memory.
 _TIGHTEST = 256
-# Chunks hold a page of their own at least, however well they are packed.
+# Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
 _SMALL_BYTES = 64 * 1024
-# Records stand side by side. Where the lengths in a file make them overlap, reading it could take time without end.
+# Reading stops once this multiple of the file's size was read: records overlap, and might do so without end.
 _MOST_READ = 4
-# What a record that is cut or bent raises while it is parsed, and what does not fit together afterwards.
+# What parsing a damaged record may raise, or using values that do not fit each other.
 BROKEN = (
     *(McapError, struct.error, zlib.error, ValueError, LookupError, TypeError),
     *(AttributeError, ArithmeticError, MemoryError, RecursionError),
@@ -45,7 +45,7 @@ BROKEN = (
 
 
 class Record(NamedTuple):
-    """A record's kind and the place of its content in the file."""
+    """A record's opcode, and start and end of its content in the file."""
 
     opcode: int
     start: int
@@ -57,8 +57,8 @@ class Damage:
     """What could not be read.
 
     Attributes:
-        skipped: What is unreadable and where, in words, in the file's order.
-        cut: Whether the file ends before its data does.
+        skipped: Descriptions of what is unreadable and where, in the order of the file.
+        cut: Whether the file ends before the end of its data section.
     """
 
     skipped: list[str] = field(default_factory=list)
@@ -70,7 +70,7 @@ def opened(path: str | Path) -> Iterator[mmap.mmap]:
     """Map an MCAP file into memory.
 
     Raises:
-        Sim2RealError: When there is no such file, it cannot be read or is no MCAP.
+        Sim2RealError: When there is no such file, or it is not an MCAP file.
     """
     path = Path(path)
     if not path.is_file():
@@ -89,7 +89,7 @@ def opened(path: str | Path) -> Iterator[mmap.mmap]:
 
 
 def cut_before_session(path: str | Path) -> Sim2RealError:
-    """Return the error for a log that ends before anything was recorded."""
+    """Return the error for a log that was cut off before its first data."""
     return Sim2RealError(
         f"the log {path} was cut before the end of its session metadata: it holds no data",
         hint="the recording stopped while it was set up; record again",
@@ -99,14 +99,15 @@ def cut_before_session(path: str | Path) -> Sim2RealError:
 def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
     """Yield the records of the data section without reading their content.
 
-    Where the chain of lengths is broken, reading resumes at the next thing that looks like a chunk or a session's end.
+    Each record has its length, which leads to the next one. If a length is damaged, reading resumes at the next bytes
+    that look like a chunk or the session's end.
 
     Args:
         data: The file.
-        damage: Takes note of what is broken.
+        damage: Damage that is found is added here.
 
     Raises:
-        Sim2RealError: When the records overlap, so that there is no end to them.
+        Sim2RealError: When records overlap.
     """
     position = trusted = len(MCAP0_MAGIC)
     read = 0
@@ -123,7 +124,7 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
             elif record.opcode == _DATA_END:
                 return
             continue
-        # A bent length may have led here, past good chunks: search from behind the last record that was surely whole.
+        # A damaged length may have led past good chunks: search from the end of the last record known to be whole.
         resume = _next_landmark(data, trusted)
         if resume is None:
             break
@@ -139,21 +140,27 @@ def chunk_times(data: mmap.mmap, record: Record) -> tuple[int, int]:
 
 
 def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
-    """Return the records in a chunk, decompressed and checked; nothing where it is damaged."""
+    """Return the content of a chunk, decompressed and checked; empty if it is damaged.
+
+    Args:
+        data: The file.
+        record: The chunk.
+        damage: Damage that is found is added here.
+    """
     try:
         return _decompressed(Chunk.read(stream_of(data, record)))
-    except Exception as error:  # every decompressor has errors of its own
+    except Exception as error:  # decompressors have their own exceptions
         damage.skipped.append(f"a chunk of {record.end - record.start} bytes at {record.start} ({error})")
         return b""
 
 
 def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, start and end of the records in a chunk's content, without reading theirs.
+    """Yield opcode, start and end of the records in a chunk's content, without reading their content.
 
-    These are what `Record` holds, but as plain tuples: there is one for each message of a log.
+    These are the fields of ``Record``, but plain tuples are faster, and there is one for each message.
 
     Raises:
-        ValueError: When they do not fill it.
+        ValueError: When the records' lengths do not add up to the content's.
     """
     position, size, unpack = 0, len(content), _PREFIX.unpack_from
     while position < size:
@@ -166,7 +173,14 @@ def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Damage) -> Any | None:
-    """Return a record's content as an ``mcap.records`` class, or None where it is damaged."""
+    """Return a record parsed by a class of ``mcap.records``; None if it is damaged.
+
+    Args:
+        kind: The class.
+        data: The file, or a chunk's content.
+        record: The record's place in it.
+        damage: Damage that is found is added here.
+    """
     try:
         return kind.read(stream_of(data, record))
     except BROKEN as error:
@@ -175,12 +189,12 @@ def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Dam
 
 
 def stream_of(data: mmap.mmap | bytes, record: Record) -> ReadDataStream:
-    """Return a record's content as what ``mcap.records`` classes read."""
+    """Return a record's content as the stream that classes of ``mcap.records`` read."""
     return ReadDataStream(BytesIO(data[record.start : record.end]))
 
 
 def _record(data: mmap.mmap, position: int) -> Record | None:
-    """Return the record at a position, or None if there is no whole and plausible one."""
+    """Return the record at a position; None if there is no complete and plausible one."""
     start = position + _PREFIX.size
     if start > len(data):
         return None
@@ -188,13 +202,13 @@ def _record(data: mmap.mmap, position: int) -> Record | None:
     end = start + length
     if end > len(data) or not opcode:
         return None
-    # Most of a file is chunks and their indices, whose lengths can be checked; a bent opcode must not end the reading.
+    # Lengths of chunks and message indices, most of a file, can be checked; of the others the opcode is checked.
     if opcode == _MESSAGE_INDEX:
         plausible = length >= 6 and length == 6 + _INDEX_BYTES.unpack_from(data, start)[0]
     elif opcode == _CHUNK:
         plausible = _is_chunk(data, start, length)
     elif opcode > _DATA_END:
-        # Somebody's own (from 0x80 on), or of a later format: to be skipped, if it is not a chunk with a bent opcode.
+        # A private record (from 0x80 on) or one of a later format, unless it is a chunk with a damaged opcode.
         plausible = _begins_record(data, end) and not _is_chunk(data, start, length)
     else:
         plausible = opcode != _DATA_END or length == 4
@@ -202,7 +216,7 @@ def _record(data: mmap.mmap, position: int) -> Record | None:
 
 
 def _begins_record(data: mmap.mmap, position: int) -> bool:
-    """Whether a record can begin at a position, or the file ends there."""
+    """Return whether a record can begin at a position, or the file ends there."""
     if position + _PREFIX.size > len(data):
         return position == len(data)
     opcode, length = _PREFIX.unpack_from(data, position)
@@ -210,6 +224,7 @@ def _begins_record(data: mmap.mmap, position: int) -> bool:
 
 
 def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
+    """Return whether the lengths inside a record's content are those of a chunk."""
     if length < 40:
         return False
     name = int.from_bytes(data[start + 28 : start + 32], "little")
@@ -219,7 +234,7 @@ def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """Return a chunk's content; at no time more than it claims, and it may not claim more than there can be."""
+    """Return a chunk's content; a wrong size or checksum is an error, found without decompressing more than claimed."""
     size = chunk.uncompressed_size
     if size > _TIGHTEST * len(chunk.data) + _SMALL_BYTES:
         raise ValueError(f"it claims to hold {size} bytes: more than can be packed into {len(chunk.data)}")
@@ -243,7 +258,7 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 def _next_landmark(data: mmap.mmap, position: int) -> int | None:
-    """Return where the next plausible chunk or end of a session begins at or after a position, or None."""
+    """Return the position of the next plausible chunk or session's end at or after a position; None without any."""
     for match in _LANDMARK.finditer(data, position):
         begin = match.start() - (_CHUNK_NAME_AT if match["chunk"] else _METADATA_NAME_AT)
         kind = Opcode.CHUNK if match["chunk"] else Opcode.METADATA

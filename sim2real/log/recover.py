@@ -1,4 +1,4 @@
-"""Saving what is readable of a damaged MCAP file into a new one."""
+"""Copies what is readable of a damaged MCAP file into a new one."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mcap.writer import CompressionType, Writer
 from sim2real.errors import Sim2RealError
 from sim2real.log.records import Damage, Record, chunk_content, chunk_records, opened, parsed, records, stream_of
 
-# Channel, sequence and two times stand before a message's own bytes.
+# Size of a message record's content before the message's own data: channel, sequence and two times.
 _MESSAGE_BYTES = 22
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What ``recover`` saved.
+    """The result of ``recover``.
 
     Attributes:
-        messages: Topic -> messages written.
-        skipped: What was unreadable, in words.
-        cut: Whether the source ends before its data does.
+        messages: Topic -> number of messages written.
+        skipped: Descriptions of what was unreadable.
+        cut: Whether the source ends before the end of its data section.
     """
 
     messages: Mapping[str, int]
@@ -34,16 +34,16 @@ class Recovery:
 
 
 def recover(source: str | Path, target: str | Path) -> Recovery:
-    """Write what is readable of a damaged MCAP file into a new one that every reader opens.
+    """Copy what is readable of a damaged MCAP file into a new one that every MCAP reader opens.
 
-    A session that crashed stays one: the new file has a ``session_end`` only if the old one had.
+    The new file has a ``session_end`` only if the old one has: a session that crashed still counts as crashed.
 
     Args:
         source: Any MCAP file.
         target: The new file; it must not exist.
 
     Raises:
-        Sim2RealError: When the source is missing or no MCAP file, or the target exists.
+        Sim2RealError: When the source is missing or not an MCAP file, or the target exists.
     """
     damage = Damage()
     if Path(target).exists():
@@ -67,12 +67,12 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
 
 @dataclass
 class _Definitions:
-    """What a file says its schemas and channels are.
+    """The schemas and channels of a file.
 
     Attributes:
         schemas: Number -> schema.
         channels: Number -> channel.
-        sure: Numbers of channels that stand in a chunk, which has a checksum; elsewhere nothing guards them.
+        sure: Numbers of channels that are defined in a chunk, which has a checksum; other definitions may be damaged.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -81,9 +81,9 @@ class _Definitions:
 
 
 def _definitions(data: mmap.mmap) -> _Definitions:
-    """Go through a file for its schemas and channels: those in chunks count before those that stand alone."""
+    """Collect a file's schemas and channels; definitions in chunks take precedence, as chunks have checksums."""
     loose, sure = _Definitions(), _Definitions()
-    unheeded = Damage()  # the second walk, which copies, tells of it
+    unheeded = Damage()  # not reported here, but when the records are copied
 
     def take(found: _Definitions, source: mmap.mmap | bytes, record: Record) -> None:
         if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, unheeded)) is not None:
@@ -102,7 +102,7 @@ def _definitions(data: mmap.mmap) -> _Definitions:
 
 
 def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
-    """Return the records in a chunk's content; none where they do not fill it."""
+    """Return the records in a chunk's content; none if their lengths do not add up."""
     try:
         return [Record(*found) for found in chunk_records(content)]
     except ValueError as error:
@@ -112,7 +112,7 @@ def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
 
 
 class _Copier:
-    """Puts the records of one file into another, with numbers of its own for schemas and channels."""
+    """Copies the records of a file into another; schemas and channels get new numbers."""
 
     def __init__(self, writer: Writer, known: _Definitions) -> None:
         self.counts: dict[str, int] = {}
@@ -124,7 +124,13 @@ class _Copier:
         self._channels: dict[int, int] = {}
 
     def take(self, data: mmap.mmap, record: Record, damage: Damage) -> None:
-        """Copy a record of the data section."""
+        """Copy a record of the data section.
+
+        Args:
+            data: The source file.
+            record: The record.
+            damage: Damage that is found is added here.
+        """
         if record.opcode == Opcode.HEADER:
             self._header = parsed(Header, data, record, damage) or self._header
         elif record.opcode == Opcode.CHUNK:
@@ -142,9 +148,9 @@ class _Copier:
             self._writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, file.data)
 
     def finish(self) -> None:
-        """Write channels that no message was on, and the index."""
+        """Write the channels without messages, and the index."""
         self._begin()
-        # One that stands alone, in a file whose chunks define others, is a damaged copy of one of those.
+        # If chunks define channels, one that is defined only elsewhere is a damaged copy of one of those.
         for number in sorted(self._known.sure or self._known.channels):
             self._channel(number)
         self._writer.finish()
@@ -175,7 +181,7 @@ class _Copier:
         return self._channels[number]
 
     def _schema(self, number: int) -> int:
-        """Return a schema's new number; 0, which stands for none, where it is lost."""
+        """Return a schema's new number; 0, MCAP's number for no schema, if it is lost."""
         if number not in self._schemas:
             schema = self._known.schemas.get(number)
             new = 0 if schema is None else self._writer.register_schema(schema.name, schema.encoding, schema.data)

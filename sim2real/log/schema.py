@@ -1,4 +1,4 @@
-"""Topics: the name, the ROS schema and the byte layout of everything that a log holds."""
+"""The topics of a log: their names, ROS message types and byte layouts."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Topic:
     """A channel of the log.
 
     Attributes:
-        name: The topic, ``/node/output``.
+        name: The topic, e.g. ``/node/output``.
         schema: Name of the message type.
-        schema_text: Its definition, in the ``ros2msg`` language.
-        layout: Where its bytes are.
-        metadata: What goes with the channel: role, original node and input names, the fields with original names.
+        schema_text: Definition of the message type, in ``ros2msg`` format.
+        layout: Byte layout of the message type.
+        metadata: The channel's metadata: role, original names of node and input, and fields with original names.
     """
 
     name: str
@@ -56,9 +56,9 @@ class JointSource:
     """Where the joint states of one node come from.
 
     Attributes:
-        topic: The joint state channel's topic, with the node's own joint names in its layout.
-        picks: For position, velocity and effort the ``(leaf, element)`` of every joint, -1 where there is none; no
-            picks at all for a quantity that no joint has.
+        topic: The topic of joint states; its layout has the names of this node's joints.
+        picks: For each of position, velocity and effort, ``(leaf, element)`` in the node's output for every joint; leaf
+            is -1 if the joint lacks the quantity. Empty for a quantity that no joint has.
     """
 
     topic: Topic
@@ -66,7 +66,7 @@ class JointSource:
 
 
 def snake(name: str) -> str:
-    """Return a name as ROS wants it: ``lower_snake_case`` that starts with a letter."""
+    """Return a name in the form that ROS requires: ``lower_snake_case``, starting with a letter."""
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name)
     result = re.sub(r"[^A-Za-z0-9]+", "_", spaced).strip("_").lower()
     return result if result[:1].isalpha() else f"field_{result}".rstrip("_")
@@ -77,11 +77,11 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
 
     Args:
         node: The node's name.
-        example: One output, such as ``init_output`` returns.
-        units: Field -> unit, where known.
+        example: An output, such as ``init_output`` returns.
+        units: Field -> unit, as far as known.
 
     Raises:
-        Sim2RealError: When two leaves get the same name, or one has a dtype that ROS does not know.
+        Sim2RealError: When two leaves get the same name, or one has a dtype that ROS lacks.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
     names = unique_names(arrays, f"the output of node {node!r}", "field")
@@ -111,7 +111,7 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
 
 
 def layout_of_fields(described: Sequence[Mapping[str, Any]]) -> Layout:
-    """Return the layout of an output from the fields in its channel's metadata; columns have the original names."""
+    """Return the layout of an output from ``fields`` in its channel's metadata; its fields have the original names."""
     return Layout(part for entry in described if (part := _field(entry)).size)
 
 
@@ -133,7 +133,7 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
 
     Args:
         node: The node's name.
-        example: One output of the node.
+        example: An output of the node.
         joints: Joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the output: ``"th"``, or
             ``"q[2]"`` for an element of the flattened field.
 
@@ -165,8 +165,13 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
 def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, str]:
     """Return original name -> ROS name.
 
+    Args:
+        originals: The original names.
+        where: What they are part of, for errors.
+        kind: What they are names of, for errors.
+
     Raises:
-        Sim2RealError: When two originals become the same name.
+        Sim2RealError: When two of them get the same ROS name.
     """
     taken: dict[str, str] = {}
     for original in originals:

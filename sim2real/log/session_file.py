@@ -1,4 +1,4 @@
-"""The file of one session: its records, in the order in which they must reach the disk. One thread at a time."""
+"""Writes the file of one session, in the order that lets a crashed session be read. For one thread at a time."""
 
 from __future__ import annotations
 
@@ -34,17 +34,25 @@ from sim2real.log.schema import (
 )
 
 LIBRARY = "sim2real"
-# Small chunks: a range read decompresses little, a damaged byte costs little.
+# Small, so that reading a range decompresses little, and a damaged byte costs little data.
 CHUNK_BYTES = 64 * 1024
 
 
 @dataclass
 class _Node:
-    """How the steps of one node are written."""
+    """How the steps of one node are written.
+
+    Attributes:
+        step: Topic of its step records.
+        output: Topic of its outputs.
+        filled: Indices of the output's leaves that have elements; empty ones are not written.
+        leaves: Number of leaves of the output.
+        joints: Where its joint states come from, or None.
+    """
 
     step: Topic
     output: Topic
-    filled: list[int]  # indices of the leaves that have elements: the others are known without a message
+    filled: list[int]
     leaves: int
     joints: JointSource | None
 
@@ -52,11 +60,22 @@ class _Node:
 class SessionFile:
     """A log that is being written.
 
-    Opening it writes the session's metadata and attachments and waits for the disk; the arguments are those of
-    ``McapRecorder``, and ``units``: node -> field -> unit, for the channels' metadata.
+    The constructor writes the session's metadata and attachments, and waits until they are on the disk.
+
+    Args:
+        path: The file; it must not exist.
+        metadata: The session's metadata: JSON-able.
+        attachments: File name -> content.
+        outputs: Node -> an example of its output.
+        inputs: The connections, as (node, input name).
+        joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
+        units: Node -> field -> unit, for the channels' metadata.
 
     Attributes:
-        counts: Topic -> messages written.
+        counts: Topic -> number of messages written.
+
+    Raises:
+        Sim2RealError: As ``McapRecorder``.
     """
 
     def __init__(
@@ -103,7 +122,12 @@ class SessionFile:
             ) from error
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """Write the channels: they carry the episode's time 0."""
+        """Write the channels, whose metadata have the episode's time 0.
+
+        Args:
+            epoch_ns: Time 0 on the wall clock [ns].
+            monotonic_ns: Time 0 on the monotonic clock [ns].
+        """
         self._epoch_ns, self._start_monotonic_ns = epoch_ns, monotonic_ns
         loose = RecordBuilder()
         schemas: dict[str, int] = {}
@@ -117,7 +141,7 @@ class SessionFile:
             channel = self._writer.register_channel(topic.name, "cdr", schema, metadata)
             Channel(channel, topic.name, "cdr", metadata, schema).write(loose)
             self._channels[topic.name] = channel
-        # The writer keeps these for the first chunk. They also stand before it: losing that chunk loses no other.
+        # Also in front of the first chunk, where the writer puts them: losing that chunk must not lose the others.
         self._stream.write(loose.end())
         for event in self._early_events:
             self.event(*event)
@@ -145,7 +169,7 @@ class SessionFile:
             self._add(node.joints.topic, payload, seq, sent, sent)
 
     def message(self, record: MessageRecord) -> None:
-        """Write the fate of a message."""
+        """Write the record of a message."""
         topic = self._inputs.get((record.node, record.input))
         if topic is None:
             known = ", ".join(f"{node}/{name}" for node, name in self._inputs)
@@ -155,7 +179,15 @@ class SessionFile:
         self._add(topic, payload, record.seq_out, received, sent)
 
     def event(self, monotonic_ns: int, ticks: int | None, level: int, kind: str, message: str) -> None:
-        """Write an event that happened at ``ticks`` or, where that is None, at ``monotonic_ns``."""
+        """Write an event.
+
+        Args:
+            monotonic_ns: When it happened, on the monotonic clock [ns].
+            ticks: When it happened, for a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
+            level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
+            kind: A short name.
+            message: What happened.
+        """
         topic = self._topics[-1]
         if not self._channels:
             self._early_events.append((monotonic_ns, ticks, level, kind, message))
@@ -169,11 +201,11 @@ class SessionFile:
         self._add(topic, payload, self.counts.get(topic.name, 0), time_ns, time_ns)
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system: it survives the end of this process."""
+        """Pass everything written so far to the operating system, so that it survives the end of this process."""
         self._writer.flush()
 
     def sync(self) -> None:
-        """Wait until the disk has everything flushed so far: it survives a loss of power."""
+        """Wait until everything flushed so far is on the disk, so that it survives a loss of power."""
         os.fsync(self._stream.fileno())
 
     def finish(self, end: Mapping[str, Any]) -> None:
@@ -186,12 +218,12 @@ class SessionFile:
         self._stream.close()
 
     def abandon(self) -> None:
-        """Close a file that could not be written to its end."""
+        """Close a file that could not be finished."""
         with suppress(OSError):
             self._stream.close()
 
     def _all_topics(self) -> list[Topic]:
-        """Return every channel's topic; the events' is the last one."""
+        """Return the topics of all channels; that of events is the last one."""
         topics = [t for node in self._nodes.values() for t in (node.step, node.output) if t.layout.fields]
         topics += self._inputs.values()
         topics += [node.joints.topic for node in self._nodes.values() if node.joints is not None][:1]
@@ -242,7 +274,7 @@ def _inputs(inputs: Iterable[tuple[str, str]], nodes: Mapping[str, _Node]) -> di
 
 
 def _to_host(leaves: list[Any]) -> list[Any]:
-    """Return the leaves as numpy arrays or numbers: all transfers are started before the first is waited for."""
+    """Return the leaves as numpy arrays or numbers; all transfers start before the first one is waited for."""
     for leaf in leaves:
         if hasattr(leaf, "copy_to_host_async"):
             leaf.copy_to_host_async()

@@ -1,4 +1,4 @@
-"""The recorder that writes a log: control threads queue what happened, one thread of its own writes it."""
+"""The recorder that writes a log: control threads put records into a queue, and a writer thread writes them."""
 
 from __future__ import annotations
 
@@ -18,34 +18,36 @@ from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
 from sim2real.log.session_file import SessionFile
 
-# A crash costs at most 0.25 s of data; the difference is for a writer thread that wakes late.
+# A crash may cost at most 0.25 s of data; 0.05 s are left for a writer thread that wakes late.
 FLUSH_PERIOD_S = 0.2
 SYNC_PERIOD_S = 1.0
-# Longer than any disk that still works takes to swallow the queue.
+# Longer than any working disk needs for the queue.
 CLOSE_TIMEOUT_S = 60.0
-# A level of rcl_interfaces/msg/Log.
+# The warning level of rcl_interfaces/msg/Log.
 WARN = 30
 
 
 class McapRecorder:
     """Writes one episode of a graph into one MCAP file; a ``Recorder``.
 
-    ``start``, ``step``, ``message`` and ``write_event`` only queue: they never wait for the disk, and any thread may
-    call them. What goes wrong while writing is raised by the next call. As a context manager, an exception that leaves
-    the block becomes the status of the session; a process that ends without closing the log closes it as ``aborted``.
+    ``start``, ``step``, ``message`` and ``write_event`` only queue: they never wait for the disk, and may be called
+    from any thread. An error while writing is raised by the next call. Used as a context manager, an exception that
+    leaves the block becomes the status of the session. If the process ends without closing the log, it is closed with
+    the status ``aborted``.
 
     Args:
         path: The file; it must not exist.
-        metadata: What the session is (pipeline, configuration, versions, ...): JSON-able. The key ``log`` is reserved.
+        metadata: Facts about the session (pipeline, configuration, versions, ...): JSON-able. The key ``log`` is
+            reserved.
         attachments: File name -> content.
-        outputs: Node -> an example of its output, such as ``init_output`` returns; later ones have its shapes.
+        outputs: Node -> an example of its output, such as ``init_output`` returns; all outputs must have its shapes.
         inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the node's output
-            (``"th"``, ``"q[2]"``), to be written as ``/joint_states`` too, which viewers plot by themselves.
+            (``"th"``, ``"q[2]"``): also written as ``/joint_states``, which viewers plot without configuration.
 
     Raises:
-        Sim2RealError: When the file exists or cannot be created, the metadata cannot be written as JSON, names collide
-            or an output has a dtype that ROS does not know.
+        Sim2RealError: When the file exists or cannot be created, the metadata cannot be written as JSON, two names get
+            the same ROS name, or an output has a dtype that ROS lacks.
     """
 
     def __init__(
@@ -74,37 +76,42 @@ class McapRecorder:
         atexit.register(self._close_at_exit)
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """The episode starts: time 0 is ``monotonic_ns`` on the monotonic clock, ``epoch_ns`` on the wall clock."""
+        """Queue the episode's start.
+
+        Args:
+            epoch_ns: Time 0 on the wall clock [ns].
+            monotonic_ns: Time 0 on the monotonic clock [ns].
+        """
         if self._started:
             raise Sim2RealError(f"the log {self.path} has an episode already", hint="open one log for each episode")
         self._started = True
         self._put(self._file.start, epoch_ns, monotonic_ns)
 
     def step(self, record: StepRecord, output: Any) -> None:
-        """Queue a step that has ended with this output: a pytree like the example, or a mapping by leaf name."""
+        """Queue a step that has ended, and its output: a pytree like the example, or a mapping by leaf name."""
         self._put(self._file.step, record, _snapshot(record.node, output, self._names.get(record.node, {})))
 
     def message(self, record: MessageRecord) -> None:
-        """Queue the fate of a message."""
+        """Queue the record of a message."""
         self._put(self._file.message, record)
 
     def write_event(self, kind: str, text: str, level: int = WARN, ticks: int | None = None) -> None:
-        """Queue an event, such as a safety stop; viewers show it as a log line. It may come before the start.
+        """Queue an event, such as a safety stop, which viewers show as a log line; also allowed before ``start``.
 
         Args:
             kind: A short name, for example ``"watchdog"``.
             text: What happened.
-            level: As in ROS: 20 information, 30 warning, 40 error, 50 fatal.
-            ticks: When [us from the episode's start], for a simulated clock; None: now.
+            level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
+            ticks: When it happened, for a simulated clock [us from the episode's start]; None: now.
         """
         self._put(self._file.event, time.monotonic_ns(), ticks, level, kind, text)
 
     def close(self, status: str = "finished", exit_code: int = OK, summary: Mapping[str, Any] | None = None) -> None:
-        """Write all that is queued and ``session_end``, and close the file. Later calls do nothing.
+        """Write everything that is queued and ``session_end``, and close the file. Later calls do nothing.
 
         Args:
             status: How the session ended, in a word or a sentence.
-            exit_code: What the command ends with.
+            exit_code: Exit code of the command.
             summary: More facts for ``session_end`` (overruns, drops, ...): JSON-able.
 
         Raises:
@@ -153,7 +160,7 @@ class McapRecorder:
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
             self.close(status, getattr(error, "exit_code", ERROR))
         except Sim2RealError as failure:
-            # The exception on its way out is the one to see.
+            # The exception that left the block is raised; this one is added to it.
             error.add_note(str(failure))
 
     def _put(self, write: Callable[..., None], *arguments: Any) -> None:
@@ -164,7 +171,7 @@ class McapRecorder:
         self._queue.put((write, *arguments))
 
     def _failure(self) -> Sim2RealError:
-        """Return the error that every call raises from now on: one object, so that whoever meets it twice can tell."""
+        """Return the error that all calls raise from now on: always the same object, so that it is reported once."""
         if self._failed is None:
             hint = None
             if isinstance(self._error, OSError):
@@ -173,7 +180,7 @@ class McapRecorder:
         return self._failed
 
     def _run(self) -> None:
-        """Write what comes out of the queue until None does."""
+        """Write what is in the queue until None comes."""
         try:
             flush_at = time.monotonic() + FLUSH_PERIOD_S
             sync_at = time.monotonic() + SYNC_PERIOD_S
@@ -195,13 +202,13 @@ class McapRecorder:
             self._error = error
 
     def _close_at_exit(self) -> None:
-        # Nobody is left to hear about a failure.
+        # The interpreter is exiting: a failure could not be reported.
         with contextlib.suppress(Sim2RealError):
             self.close("aborted", ERROR)
 
 
 def _snapshot(node: str, output: Any, names: dict[str, None]) -> list[Any]:
-    """Return the leaves of an output, safe from what the caller does next: JAX arrays are, numpy's are copied."""
+    """Return the leaves of an output; writable numpy arrays are copied, as the caller may change them."""
     if isinstance(output, Mapping) and output.keys() == names.keys():
         leaves = [output[name] for name in names]
     elif isinstance(output, Mapping) and names and not any(isinstance(value, Mapping) for value in output.values()):
@@ -209,7 +216,7 @@ def _snapshot(node: str, output: Any, names: dict[str, None]) -> list[Any]:
             f"the output of node {node!r} has the fields {', '.join(output)}, expected {', '.join(names)}"
         )
     else:
-        import jax  # a log is written without JAX when messages are plain dictionaries
+        import jax  # imported late: a log of plain dictionaries is written without JAX
 
         leaves = jax.tree_util.tree_leaves(output)
     return [leaf.copy() if type(leaf) is np.ndarray and leaf.flags.writeable else leaf for leaf in leaves]
