@@ -1,4 +1,4 @@
-"""The servo bus: what a control loop does with DYNAMIXEL X servos, in SI units, and how it leaves them."""
+"""The servo bus: reads and commands DYNAMIXEL X servos in SI units, and takes their torque off at the end."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ _SAFE_PAUSE_S: Final = 0.002
 
 @dataclass(frozen=True)
 class StateReading:
-    """What the servos measured, in the order of the ids asked for.
+    """Measurements of n servos, in the order of the ids that were asked for.
 
     Args:
-        position_rad: (n,) from each encoder's zero.
-        velocity_rad_s: (n,)
-        load: (n,) share of the largest load, in [-1, 1]; servos that report current instead: in units of 1000 counts.
-        transaction: When it was asked for, and what that took.
+        position_rad: Shape (n,): angles from each encoder's zero [rad].
+        velocity_rad_s: Shape (n,) [rad/s].
+        load: Shape (n,): fraction of the largest load, in [-1, 1]; for servos that report current instead, the current
+            in units of 1000 counts.
+        transaction: When the measurement was requested, and how long it took.
     """
 
     position_rad: np.ndarray
@@ -49,11 +50,12 @@ class StateReading:
 
 
 class ServoBus:
-    """DYNAMIXEL X servos on one port. Every method may be called from any thread.
+    """DYNAMIXEL X servos on one port. All methods may be called from any thread.
 
-    A missed answer is counted and asked for again; a bus that stays silent raises HardwareLost. Leaving the context,
-    `close`, or the end of the interpreter take the torque off. A signal does not unless its handler calls `make_safe`.
-    When this process is killed, or hangs, the guardian takes it off: a process of its own, there before torque goes on.
+    If an answer is missing, the instruction is sent again; a bus that stays silent raises HardwareLost. The torque is
+    taken off by `close`, when the context is left, and when the interpreter exits; on a signal only if its handler
+    calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate process that is
+    started before torque goes on.
 
         with ServoBus(BusConfig("/dev/ttyUSB0")) as bus:
             bus.handshake({1: None})
@@ -84,37 +86,37 @@ class ServoBus:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close it."""
+        """Take the torque off and close the port."""
         self.close()
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The servos found by `handshake`."""
+        """Ids of the servos found by `handshake`."""
         return self._ids
 
     @property
     def transactions(self) -> int:
-        """Instructions carried out so far."""
+        """Number of instructions that were answered, or needed no answer, so far."""
         return self._link.transactions
 
     @property
     def lost_replies(self) -> int:
-        """Answers missed so far."""
+        """Number of missing answers so far."""
         return self._link.lost_replies
 
     @property
     def retries(self) -> int:
-        """Instructions sent again so far."""
+        """Number of instructions that were sent again so far."""
         return self._link.retries
 
     @property
     def late_replies(self) -> int:
-        """Answers so far that came too late, or so late that when they were measured is not sure."""
+        """Number of answers so far that came too late, or so late that the time of their sample is uncertain."""
         return self._link.late_replies
 
     @property
     def late_s(self) -> np.ndarray:
-        """By how much each answer so far took longer than its bytes, (N,) [s]."""
+        """How much longer each answer so far took than its bytes need on the wire, shape (N,) [s]."""
         return np.array(self._link.late_us, np.float64) * 1e-6
 
     @property
@@ -129,11 +131,11 @@ class ServoBus:
 
     @property
     def guardian_pid(self) -> int | None:
-        """The guardian's process, once there is one."""
+        """Process id of the guardian; None before it is started."""
         return None if self._link.guardian is None else self._link.guardian.pid
 
     def without_host(self) -> list[str]:
-        """Return for each kind of servo found what it does by itself when this process dies."""
+        """Return for each model of servo found a sentence on what it does by itself when this process dies."""
         kinds: dict[int, list[int]] = {}
         for servo_id, number in zip(self._ids, self._models, strict=True):
             kinds.setdefault(number, []).append(servo_id)
@@ -141,13 +143,13 @@ class ServoBus:
         return [f"{model(n).name} (servo {', '.join(map(str, ids))}) {what[n]}" for n, ids in kinds.items()]
 
     def handshake(self, expected: Mapping[int, int | None]) -> dict[int, int]:
-        """Find the servos; from now on they are the ones whose torque `close` takes off.
+        """Find the servos; `torque`, `close` and `make_safe` act on these from now on.
 
         Args:
-            expected: Model number by servo id; None accepts any model.
+            expected: Servo id -> model number; None accepts any model.
 
         Returns:
-            The model number found, by id.
+            Servo id -> model number found.
 
         Raises:
             HardwareLost: A servo does not answer, or is another model.
@@ -160,19 +162,22 @@ class ServoBus:
                     f"servo {servo_id} is model {models[servo_id]} ({names[0]}), expected {wanted} ({names[1]})"
                 )
         self._ids, self._models = tuple(expected), tuple(models.values())
-        self._torque_off_packet = torque_off_packet(self._ids)  # now, so that make_safe has nothing to compute
+        self._torque_off_packet = torque_off_packet(self._ids)  # built here, as make_safe must not need any time
         return models
 
     def scan(self) -> dict[int, int]:
-        """Return the model number of every servo that answers a broadcast ping, by id; takes 0.8 s at 1 Mbaud."""
+        """Return id -> model number of all servos that answer a broadcast ping; takes 0.8 s at 1 Mbaud."""
         with self._link.hold():
             found, _ = self._link.packets.broadcastPing(self._link.port)
         return {servo_id: model for servo_id, (model, _) in sorted(found.items())}
 
     def setup(self, mode: OperatingMode) -> None:
-        """Prepare the servos for a control loop, with torque off: operating mode, answers without delay.
+        """Take the torque off, set the operating mode, and let the servos answer without delay.
 
-        EEPROM registers are only written where they differ, for they wear out.
+        EEPROM registers are written only if their value differs, as writing wears them out.
+
+        Args:
+            mode: The operating mode.
         """
         for servo_id in self._ids:
             self.write(servo_id, reg.TORQUE_ENABLE, 0)
@@ -197,13 +202,17 @@ class ServoBus:
         self._link.torque_withheld = True
 
     def torque(self, on: bool) -> None:
-        """Switch the torque of all servos; on: with goals at rest (no PWM, no speed, or the present position).
+        """Switch the torque of all servos on or off.
 
-        The bus watchdog is armed once torque is on, and disarmed, which also clears it, before that. The guardian
-        watches from before torque goes on until it is off.
+        Before torque goes on, goals are set to rest: no PWM, no speed, or the present position. The servos' bus
+        watchdogs are cleared before torque goes on and armed afterwards. The guardian watches from before torque goes
+        on until it is off.
+
+        Args:
+            on: Whether to switch it on.
 
         Raises:
-            SafetyStop: `make_safe` or `close` came before, or the guardian has taken over.
+            SafetyStop: `make_safe` or `close` was called before, or the guardian has taken over.
             HardwareLost: A servo does not answer, or the guardian does not start.
         """
         if on and self._halted:
@@ -213,7 +222,7 @@ class ServoBus:
         if on:
             self._guard()
         elif guardian is not None and not guardian.settle():
-            guardian.disarm()  # that it has acted, or died, is no reason to leave the torque on
+            guardian.disarm()  # it has taken over or died: take the torque off all the same
         for servo_id in self._ids:
             if on:
                 self.write(servo_id, reg.BUS_WATCHDOG, 0)
@@ -225,7 +234,11 @@ class ServoBus:
             guardian.disarm()
 
     def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
-        """Read position, velocity and load of some servos (default: all) in one transaction."""
+        """Read position, velocity and load of servos in one transaction.
+
+        Args:
+            ids: The servos; None: all.
+        """
         ids = self._ids if ids is None else tuple(ids)
         data, transaction = self._read_each(ids, _STATE_ADDRESS, _STATE_BYTES, "read of the state")
         counts = np.frombuffer(data, _STATE_DTYPE)
@@ -237,9 +250,12 @@ class ServoBus:
         )
 
     def write_goal_pwm(self, goals: Mapping[int, float]) -> Transaction:
-        """Command shares of the supply voltage, in [-1, 1], by servo id.
+        """Command PWM, as fractions of the supply voltage.
 
-        One servo confirms its goal; several get theirs in one instruction, at the same time and without an answer.
+        A single servo confirms its goal. Several get their goals in one instruction, which they do not answer.
+
+        Args:
+            goals: Servo id -> fraction in [-1, 1].
 
         Raises:
             SafetyStop: A goal is not finite or out of range, or the servo's watchdog has tripped.
@@ -247,13 +263,13 @@ class ServoBus:
         return self._write_goals(reg.GOAL_PWM, goals, reg.pwm_from_fraction, 1.0)
 
     def write_goal_velocity(self, goals: Mapping[int, float]) -> Transaction:
-        """Command speeds in rad/s, by servo id; otherwise as `write_goal_pwm`."""
+        """Command speeds [rad/s] by servo id; otherwise like `write_goal_pwm`."""
         return self._write_goals(
             reg.GOAL_VELOCITY, goals, reg.count_from_rad_s, reg.rad_s_from_count(reg.GOAL_VELOCITY.maximum)
         )
 
     def write_goal_position(self, goals: Mapping[int, float]) -> Transaction:
-        """Command positions in rad from each encoder's zero, by servo id; otherwise as `write_goal_pwm`."""
+        """Command positions [rad from each encoder's zero] by servo id; otherwise like `write_goal_pwm`."""
         return self._write_goals(
             reg.GOAL_POSITION, goals, reg.count_from_rad, reg.rad_from_count(reg.GOAL_POSITION.maximum)
         )
@@ -263,13 +279,20 @@ class ServoBus:
         return self._link.read(servo_id, register)
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
-        """Write a value in counts to a register, and wait for the servo to confirm it."""
+        """Write a register and wait for the servo to confirm it.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
         return self._link.write(servo_id, register, value)
 
     def check(self) -> None:
-        """Raise SafetyStop if a servo's watchdog has tripped, or it restarted or has a hardware error; for a slow loop.
+        """Raise SafetyStop if a servo's watchdog has tripped, it has restarted, or it has a hardware error.
 
-        Goals written to several servos at once are not confirmed, so that nothing else would tell of the first two.
+        To be called every now and then when several servos are commanded at once: they do not confirm their goals, and
+        nothing else would show a tripped watchdog or a restart.
         """
         armed = self._armed
         data, _ = self._read_each(self._ids, reg.BUS_WATCHDOG.address, reg.BUS_WATCHDOG.size, "read of bus_watchdog")
@@ -277,7 +300,7 @@ class ServoBus:
             count = reg.BUS_WATCHDOG.decode(bytes((byte,)))
             if count == reg.WATCHDOG_TRIPPED:
                 raise SafetyStop(*watchdog_message(servo_id))
-            # Before and after: another thread may be switching the torque, which changes the register.
+            # Checked before and after the read: switching the torque in another thread changes the register.
             if armed and self._armed and count != self.config.watchdog_count:
                 raise SafetyStop(
                     f"servo {servo_id} has lost its settings: its bus watchdog holds {count}, "
@@ -286,10 +309,11 @@ class ServoBus:
                 )
 
     def make_safe(self) -> None:
-        """Take the torque off without waiting for anything or anyone: for signal handlers and watchdog threads.
+        """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
 
-        It takes no lock, for the code that it interrupts may hold it. The instruction may meet an answer on the wire
-        and be lost; therefore it is sent several times, over 8 ms. Torque cannot go on again afterwards.
+        It takes no lock because the code that a signal interrupts may hold it. The instruction may collide with an
+        answer on the wire and be lost, so it is sent five times within 8 ms. Torque cannot be switched on again
+        afterwards.
         """
         self._halted = True
         if not self._torque_off_packet or self._link.closed:
@@ -300,9 +324,9 @@ class ServoBus:
                 os.write(self._link.port.fd, self._torque_off_packet)
 
     def close(self) -> None:
-        """Take the torque off, disarm the watchdogs, close the port. Never raises; closing twice is fine.
+        """Take the torque off, disarm the watchdogs, close the port. Never raises; may be called twice.
 
-        The watchdog of a servo that does not confirm stays armed, and the guardian goes on trying for 10 s.
+        If a servo does not confirm, its watchdog stays armed, and the guardian goes on trying for 10 s.
         """
         if self._link.closed:
             return
@@ -323,7 +347,7 @@ class ServoBus:
         atexit.unregister(self.close)
 
     def _guard(self) -> None:
-        """Have the guardian watch; the first time, start it."""
+        """Let the guardian watch; start it the first time."""
         if not self.config.guardian:
             return
         link = self._link
@@ -332,7 +356,7 @@ class ServoBus:
         link.guardian.arm()
 
     def _ping(self, servo_id: int) -> int:
-        """Return the model number of a servo that must be there."""
+        """Return the model number of a servo; raise HardwareLost if it does not answer."""
         link = self._link
         try:
             return link.exchange(lambda: link.packets.ping(link.port, servo_id), f"ping of servo {servo_id}")[0]
@@ -365,7 +389,7 @@ class ServoBus:
         return self._link.write_each(register, counts)
 
     def _read_each(self, ids: tuple[int, ...], address: int, length: int, what: str) -> tuple[bytes, Transaction]:
-        """Return blocks of the servos' control tables, one behind the other."""
+        """Return a block of each servo's control table, concatenated."""
         if not ids:
             raise UsageError("there are no servos to read", hint="call handshake first")
         return self._link.read_bytes_of(ids, address, length, what)

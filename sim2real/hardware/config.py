@@ -1,4 +1,4 @@
-"""What no command gets past; every field is a flag of the stages that move a robot. Imports nothing heavy."""
+"""Limits of the safety gate, as flags of the stages that move a robot. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -9,23 +9,26 @@ from sim2real.errors import UsageError
 
 @dataclass(frozen=True)
 class GateLimits:
-    """The safety gate: what no command gets past."""
+    """The limits of the safety gate, through which every command passes."""
 
     limit: float = 2.0
-    """Largest command in either direction [the actuator's unit: V for the pendulum, rad for the arm]."""
+    """Largest magnitude of a command [the actuator's unit: V for the pendulum, rad for the arm]."""
     slew_per_s: float = 400.0
-    """Fastest change of the command [unit/s]."""
+    """Largest rate of change of a command [the actuator's unit per second]."""
     command_timeout_s: float = 0.1
-    """A command older than this becomes zero volts; servos in position mode hold where they are [s]."""
+    """Age after which a command is replaced: by zero volts, or, in position mode, by the last one, so that the servos
+    hold their position [s]."""
     max_speed_rad_s: float = 60.0
-    """Joint speed above which the robot is stopped [rad/s]; so is one whose position leaps further than that allows."""
+    """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
     stuck_effort: float = 0.2
-    """A joint that is pushed both ways with more than this share of its torque must move, or the robot is stopped."""
+    """Fraction of a joint's torque: if a joint that is driven with more than this in both directions does not move, the
+    robot is stopped."""
     servo_watchdog_s: float = 0.1
-    """Longest silence on the bus: then the guardian takes the torque off, and servos that do so stop [s]; of 20 ms."""
+    """Longest time without an instruction on the bus; after it the guardian takes the torque off, and servos whose own
+    watchdog stops them stop [s, rounded to 20 ms]."""
 
     def __post_init__(self) -> None:
-        """Check that each limit keeps something out and lets something through."""
+        """Check that all limits are in their ranges."""
         for name in ("limit", "slew_per_s", "command_timeout_s", "max_speed_rad_s", "stuck_effort"):
             if not getattr(self, name) > 0.0:
                 raise UsageError(f"gate.{name} must be above 0, got {getattr(self, name)}")

@@ -1,4 +1,4 @@
-"""What servos are driven with: volts or joint angles; how either becomes goals on the bus, and what rest is."""
+"""The ways to drive servos, by voltage or by joint angle: how commands become goals on the bus, and back."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim2real.hardware.registers import OperatingMode, Register
 
 
 class Drive(Protocol):
-    """A way to drive servos. Commands are (n,) float64, in the order of the bus's ids.
+    """A way to drive servos. Commands are float64 arrays of shape (n,), in the order of the bus's ids.
 
     Attributes:
         mode: The operating mode that the servos must be in.
@@ -26,20 +26,20 @@ class Drive(Protocol):
     mode: ClassVar[OperatingMode]
 
     def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Raise UsageError if this gate, or so many servos, make no sense with it; before the port is opened."""
+        """Check gate and number of servos before the port is opened; raise UsageError if they do not fit the drive."""
         ...
 
     def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
         """Write the servos' settings, with torque off.
 
         Raises:
-            HardwareLost: A servo does not keep them.
-            UsageError: The gate lets more through than a servo takes.
+            HardwareLost: A servo does not keep its settings.
+            UsageError: The gate allows commands that a servo does not accept.
         """
         ...
 
     def rest(self, bus: ServoBus) -> np.ndarray:
-        """Return the command that the servos obey right after torque on."""
+        """Return the command that the servos follow right after torque goes on."""
         ...
 
     def send(self, bus: ServoBus, command: np.ndarray) -> None:
@@ -47,17 +47,17 @@ class Drive(Protocol):
         ...
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return with how much of their torque the servos push, by their command and angles, (n,) in [-1, 1]."""
+        """Return the fraction of full torque that the servos apply, shape (n,) in [-1, 1], from command and angles."""
         ...
 
     def reading(self, reading: StateReading) -> StateReading:
-        """Return a measurement of all servos in this drive's angles."""
+        """Return a measurement with positions in this drive's angles."""
         ...
 
 
 @dataclass(frozen=True)
 class VoltageDrive:
-    """Servos in PWM mode, commanded in volts; at rest there are none. Angles are rad from each encoder's zero.
+    """Servos in PWM mode, commanded in volts, at rest 0 V. Angles are measured from each encoder's zero [rad].
 
     Args:
         supply_v: Voltage of a motor at full PWM [V].
@@ -67,17 +67,17 @@ class VoltageDrive:
     mode: ClassVar[OperatingMode] = OperatingMode.PWM
 
     def __post_init__(self) -> None:
-        """Refuse a supply that is none."""
+        """Check the supply voltage."""
         if not 0.0 < self.supply_v < math.inf:
             raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
 
     def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Refuse a gate that would keep a voltage on."""
+        """Refuse a gate that repeats the last voltage when commands are stale."""
         del ids
         _require_stale(gate, "zero", "volts")
 
     def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
-        """PWM mode has no settings."""
+        """Do nothing: PWM mode has no settings."""
 
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return zero volts."""
@@ -88,28 +88,28 @@ class VoltageDrive:
         bus.write_goal_pwm({i: float(v) / self.supply_v for i, v in zip(bus.ids, command, strict=True)})
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the voltage's share of the supply."""
+        """Return the command as a fraction of the supply voltage."""
         del position_rad
         return np.clip(command / self.supply_v, -1.0, 1.0)
 
     def reading(self, reading: StateReading) -> StateReading:
-        """Return the measurement as it is."""
+        """Return the measurement unchanged."""
         return reading
 
 
 @dataclass(frozen=True)
 class PositionDrive:
-    """Servos in position mode, commanded in joint angles [rad]; at rest they hold where they are.
+    """Servos in position mode, commanded in joint angles [rad]; at rest they hold their position.
 
-    A joint's angle is 0 where its encoder shows `zero_count`. The servos take goals of one revolution, counts 0 to
-    4095, so that a joint whose zero is the centre reaches -pi to almost pi.
+    A joint's angle is 0 where its encoder reads `zero_count`. The servos accept goals within one revolution, counts 0
+    to 4095, so a joint with its zero at the centre moves between -pi and pi.
 
     Args:
-        p_gain: Position P Gain, in counts, of every servo.
-        profile_velocity_rad_s: Speed at which a servo's own setpoint follows its goal [rad/s], rounded to 0.024 rad/s
-            and never to 0; inf: at once.
-        d_gain: Position D Gain, in counts.
-        zero_count: Encoder count of the joint's zero: for all, or one per servo.
+        p_gain: Position P Gain of every servo [counts].
+        profile_velocity_rad_s: Speed at which a servo's setpoint moves to its goal [rad/s], rounded to a multiple of
+            0.024 rad/s of at least one; inf: the setpoint is the goal.
+        d_gain: Position D Gain of every servo [counts].
+        zero_count: Encoder count at the joint's zero: one for all servos, or one per servo.
     """
 
     p_gain: int
@@ -119,7 +119,7 @@ class PositionDrive:
     mode: ClassVar[OperatingMode] = OperatingMode.POSITION
 
     def __post_init__(self) -> None:
-        """Refuse what the registers cannot hold."""
+        """Check that the values fit the registers."""
         for register, value in self._settings().items():
             if not register.minimum <= value <= register.maximum:
                 limits = f"[{register.minimum}, {register.maximum}]"
@@ -129,13 +129,13 @@ class PositionDrive:
             raise UsageError(f"position drive: zero_count = {self.zero_count} is outside the encoder's revolution")
 
     def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Refuse a gate that would send the joints to zero, or another number of zeros than of servos."""
+        """Refuse a gate that moves the joints to 0 when commands are stale, and a wrong number of zero counts."""
         _require_stale(gate, "hold", "positions")
         if isinstance(self.zero_count, tuple) and len(self.zero_count) != len(ids):
             raise UsageError(f"position drive: {len(self.zero_count)} zero counts for {len(ids)} servos")
 
     def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
-        """Write gains and profile, which a servo forgets without power, and read them back."""
+        """Write gains and profile, which a servo loses without power, and read them back."""
         self._require_reach(bus, gate)
         for servo_id in bus.ids:
             drive_mode = bus.read(servo_id, reg.DRIVE_MODE)
@@ -153,7 +153,7 @@ class PositionDrive:
 
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return the angles that the servos hold [rad]: their positions when torque went on."""
-        # The goals and not the positions by now: a load has pulled the joints off them, and would again and again.
+        # Read from the goals, not from the positions: a load pulls the joints off their goals, a little more each time.
         return self._angle(bus, reg.GOAL_POSITION)
 
     def send(self, bus: ServoBus, command: np.ndarray) -> None:
@@ -162,7 +162,7 @@ class PositionDrive:
         bus.write_goal_position({i: float(a) for i, a in zip(bus.ids, angles, strict=True)})
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of full duty that the P gain makes of the error; with a profile it gets there later."""
+        """Return the duty that the P gain computes from the position error, ignoring the profile."""
         error_count = (command - position_rad) / reg.RAD_PER_COUNT
         return np.clip(error_count * self.p_gain / reg.P_GAIN_UNIT / reg.PWM_FULL_SCALE, -1.0, 1.0)
 
@@ -175,11 +175,14 @@ class PositionDrive:
         return np.asarray(self.zero_count) * reg.RAD_PER_COUNT
 
     def _angle(self, bus: ServoBus, register: Register) -> np.ndarray:
-        """Return the joint angles (n,) [rad] that a position register of each servo holds."""
+        """Return a position register of each servo as joint angles, shape (n,) [rad]."""
         return np.array([bus.read(servo_id, register) for servo_id in bus.ids]) * reg.RAD_PER_COUNT - self._zero_rad
 
     def _require_reach(self, bus: ServoBus, gate: GateConfig) -> None:
-        """Refuse limits beyond the servos' own: they drop such goals, and of several at once none is confirmed."""
+        """Refuse gate limits beyond the servos' own position limits.
+
+        A servo ignores such a goal, and would do so silently when several are commanded at once.
+        """
         low, high = self._angle(bus, reg.MIN_POSITION_LIMIT), self._angle(bus, reg.MAX_POSITION_LIMIT)
         slack = reg.RAD_PER_COUNT / 2
         if np.any(gate.range[0] < low - slack) or np.any(gate.range[1] > high + slack):
@@ -195,7 +198,7 @@ class PositionDrive:
                 f"position drive: profile_velocity_rad_s = {self.profile_velocity_rad_s} must be larger than 0",
                 hint="inf switches the profile off",
             )
-        unlimited = math.isinf(self.profile_velocity_rad_s)  # 0 in the register, where rounding must not lead
+        unlimited = math.isinf(self.profile_velocity_rad_s)  # the register's 0 means unlimited: never round to it
         velocity = 0 if unlimited else max(1, reg.count_from_rad_s(self.profile_velocity_rad_s))
         return {
             reg.POSITION_P_GAIN: self.p_gain,

@@ -1,4 +1,4 @@
-"""A robot inside the computer: the emulator as a process of its own, started and stopped from here."""
+"""An emulated robot: starts and stops the emulator as a separate process."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ _STOP_TIMEOUT_S: Final = 3.0
 
 
 class EmbeddedRobot:
-    """Emulated servos on `port`, from construction until `stop` or until this process dies, however it dies.
+    """Emulated servos on `port`, from construction until `stop` or the end of this process, however it ends.
 
-    The host gets the port and nothing else; what is true stays in the truth file until someone asks to `reveal` it.
+    The stages get the port alone. The emulator logs true states and latencies to the truth file; `truth` and `reveal`
+    read it.
 
     Args:
-        plant: `package.module:Name` or `path/to/file.py:Name`, as of `load_plant`.
+        plant: `package.module:Name` or `path/to/file.py:Name`; see `load_plant`.
         config: Behaviour of bus and servos.
-        plant_args: Keyword arguments for the plant; must be JSON.
-        truth_path: Where the truth is logged; default: a temporary file that goes with `stop`.
+        plant_args: Keyword arguments for the plant: JSON-able.
+        truth_path: The truth file; None: a temporary file, deleted by `stop`.
 
     Raises:
         HardwareLost: The emulator did not start; its own message is included.
@@ -50,14 +51,14 @@ class EmbeddedRobot:
         self.truth_path = Path(truth_path) if truth_path is not None else folder / "truth.bin"
         self.truth_path.parent.mkdir(parents=True, exist_ok=True)
         self._messages_path = folder / "messages.txt"
-        # -P: the working directory is somebody's data, and must not lend its files as modules.
+        # -P: files in the working directory, which is the user's, must not be imported as modules.
         command = [sys.executable, "-P", "-m", "sim2real.hardware.emulator", "--until-stdin-closes", "--plant", plant]
         command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
         for name, value in asdict(config or EmulatorConfig()).items():
             if value is not None:
                 command.append(f"--{name.replace('_', '-')}={value!r}")
         with self._messages_path.open("wb") as messages:
-            # A session of its own: Ctrl-C in a terminal is for the host, which then stops the robot properly.
+            # In a new session, so that Ctrl-C in a terminal reaches only the host, which then stops the robot.
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=messages, start_new_session=True
             )
@@ -79,9 +80,9 @@ class EmbeddedRobot:
         return self._process.poll() is None
 
     def stop(self) -> None:
-        """End the process; the truth file is complete afterwards. Stopping twice is fine."""
+        """End the process, after which the truth file is complete. May be called twice."""
         if not self.running and self._process.returncode != 0 and self._messages_path.exists():
-            # To the host a plant that raised is a cable pulled; only its messages tell.
+            # To the host, a plant that raised an exception looks like a lost bus; the reason is in its messages.
             _LOGGER.error("the emulated robot had died (%d): %s", self._process.returncode, self._messages())
         elif self.running:
             self._process.terminate()
@@ -97,7 +98,7 @@ class EmbeddedRobot:
         self._folder.cleanup()
 
     def truth(self) -> Truth:
-        """Read the truth logged so far (the last 0.25 s may be missing while the robot runs)."""
+        """Read what the truth file has so far; while the robot runs, the last 0.25 s may be missing."""
         return read_truth(self.truth_path)
 
     def reveal(self) -> dict[str, Any]:
@@ -114,5 +115,5 @@ class EmbeddedRobot:
         raise HardwareLost(message)
 
     def _messages(self) -> str:
-        """Return what the process wrote to stderr."""
+        """Return what the process has written to stderr."""
         return self._messages_path.read_text(errors="replace").strip() or "it said nothing"

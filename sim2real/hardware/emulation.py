@@ -1,4 +1,4 @@
-"""How an emulated bus and its servos behave: latencies, firmware and faults."""
+"""Settings of the emulated bus and servos: latencies, firmware and faults."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from sim2real.hardware import registers as reg
 
 @dataclass(frozen=True)
 class EmulatorConfig:
-    """How the emulated bus and its servos behave.
+    """Settings of the emulated bus and servos; times of faults count from the emulator's start.
 
     Args:
         baud_rate: Bits per second; a byte takes 10 bits.
-        sensing_latency_s: Age of a measurement when the instruction that reads it is complete.
-        sensing_jitter_s: Uniform, plus or minus, on each measurement; at most the latency.
-        actuation_latency_s: From a complete goal instruction to its effect on the motor.
-        actuation_jitter_s: Uniform, plus or minus, on each effect; at most the latency. Order is kept.
-        return_delay_us: The servos' Return Delay Time at power-up.
-        reply_loss: Probability that an answer never leaves.
-        corrupt: Probability that a byte of an answer is flipped.
-        encoder_counts: Positions that the encoder tells apart in one revolution.
-        plant_step_s: Grid on which the plant is stepped and commands take effect; at most 1 ms.
-        model_number: What the servos say they are; their firmware is that model's.
-        seed: Of jitter, loss and corruption.
-        silent_after_s: From then on nothing is heard or answered, as if the cable were pulled.
-        overload_after_s: From then on the servos report an overload, with torque off.
-        watchdog_stops: Whether the bus watchdog stops the motor, or only notices; None: as the model's firmware does.
-        late: Probability that an answer waits, as in a USB adapter; those behind it wait, too.
-        late_s: How long it waits.
-        wild: Probability that a position is answered that no motor can reach, with a good checksum.
-        frozen_after_s: From then on the servos answer with the position of that moment, at rest.
+        sensing_latency_s: Age of a measurement when the instruction that reads it is complete [s].
+        sensing_jitter_s: Half-width of the uniform variation of that age [s]; at most the latency.
+        actuation_latency_s: Time from a complete goal instruction to its effect on the motor [s].
+        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
+            effect in the order in which they were sent.
+        return_delay_us: The servos' Return Delay Time at power-up [us].
+        reply_loss: Probability that an answer is lost.
+        corrupt: Probability that an answer has a corrupted byte.
+        encoder_counts: Resolution of the encoder [counts per revolution].
+        plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
+        model_number: The servos' model number; their firmware behaves as that of the model.
+        seed: Seed of jitter, loss and corruption.
+        silent_after_s: Time from which nothing is received or answered, as with an unplugged cable [s]; None: never.
+        overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never.
+        watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
+        late: Probability that an answer is delayed, as by a USB adapter; later answers wait for it.
+        late_s: That delay [s].
+        wild: Probability that a read returns a position that no motor can reach, with a correct checksum.
+        frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
     """
 
     baud_rate: int = 1_000_000
@@ -55,7 +56,7 @@ class EmulatorConfig:
     frozen_after_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that make no sense, by name."""
+        """Check that all values are in their ranges."""
         ranges = {
             "baud_rate": (1, 10_000_000),
             "sensing_jitter_s": (0.0, self.sensing_latency_s),

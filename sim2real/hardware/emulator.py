@@ -30,7 +30,7 @@ from sim2real.hardware.wire import EmulatedBus, EmulatorConfig, truth_header
 
 __all__ = ["EmulatedBus", "EmulatorConfig", "Plant", "main"]
 
-_IDLE_NS: Final = 2_000_000  # the plant is never further behind than this, so that catching up delays no answer
+_IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
 _REAL_TIME_PRIORITY: Final = 1
@@ -38,9 +38,9 @@ _TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": Fal
 
 
 class _Pty:
-    """A raw pseudo-terminal: `port` is for the host, the emulator holds the other end.
+    """A raw pseudo-terminal: the host opens `port`, the emulator has the other end.
 
-    The host's end is kept open here as well, so that a host may come and go.
+    The host's end is kept open here too, so that hosts may open and close it.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class _Pty:
         self.port = os.ttyname(self._host_fd)
 
     def send(self, answer: bytes) -> bool:
-        """Give bytes to the host; False if nobody has read the line for so long that it is full."""
+        """Send bytes to the host; return False if the buffer is full, because the host does not read."""
         try:
             return os.write(self.fd, answer) == len(answer)
         except BlockingIOError:
@@ -65,7 +65,7 @@ class _Pty:
 
 
 class _StopFlag:
-    """Set by SIGTERM or SIGINT."""
+    """A flag that SIGTERM and SIGINT set."""
 
     def __init__(self) -> None:
         self.is_set = False
@@ -78,7 +78,7 @@ class _StopFlag:
 
 
 def _serve(bus: EmulatedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_fd: int | None) -> None:
-    """Run the bus until it is told to stop, or, with `parent_fd`, until that pipe's other end is closed."""
+    """Run the bus until `stop` is set; with `parent_fd`, also until the other end of that pipe is closed."""
     inputs = [pty.fd] if parent_fd is None else [pty.fd, parent_fd]
     while not stop.is_set:
         now_ns = time.monotonic_ns()
@@ -97,14 +97,14 @@ def _serve(bus: EmulatedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent
 
 
 def _keep_time() -> None:
-    """Make this process as punctual as the operating system lets it be: servos do not wait for a busy computer."""
-    # Sleeps end within about 1 us of the time asked for, instead of 50 us.
+    """Make this process as punctual as the operating system allows."""
+    # Sleeps end within about 1 us of the requested time, instead of 50 us.
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, _TIMER_SLACK_NS, 0, 0, 0)
-    # Real-time priority, where it is allowed: the latest answer came 0.1 ms late with it, 4 ms without, on a busy CPU.
+    # Real-time priority, if allowed: on a busy CPU, answers were up to 0.1 ms late with it and up to 4 ms without.
     with contextlib.suppress(AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_REAL_TIME_PRIORITY))
-    # Nothing in the loop makes reference cycles; a collection would only make answers late.
+    # The loop makes no reference cycles; a garbage collection would only delay answers.
     gc.collect()
     gc.disable()
 

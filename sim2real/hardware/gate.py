@@ -1,4 +1,4 @@
-"""The safety gate: the last thing a command passes before it reaches an actuator."""
+"""The safety gate: checks and limits every command before it is sent to an actuator."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from sim2real.errors import SafetyStop, UsageError
 
 @dataclass(frozen=True)
 class GateConfig:
-    """What a command may be.
+    """The limits of commands and measurements.
 
     Args:
-        limit: Largest magnitude, or (low, high), in the command's unit; low and high: for all, or one per actuator.
-        slew_per_s: Largest change per second; None: any.
-        command_timeout_s: A command older than this is stale.
-        max_speed_rad_s: A measured speed beyond this stops the robot, and so does a position that takes one; for all,
-            or one per joint; None: not watched.
-        node: Name of the actuator's node, for messages.
-        stale: What a stale command becomes: zero, or (hold) what was allowed last, where zero is a place to jump to.
-        joints: Names, for messages.
-        stuck_effort: A joint that is pushed both ways with more than this share of its torque must move: for all, or
-            one per joint; above 1: not watched. See `sim2real.hardware.plausibility`.
-        stuck_s: For how long on end, each way.
+        limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit].
+        slew_per_s: Largest rate of change of a command [the command's unit per second]; None: no limit.
+        command_timeout_s: Age from which a command is stale [s].
+        max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
+            one value or one per joint [rad/s]; None: not checked.
+        node: Name of the actuator's node, for errors.
+        stale: What replaces a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
+        joints: The joints' names, for errors.
+        stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
+            move, or the robot is stopped; one value or one per joint; above 1: not checked. See
+            `sim2real.hardware.plausibility`.
+        stuck_s: How long it must be driven in each direction without a break [s].
     """
 
     limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
@@ -41,7 +42,7 @@ class GateConfig:
     stuck_s: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse limits that let nothing through, or keep nothing out."""
+        """Check that all limits are in their ranges and fit each other."""
         low, high = self.range
         if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
@@ -55,19 +56,19 @@ class GateConfig:
                 raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
 
     def joint(self, index: int) -> str:
-        """Return how messages call a joint."""
+        """Return a joint's name for errors."""
         return f"joint {self.joints[index]!r}" if index < len(self.joints) else f"joint {index}"
 
     @property
     def range(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lowest and the highest command, each of shape () or (n,)."""
+        """Lowest and highest command, each of shape () or (n,)."""
         low, high = self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
 
 @dataclass
 class GateCounts:
-    """How often the gate was passed, and how often each of its limits changed a command.
+    """Number of commands that passed the gate, and that each of its limits changed.
 
     Args:
         passed: Calls that returned a command.
@@ -98,9 +99,9 @@ class GateCounts:
 
 
 class SafetyGate:
-    """Clamps, slows down and refuses commands of one or several actuators.
+    """Clamps commands of one or several actuators, limits their rate of change, and replaces stale ones.
 
-    Once it has stopped the robot it stays stopped: every later call raises the same SafetyStop, until `reset`.
+    Once it has raised SafetyStop, every later call raises it again, until `reset`.
 
     Args:
         config: The limits.
@@ -112,11 +113,11 @@ class SafetyGate:
         self.reset()
 
     def reset(self, start: np.ndarray | None = None) -> None:
-        """Start again: counts at zero, no longer stopped.
+        """Start again, with counts at zero and no stop.
 
         Args:
-            start: (n,) The command that the robot obeys now, where the slew limit starts; it need not lie within the
-                limits. None: zero, which a gate that holds does not accept.
+            start: Shape (n,): the command that the robot follows now, from which the slew limit starts; it may be
+                outside the limits. None: zero, not allowed if stale commands are replaced by the last one.
         """
         self.counts = GateCounts()
         self._last = None if start is None else np.array(start, dtype=np.float64, ndmin=1)
@@ -128,10 +129,10 @@ class SafetyGate:
 
     @property
     def fallback(self) -> np.ndarray:
-        """What a stale command becomes now, (n,) float64; needs a `start` or a command that was allowed.
+        """What would replace a stale command now, float64 of shape (n,).
 
         Raises:
-            UsageError: There is neither.
+            UsageError: There was neither a `start` nor a command yet.
         """
         if self._last is None:
             raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
@@ -142,21 +143,21 @@ class SafetyGate:
     ) -> np.ndarray:
         """Return the command that may be sent.
 
-        A stale command becomes zero at once, whatever the slew limit, if zero is the safe command; else the last one
-        stays. The slew limit starts from `reset`'s start at the first call.
+        A stale command is replaced by zero or by the last command, as configured; the slew limit does not apply to
+        that.
 
         Args:
-            command: (n,) What the policy wants.
-            age_s: Since the policy decided; NaN counts as stale.
-            now_s: Clock of the slew limit.
-            speed_rad_s: (n,) or scalar, measured, if there is a limit for it.
+            command: Shape (n,): the policy's command.
+            age_s: Time since the policy computed it [s]; NaN counts as stale.
+            now_s: A monotonic time, for the slew limit [s].
+            speed_rad_s: Shape (n,) or scalar: measured speeds [rad/s]; None: not checked.
 
         Returns:
-            (n,) float64.
+            Shape (n,), float64.
 
         Raises:
-            SafetyStop: A value is not finite, or a speed is beyond its limit or not finite.
-            UsageError: There are more or fewer commands than limits, or nothing to hold.
+            SafetyStop: A value is not finite, or a speed is above its limit.
+            UsageError: The number of commands differs from that of the limits, or there is no last command to hold.
         """
         if self._stop is not None:
             raise self._stop
@@ -187,7 +188,7 @@ class SafetyGate:
             return wanted
         elapsed_s = 0.0 if self._last_s is None else max(0.0, now_s - self._last_s)
         if self.config.stale == "hold":
-            # The robot stood still while nothing came: that time earns no leap.
+            # The robot held its position meanwhile: a long pause must not allow a large jump.
             elapsed_s = min(elapsed_s, self.config.command_timeout_s)
         largest = self.config.slew_per_s * elapsed_s
         slewed = np.clip(wanted, self._last - largest, self._last + largest)

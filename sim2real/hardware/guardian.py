@@ -1,4 +1,4 @@
-"""The control process' side of the guardian: starts it, shows it signs of life, and hears from it."""
+"""The guardian as seen from the control process: starts it, sends it signs of life, and reads its messages."""
 
 from __future__ import annotations
 
@@ -20,29 +20,32 @@ from sim2real.hardware.protocol import ALERT_BIT, BROADCAST_ID, Instruction, bui
 
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
-_BEATS: Final = 10  # signs of life in the time after which silence is too long
-_INTERVAL_S: Final = 0.01  # between signs of life where silence may last
-_UNHEARD_BYTES: Final = 20_000  # Linux takes 770 of twice so many for each: 50 signs that it has not read, and it hangs
+_BEATS: Final = 10  # signs of life per allowed silence
+_INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
+# Send buffer for about 50 unread signs of life (on Linux 770 bytes each, of twice this size); when it is full, the
+# guardian hangs.
+_UNHEARD_BYTES: Final = 20_000
 _DEAD: Final = "the guardian has died: nothing would take the torque off if this process died too"
 
 
 def torque_off_packet(ids: Sequence[int]) -> bytes:
-    """Return the one instruction that takes the torque of all servos off; none of them answers."""
+    """Return the instruction that takes the torque of all servos off, which they do not answer."""
     register = reg.TORQUE_ENABLE
     head = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
     return build(BROADCAST_ID, Instruction.SYNC_WRITE, head + b"".join(bytes((i, 0)) for i in ids))
 
 
 class Guardian:
-    """A process of its own that takes the torque off when this one dies, or says nothing while torque is on.
+    """A separate process that takes the torque off when this one dies, or gives no sign of life while torque is on.
 
-    It shares the open port and its lock: nobody else gets the port before the torque is off. In normal operation it
-    only listens to `beat`, which costs 2 us every tenth of `silence_s`. What it did is said on stderr.
+    It shares the open port and its lock, so that no other process gets the port before the torque is off. In normal
+    operation it only receives signs of life from `beat`, which cost 2 us each. It reports on stderr what it did.
 
     Args:
-        port_fd: The open port.
+        port_fd: File descriptor of the open port.
         ids: The servos.
-        silence_s: So long without `beat`, while torque is on, is too long [s]; 0: only death counts.
+        silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
+            counts.
         answer_s: How long a servo's answer may take [s].
 
     Raises:
@@ -54,7 +57,7 @@ class Guardian:
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = 0.0
         self._armed = False
-        self._lock = threading.RLock()  # a signal's handler may close the bus in the middle of `beat`
+        self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
         self._said = b""
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
@@ -65,12 +68,12 @@ class Guardian:
             + ",".join(build_status(i, error, b"\0").hex() for error in (0, ALERT_BIT))
             for i in ids
         ]
-        longest_s = silence_s + self._interval_s if silence_s else 0.0  # a sign of life may be as old as the interval
+        longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
         numbers = [str(port_fd), str(other.fileno()), repr(longest_s), repr(answer_s)]
-        # -I -S: neither what the user has installed nor the working directory decides what runs here.
+        # -I -S: neither the user's site packages nor the working directory may affect what runs here.
         command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, torque_off_packet(ids).hex()]
         try:
-            # A session of its own: Ctrl-C in a terminal is for the control process alone.
+            # In a new session, so that Ctrl-C in a terminal reaches only the control process.
             self._process = subprocess.Popen(
                 [*command, *servos],
                 stdin=subprocess.DEVNULL,
@@ -94,14 +97,14 @@ class Guardian:
 
     @property
     def pid(self) -> int:
-        """Its process."""
+        """The guardian's process id."""
         return self._process.pid
 
     def arm(self) -> None:
-        """Ask it to watch for silence, before torque goes on.
+        """Let it watch for silence from now on; called before torque goes on.
 
         Raises:
-            SafetyStop: As of `beat`.
+            SafetyStop: As in `beat`.
         """
         with self._lock:
             self._armed, self._beat_s = True, 0.0
@@ -112,16 +115,16 @@ class Guardian:
             raise
 
     def disarm(self) -> None:
-        """Allow silence: torque is off. Never raises: if it has died, the next `arm` tells."""
-        with self._lock, suppress(SafetyStop):  # locked: a sign of life after this one would have it watch on
+        """Let it no longer watch for silence, as torque is off. Never raises; if it has died, the next `arm` raises."""
+        with self._lock, suppress(SafetyStop):  # locked, as a sign of life sent after this message would arm it again
             self._armed = False
             self._say(process.REST)
 
     def beat(self) -> None:
-        """Show a sign of life; call it before every instruction on the bus.
+        """Send a sign of life if one is due; called before every instruction on the bus.
 
         Raises:
-            SafetyStop: The guardian has taken the torque off, or has died; from then on always.
+            SafetyStop: The guardian has taken the torque off, or has died; also at all later calls.
         """
         with self._lock:
             now_s = time.monotonic()
@@ -138,10 +141,10 @@ class Guardian:
         )
 
     def settle(self) -> bool:
-        """Let it finish what it is doing on the bus, if it has taken over. Never raises.
+        """Wait until it has finished taking the torque off, if it is doing so. Never raises.
 
         Returns:
-            Whether it still watches: it has neither taken over nor died.
+            Whether it is still watching: it has neither taken over nor died.
         """
         try:
             with self._lock:
@@ -153,10 +156,10 @@ class Guardian:
         return not self._said
 
     def end(self, confirmed: bool) -> None:
-        """Let it go. Never raises.
+        """End the guardian. Never raises.
 
         Args:
-            confirmed: Whether all servos have confirmed that their torque is off; if not, it goes on trying.
+            confirmed: Whether all servos have confirmed that their torque is off; if not, it goes on trying for 10 s.
         """
         if confirmed:
             with suppress(SafetyStop):
@@ -173,11 +176,11 @@ class Guardian:
     def _say(self, message: bytes) -> None:
         try:
             self._link.send(message)
-        except OSError as error:  # it is gone, or does not read
+        except OSError as error:  # it has died, or does not read
             raise SafetyStop(_DEAD, hint="start again") from error
 
     def _listen(self) -> None:
-        """Take in what the guardian has said."""
+        """Read the guardian's messages; raise SafetyStop if it has died."""
         try:
             said = self._link.recv(16)
         except BlockingIOError:
@@ -189,7 +192,7 @@ class Guardian:
         self._said += said
 
     def _hears(self, message: bytes, timeout_s: float) -> bool:
-        """Wait for a message, for word of a failure, or for the guardian's end; return whether the message came."""
+        """Wait for a message, for a report of failure, or for the guardian's death; return whether the message came."""
         end_s = time.monotonic() + timeout_s
         with suppress(SafetyStop):
             while message not in self._said and process.FAILED not in self._said:

@@ -1,9 +1,10 @@
-"""The guardian: takes the torque off when the process that controls the servos is gone, or has fallen silent.
+"""The guardian process: takes the torque off when the process that controls the servos has died or is silent.
 
     python -I -S guardian_process.py PORT_FD LINK_FD SILENCE_S ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
 
-It holds the port from before torque goes on, and writes to it only when nobody else does. It imports little, so that it
-is there within 20 ms, and knows no protocol: the packets come from `sim2real.hardware.guardian`, in hexadecimal.
+It has the port open from before torque goes on, and writes to it only when the control process no longer does. It
+imports little, so that it starts within 20 ms, and knows no protocol: `sim2real.hardware.guardian` passes the packets
+as hexadecimal arguments.
 """
 
 import os
@@ -19,31 +20,31 @@ _QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
 
 
 class Guard:
-    """What takes the torque off, and decides when.
+    """Decides when to take the torque off, and does it.
 
     Args:
-        port_fd: The open port.
+        port_fd: File descriptor of the open port.
         answer_s: How long a servo's answer may take [s].
         off: The packet that takes the torque of all servos off.
-        servos: By servo the packet that asks for its torque, and the answers that mean off.
+        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
     """
 
     def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
         self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
 
     def watch(self, link: int, silence_s: float) -> None:
-        """Wait until the control process leaves; act when it dies, or is silent while torque is on.
+        """Wait until the control process says goodbye; act when it dies, or is silent for too long with torque on.
 
         Args:
-            link: Socket to the control process.
-            silence_s: So long without a sign of life, while torque is on, is too long [s]; 0: it may be silent.
+            link: File descriptor of the socket to the control process.
+            silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
         """
         armed, tripped, heard_s = False, False, time.monotonic()
         _write(link, READY)
         while True:
             watched = armed and not tripped and silence_s > 0.0
             wait_s = max(0.0, heard_s + silence_s - time.monotonic()) if watched else None
-            if select.select([link], [], [], wait_s)[0]:  # before the clock: this process may have been late itself
+            if select.select([link], [], [], wait_s)[0]:  # messages first: this process may be late itself
                 said = _hear(link)
                 if said.endswith(LEAVE):
                     return
@@ -52,14 +53,14 @@ class Guard:
                     return
                 armed, heard_s = said.endswith(BEAT), time.monotonic()
             elif watched and time.monotonic() - heard_s >= silence_s:
-                # It may come back, and switch the torque on before it notices: this goes on until it leaves.
+                # Stay until the control process leaves: it may resume, and switch torque on before it notices.
                 tripped = True
                 _write(link, TRIPPED)
                 confirmed = self.make_safe(f"the control process was silent for {silence_s:.2f} s")
                 _write(link, SAFE if confirmed else FAILED)
 
     def make_safe(self, reason: str) -> bool:
-        """Take the torque off, say so, and return whether all servos have confirmed."""
+        """Take the torque off, report it on stderr, and return whether all servos have confirmed."""
         begin_s = time.monotonic()
         failure = self._take_torque_off()
         took_ms = 1e3 * (time.monotonic() - begin_s)
@@ -71,10 +72,10 @@ class Guard:
         return not failure
 
     def _take_torque_off(self) -> str:
-        """Switch all servos off, again and again until each has confirmed; return why that failed, if it did.
+        """Switch all servos off, repeatedly until each has confirmed; return the reason if that failed, else "".
 
-        A packet that its writer died in the middle of swallows the first of ours; what a process that has been woken
-        again reads is lost for us. Either costs another round.
+        Repeated, because the first packet is lost if the control process died while it was writing one, and because
+        the control process, if it resumes, may read an answer in place of this one.
         """
         end = time.monotonic() + GIVE_UP_S
         left = self._servos
@@ -88,7 +89,7 @@ class Guard:
         return f"{len(left)} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if left else ""
 
     def _drain(self) -> None:
-        """Let an answer that is on its way come in: two packets at a time would destroy each other on the line."""
+        """Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer."""
         end = time.monotonic() + _LONGEST_ANSWER_S
         while time.monotonic() < end and self._receive(_QUIET_S):
             pass
@@ -96,7 +97,7 @@ class Guard:
     def _send(self, packet: bytes) -> None:
         try:
             os.write(self._fd, packet)
-        except BlockingIOError:  # the line is full: lost, like a packet that is not heard
+        except BlockingIOError:  # the buffer is full: the packet is lost, and sent again in the next round
             time.sleep(_QUIET_S)
 
     def _confirms(self, query: bytes, answers: list[bytes]) -> bool:
@@ -113,7 +114,7 @@ class Guard:
             return b""
         try:
             data = os.read(self._fd, 4096)
-        except BlockingIOError:  # a process that has been woken again took it
+        except BlockingIOError:  # the control process has resumed and read it
             return b""
         if not data:
             raise OSError("it has been unplugged")
@@ -121,7 +122,7 @@ class Guard:
 
 
 def _hear(link: int) -> bytes:
-    """Return what the control process says; nothing if it is gone."""
+    """Return the control process' messages; empty if it has died."""
     try:
         return os.read(link, 4096)
     except OSError:
@@ -129,7 +130,7 @@ def _hear(link: int) -> bytes:
 
 
 def _write(fd: int, message: bytes) -> None:
-    """Tell the control process or the terminal, if it is still there."""
+    """Write to the control process or the terminal, if it still exists."""
     try:  # noqa: SIM105 - importing contextlib takes a third of the start
         os.write(fd, message)
     except OSError:
@@ -137,11 +138,11 @@ def _write(fd: int, message: bytes) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Run until the control process leaves or is gone."""
+    """Run until the control process ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     try:  # noqa: SIM105 - as above
-        # Where it is allowed: on a busy machine this process must not wait for its turn. It hardly ever does anything.
+        # Real-time priority, if allowed: on a busy machine this process, which is almost always idle, must not wait.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except (AttributeError, OSError):
         pass

@@ -1,4 +1,4 @@
-"""One transaction at a time: the lock around ROBOTIS' SDK, the retries, and what a servo's refusal means."""
+"""Transactions on the bus, one at a time: a lock around ROBOTIS' SDK, retries, and errors that servos report."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _REASONS: Final[dict[int, str]] = {
 }
 _LOCK_TIMEOUT_S: Final = 0.5
 _FORCED_ATTEMPTS: Final = 5
-_LEAST_LOSSES: Final = 3  # fewer in a long time are this process' own fault: it was kept from running
+_LEAST_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
 _PADS: Final = 4
-# What comes before the parameters of a status packet, header to error byte, and its place; and the checksum after them.
+# Positions of id and error byte in a status packet, and sizes of what comes before and after its parameters.
 _ID_AT, _ERROR_AT, _HEAD_BYTES, _CRC_BYTES = 4, 8, 9, 2
 
 _T = TypeVar("_T")
@@ -42,19 +42,20 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class BusConfig:
-    """The port, and when a silent bus is given up.
+    """Port and time limits of the bus.
 
     Args:
         port: Device file, e.g. /dev/ttyUSB0.
         baud_rate: Bits per second.
-        reply_timeout_s: How long an answer may be late. A USB adapter whose latency timer is 16 ms needs more than
-            that, or, better, a latency timer of 1 ms.
-        max_silence_s: So long without any answer, from the first that is missed, is a lost bus.
-        late_after_s: An answer that takes so much longer than its bytes is late: when its sample was taken is not sure.
-        watchdog_s: So long without an instruction while torque is on, and the servos' bus watchdogs trip, a multiple of
-            20 ms, at most 2.54 s, and the guardian takes the torque off; 0: neither. What a servo does by itself, its
-            model says: `sim2real.hardware.models`.
-        guardian: Whether a process of its own watches over this one; False only where the servos' own is looked at.
+        reply_timeout_s: How long to wait for an answer, beyond the time that its bytes need on the wire [s]. With a USB
+            adapter whose latency timer is 16 ms this must be longer than 16 ms; better set the timer to 1 ms.
+        max_silence_s: Time without any answer after which the bus counts as lost [s].
+        late_after_s: An answer that takes this much longer than its bytes need is late: the time at which its sample
+            was taken is then uncertain [s].
+        watchdog_s: Longest time without an instruction while torque is on [s]; after it the guardian takes the torque
+            off and the servos' bus watchdogs, set to a multiple of 20 ms and at most 2.54 s, trip. 0: neither. What a
+            servo does then depends on its model: `sim2real.hardware.models`.
+        guardian: Whether to start a guardian; False only to test the servos' own watchdogs.
     """
 
     port: str
@@ -66,27 +67,27 @@ class BusConfig:
     guardian: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse a watchdog that the register cannot hold."""
+        """Check that the watchdog's time fits the register."""
         longest_s = reg.WATCHDOG_MAX_COUNT * reg.WATCHDOG_UNIT_S
         if not 0.0 <= self.watchdog_s <= longest_s:
             raise UsageError(f"watchdog_s = {self.watchdog_s} is outside [0, {longest_s}]")
 
     @property
     def watchdog_count(self) -> int:
-        """The value of Bus Watchdog: `watchdog_s` rounded to 20 ms, and on unless that is 0."""
+        """Value of the register Bus Watchdog: `watchdog_s` in units of 20 ms, at least 1 unless it is 0 (off)."""
         return max(1, round(self.watchdog_s / reg.WATCHDOG_UNIT_S)) if self.watchdog_s > 0.0 else 0
 
 
 @dataclass(frozen=True)
 class Transaction:
-    """What one instruction, with its answer and its retries, took.
+    """The times of one instruction with its answer and its retries.
 
     Args:
-        t_sent_ns: When the instruction that was answered went out, CLOCK_MONOTONIC.
-        lock_wait_ns: Waiting for the bus while another thread had it.
-        transfer_ns: From having the bus to having the answer, retries included.
-        retries: Answers that were missed before.
-        late_ns: By how much the answer took longer than its bytes.
+        t_sent_ns: When the instruction that was answered was sent, CLOCK_MONOTONIC [ns].
+        lock_wait_ns: How long it waited for another thread's use of the bus [ns].
+        transfer_ns: Time from getting the bus to having the answer, retries included [ns].
+        retries: Number of times that the instruction was sent again.
+        late_ns: How much longer the answer took than its bytes need on the wire [ns].
     """
 
     t_sent_ns: int
@@ -97,7 +98,7 @@ class Transaction:
 
 
 class BusLink:
-    """Owner of port and lock. Every method may be called from any thread.
+    """Owner of port and lock. All methods may be called from any thread.
 
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
 
@@ -132,19 +133,36 @@ class BusLink:
         return self._withheld_goals.get((servo_id, register), found)
 
     def read_bytes(self, servo_id: int, address: int, length: int, what: str) -> tuple[bytes, Transaction]:
-        """Return `length` bytes of a servo's control table."""
+        """Read bytes of a servo's control table.
+
+        Args:
+            servo_id: The servo.
+            address: Address of the first byte.
+            length: Number of bytes.
+            what: Description of the instruction, for errors.
+        """
         return self.read_bytes_of((servo_id,), address, length, what)
 
     def read_bytes_of(
         self, servo_ids: Sequence[int], address: int, length: int, what: str
     ) -> tuple[bytes, Transaction]:
-        """Return `length` bytes of each servo's control table, one behind the other, asked for in one instruction."""
+        """Read the same bytes of several servos' control tables with one instruction.
+
+        Args:
+            servo_ids: The servos.
+            address: Address of the first byte.
+            length: Number of bytes of each servo.
+            what: Description of the instruction, for errors.
+
+        Returns:
+            The bytes of all servos, concatenated; and the transaction.
+        """
 
         def attempt() -> tuple[tuple[bytes, int], int, int]:
-            # After an answer that was missed the next ones are longer: should it still come, it is told by its length.
-            # Taken for the answer to the instruction sent again, it would be stamped 8 ms too late.
+            # After a missing answer, more bytes are requested: if it still comes, it is recognised by its length. Taken
+            # for the answer to the repeated instruction, its sample would get a time stamp that is 8 ms too late.
             asked = length + (self._pad if address + length + _PADS <= reg.TABLE_BYTES else 0)
-            # The SDK's GroupSyncRead drops the answers' error bytes, where a servo says that it has stopped itself.
+            # Not the SDK's GroupSyncRead: it drops the error byte, by which a servo reports that it has stopped itself.
             if len(servo_ids) == 1:
                 result = self.packets.readTx(self.port, servo_ids[0], address, asked)
             else:
@@ -193,7 +211,12 @@ class BusLink:
         return self.exchange(lambda: ((), group.txPacket(), 0), f"write of {register.name}")[2]
 
     def force(self, servo_id: int, register: Register, value: int) -> bool:
-        """Write a register whatever stands in the way: a stuck lock, missed answers, errors. Never raises.
+        """Write a register despite a held lock, missing answers or errors. Never raises.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
 
         Returns:
             Whether the servo confirmed.
@@ -213,33 +236,33 @@ class BusLink:
         return False
 
     def close(self) -> None:
-        """Close the port; what is asked of it afterwards raises HardwareLost. Never raises itself."""
+        """Close the port; later instructions raise HardwareLost. Never raises itself."""
         self.closed = True
         with suppress(OSError):
             self.port.closePort()
 
     @contextmanager
     def hold(self) -> Iterator[None]:
-        """Have the bus for oneself."""
+        """Have exclusive use of the bus in the block; raise HardwareLost if it is closed."""
         with self._lock:
             if self.closed:
                 raise HardwareLost(f"the bus on {self.config.port} is closed")
-            # An exception, such as Ctrl-C, may have left the SDK in the middle of a transaction; the lock is ours.
+            # The SDK's own flag may still be set if an exception such as Ctrl-C interrupted a transaction.
             self.port.is_using = False
             yield
 
     def exchange(self, attempt: Callable[[], tuple[_T, int, int]], what: str) -> tuple[_T, int, Transaction]:
-        """Carry out an instruction until it is answered, or the bus is lost.
+        """Repeat an instruction until it is answered, or the bus counts as lost.
 
         Args:
-            attempt: Sends and receives; returns the data, the SDK's result, the status packet's error byte.
-            what: For messages.
+            attempt: Sends and receives once; returns the data, the SDK's result, and the status packet's error byte.
+            what: Description of the instruction, for errors.
 
         Returns:
-            The data, the error byte, and what it took.
+            The data, the error byte, and the transaction.
 
         Raises:
-            HardwareLost: No answer within the limits of the configuration.
+            HardwareLost: There was no answer within the configured limits.
             SafetyStop: The guardian has taken over, or has died.
         """
         asked_ns = time.monotonic_ns()
@@ -278,12 +301,12 @@ class BusLink:
         return self.read_bytes(first, register.address, register.size, f"read of {register.name}")[1]
 
     def _receive(self, servo_id: int, length: int) -> tuple[bytes, int, int]:
-        """Wait for the status packet of a servo with so many bytes of data, or with an error and none.
+        """Wait for a servo's status packet with `length` bytes of data, or with an error and no data.
 
-        What else comes is late, to an instruction given up, and is dropped.
+        Other packets are late answers to earlier instructions, and are dropped.
 
         Returns:
-            The data, the SDK's result, the error byte.
+            The data, the SDK's result, and the error byte.
         """
         while True:
             packet, result = self.packets.rxPacket(self.port, False)
@@ -295,7 +318,7 @@ class BusLink:
             self.late_replies += 1
 
     def _count_answer(self, now_ns: int) -> int:
-        """Count an answer that came now; return by how much it took longer than its bytes [ns]."""
+        """Count an answer that has arrived; return how much longer it took than its bytes need on the wire [ns]."""
         self.transactions += 1
         late_ns = max(0, now_ns - self.port.t_sent_ns - self.port.wire_ns)
         self.late_us.append(min(late_ns // 1000, 1 << 30))
@@ -310,7 +333,7 @@ class BusLink:
             )
 
     def _refused(self, error: int, servo_id: int, what: str) -> NoReturn:
-        """Raise what a status packet's error means: SafetyStop if the servo has stopped itself."""
+        """Raise the error that a status packet reports: SafetyStop if the servo has stopped itself."""
         address = reg.HARDWARE_ERROR_STATUS.address
         if error & ALERT_BIT:
             bits, _, _ = self.exchange(

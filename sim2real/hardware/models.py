@@ -1,4 +1,4 @@
-"""The servos' models, and what each does by itself when the computer that controls it dies."""
+"""Servo models, and what each does by itself when the computer that controls it dies."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _FORUM: Final = "ROBOTIS reproduced it with all 330s: forum.robotis.com/t/4814 (
 
 @dataclass(frozen=True)
 class ServoModel:
-    """A model of servo.
+    """A servo model.
 
     Args:
-        name: As printed on it.
-        stops_alone: Whether a lost host stops it, once its bus watchdog has noticed.
+        name: The model's name, as printed on the servo.
+        stops_alone: Whether it stops by itself when its bus watchdog trips.
         source: How that is known.
     """
 
@@ -25,10 +25,10 @@ class ServoModel:
     source: str
 
     def without_host(self, watchdog_s: float) -> str:
-        """Return what it does by itself when its host dies.
+        """Return in words what the servo does by itself when its host dies.
 
         Args:
-            watchdog_s: What its bus watchdog is set to [s]; 0: off.
+            watchdog_s: The time that its bus watchdog is set to [s]; 0: off.
         """
         if not watchdog_s:
             return "goes on as commanded last (its bus watchdog is off)"
@@ -49,16 +49,16 @@ MODELS: Final[Mapping[int, ServoModel]] = {
     1230: ServoModel("XC330-M181", False, _FORUM),
     1240: ServoModel("XC330-M288", False, _FORUM),
 }
-"""By model number."""
+"""Model number -> model."""
 
 
 def model(number: int) -> ServoModel:
-    """Return a model; of one that is not known nothing good is assumed."""
+    """Return the model with a number; an unknown one is assumed not to stop by itself."""
     return MODELS.get(number, ServoModel(f"model {number}", False, "unknown model: the worst is assumed"))
 
 
 def table() -> str:
-    """Return the models and what they do by themselves, as the Markdown table of docs/guides/safety.md."""
+    """Return the Markdown table of docs/guides/safety.md: the models, and what they do by themselves."""
     rows = [
         (m.name, m.without_host(0.1).replace("after 0.1 s", "after `servo_watchdog_s`"), m.source)
         for m in MODELS.values()

@@ -1,4 +1,4 @@
-"""The physics behind emulated servos: the protocol that a plant obeys, and the clock that steps it."""
+"""The physics of emulated servos: the protocol of a plant, and the clock that steps it."""
 
 from __future__ import annotations
 
@@ -19,18 +19,22 @@ STATE_PERIOD_S: Final = 0.005
 
 
 class Plant(Protocol):
-    """A mechanism driven by servos. The emulator owns it, alone, in one thread.
+    """A mechanism driven by servos; used by the emulator alone, in one thread.
 
-    A plant need not subclass this. Times are seconds since the emulator's start, angles are rad at the servo's output.
+    A plant need not inherit from this class. Times count from the emulator's start [s]; angles are those of the servos'
+    output shafts [rad].
     """
 
     servo_ids: tuple[int, ...]
 
     def advance(self, t_s: float) -> None:
-        """Integrate up to time `t_s`, in fixed steps of at most 1 ms under the commands given last.
+        """Integrate up to a time, in fixed steps of at most 1 ms, with the last commands.
 
-        It is called with k * plant_step_s, k = 1, 2, ...: the plant's own step has to divide `plant_step_s`, and
-        `round((t_s - now) / step)` steps bring it there without drift.
+        It is called with k * plant_step_s, k = 1, 2, ... The plant's own step must divide `plant_step_s`; to avoid
+        drift, make `round((t_s - now) / step)` steps.
+
+        Args:
+            t_s: The time [s].
         """
         ...
 
@@ -39,56 +43,54 @@ class Plant(Protocol):
 
         Args:
             servo_id: One of `servo_ids`.
-            mode: 16 (PWM): share of the supply voltage in [-1, 1]; 3 (position): rad; 1 (velocity): rad/s;
-                0 (torque off): the goal is 0.
-            goal: In the mode's unit.
+            mode: 16: PWM, 3: position, 1: velocity, 0: torque off.
+            goal: PWM: fraction of the supply voltage in [-1, 1]; position: [rad]; velocity: [rad/s]; torque off: 0.
         """
         ...
 
     def measure(self, servo_id: int) -> tuple[float, float, float]:
-        """Return position (rad, 0 where the encoder counts 0), velocity (rad/s), load (share of the largest)."""
+        """Return position from the encoder's zero [rad], velocity [rad/s], and load, a fraction of the largest."""
         ...
 
     def state(self) -> dict[str, float]:
-        """Return the true state, always with the same names, for the truth log."""
+        """Return the true state for the truth log, with the same names at every call."""
         ...
 
     def truth(self) -> dict[str, Any]:
-        """Return the true parameters, for the truth log's header: what an identification should find."""
+        """Return the true parameters, which an identification should find, for the truth log's header."""
         ...
 
 
 @runtime_checkable
 class ConfigurablePlant(Plant, Protocol):
-    """A plant that wants to know how its servos' position controllers are set."""
+    """A plant that is told the settings of its servos' position controllers."""
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
         """Set a servo's position controller from the plant's present time on.
 
-        It is called for every servo before time goes on from 0, with the power-up values, and when one of them changes:
-        by a write, at the time that it is complete, or by a reboot.
+        Called for every servo at time 0 with the power-up values, and later whenever a write or a reboot changes them.
 
         Args:
             servo_id: One of `servo_ids`.
-            p_gain: Position P Gain, in the register's counts.
-            d_gain: Position D Gain, in the register's counts.
-            profile_velocity_rad_s: Speed at which the setpoint follows the goal; inf: it is the goal.
+            p_gain: Position P Gain [counts].
+            d_gain: Position D Gain [counts].
+            profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
+                goal.
         """
         ...
 
 
 class PlantClock:
-    """Steps a plant on a fixed grid, applies commands at grid points, and remembers what could be measured.
+    """Steps a plant on a fixed time grid, applies commands at grid points, and keeps a history of measurements.
 
-    The plant is stepped lazily, and never past the time asked for: nothing that arrives later can find itself in the
-    plant's past.
+    The plant is never stepped past the time asked for, so that no command can arrive for a time that has passed.
 
     Args:
         plant: The mechanism; must be at time 0.
-        step_ns: Spacing of the grid.
-        start_ns: Time of the grid's first point, CLOCK_MONOTONIC.
-        history_ns: How far back `sample` must reach from the newest grid point.
-        truth: Where effects and states are logged.
+        step_ns: Spacing of the grid [ns].
+        start_ns: Time of the grid's first point, CLOCK_MONOTONIC [ns].
+        history_ns: How far back from the newest grid point `sample` must reach [ns].
+        truth: Log of effects and states.
     """
 
     def __init__(self, plant: Plant, step_ns: int, start_ns: int, history_ns: int, truth: TruthLog) -> None:
@@ -115,25 +117,45 @@ class PlantClock:
             self._remember()
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's position controller now, if the plant wants to know."""
+        """Tell the plant a servo's controller settings, if it is a `ConfigurablePlant`.
+
+        Args:
+            servo_id: The servo.
+            p_gain: Position P Gain [counts].
+            d_gain: Position D Gain [counts].
+            profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
+                goal.
+        """
         if isinstance(self._plant, ConfigurablePlant):
             self._plant.configure(servo_id, p_gain, d_gain, profile_velocity_rad_s)
 
     def schedule(self, t_ns: int, t_host_ns: int, servo_id: int, mode: int, goal: float) -> None:
-        """Plan a command for the grid point nearest to `t_ns`; commands of one point apply in the order given."""
+        """Schedule a command at the grid point nearest to a time; commands at one point apply in the order given.
+
+        Args:
+            t_ns: When it takes effect [ns].
+            t_host_ns: When the emulator received it, for the truth log [ns]; 0: it does not come from the host.
+            servo_id: The servo.
+            mode: As in `Plant.command`.
+            goal: As in `Plant.command`.
+        """
         index = max(round((t_ns - self._start_ns) / self._step_ns), self._index)
         self._sequence += 1
         heapq.heappush(self._effects, (index, self._sequence, t_ns, t_host_ns, servo_id, mode, goal))
 
     def cancel(self, servo_id: int) -> None:
-        """Drop the commands of a servo that have not taken effect yet."""
+        """Drop a servo's commands that have not taken effect yet."""
         self._effects = [effect for effect in self._effects if effect[4] != servo_id]
         heapq.heapify(self._effects)
 
     def sample(self, servo_id: int, t_ns: int) -> tuple[float, float, float]:
-        """Return position, velocity and load at a time at or before the time advanced to.
+        """Return position, velocity and load at a time up to the one advanced to.
 
-        Linear between grid points; after the newest one the position is carried on by its velocity.
+        Interpolated linearly between grid points; after the newest one the position is extrapolated by the velocity.
+
+        Args:
+            servo_id: The servo.
+            t_ns: The time [ns].
         """
         place = max(0.0, (t_ns - self._start_ns) / self._step_ns)
         before = min(int(place), self._index)
@@ -167,7 +189,7 @@ def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
     """Make the plant that a command line names.
 
     Args:
-        spec: `package.module:Name` or `path/to/file.py:Name`; calling `Name` gives the plant.
+        spec: `package.module:Name` or `path/to/file.py:Name`; calling `Name` must return the plant.
         arguments: Keyword arguments of that call.
 
     Raises:
@@ -191,7 +213,7 @@ def _load_module(place: str) -> ModuleType:
         if not path.is_file() or module_spec is None or module_spec.loader is None:
             raise UsageError(f"there is no plant file {path}")
         module = importlib.util.module_from_spec(module_spec)
-        sys.modules[module.__name__] = module  # dataclasses look their own module up there
+        sys.modules[module.__name__] = module  # dataclasses look up their module there
         module_spec.loader.exec_module(module)
         return module
     try:

@@ -1,4 +1,4 @@
-"""Whether what the joints are said to do can be true: no motor leaps, none stands still while it is pushed about."""
+"""Checks whether measured positions are physically possible: no jumps, and no standstill under changing torque."""
 
 from __future__ import annotations
 
@@ -8,27 +8,35 @@ from sim2real.errors import SafetyStop
 from sim2real.hardware.gate import GateConfig
 
 _STAMP_S = 0.01
-"""By how much the time between two samples may be wrong [s]: a servo may answer with a sample that it took before."""
+"""Uncertainty of the time between two samples [s]: a servo may answer with an older sample."""
 _PLAY_RAD = 0.05
-"""What a reading may jump besides [rad]: 33 counts."""
+"""Tolerance of a position change [rad]: 33 counts."""
 _HARD = 10.0
-"""So many times ``stuck_s`` a push one way, which a weight explains, is suspect."""
+"""A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
 
 
 class Plausibility:
-    """Judges measured positions; the limits are the gate's.
+    """Checks measured positions against the gate's limits.
 
-    **A leap.** No position may change by more than the fastest joint could have moved, ``max_speed_rad_s`` times the
-    time since the last sample, plus what times and readings may be wrong by.
+    **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
+    uncertainty of times and readings, the robot is stopped.
 
-    **A joint that stands still** reads exactly the same, to the count. That is normal for one that rests, holds, sticks
-    or has come to a stop. It is not for one that was pushed both ways, each time with more than ``stuck_effort`` of its
-    torque for ``stuck_s`` on end: the robot is stopped. One whose push has only changed, by twice as much for as long,
-    may lie on something, and one that is pushed one way, twice as hard for ten times as long, may hold a weight: those
-    are suspect, and said to be so.
+    **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
+    holding, with friction, and at a stop. "Push" is the torque that the command asks for:
+
+    - A joint that stands still although it was pushed in both directions, each with more than ``stuck_effort`` of its
+      torque for ``stuck_s`` without a break, is not plausible: the robot is stopped.
+    - If the push has changed by twice that for ``stuck_s``, the joint may lie against something: it is suspicious.
+    - If it was pushed in one direction with twice that for ten times ``stuck_s``, it may hold a weight: it is
+      suspicious.
+
+    Suspicious joints do not stop the robot; they are listed in ``suspects``.
 
     Args:
         config: The gate's limits.
+
+    Attributes:
+        suspects: Descriptions of what was suspicious since ``reset``.
     """
 
     def __init__(self, config: GateConfig) -> None:
@@ -36,23 +44,23 @@ class Plausibility:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was measured: torque goes on, or off."""
+        """Forget all measurements; called when torque goes on or off."""
         self.suspects: list[str] = []
         self._t_s: float | None = None
         self._unsure_s = 0.0
         self._position = self._since_s = self._start = self._held_s = self._longest_s = np.zeros(0)
 
     def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
-        """Take in a measurement.
+        """Check a measurement.
 
         Args:
-            position_rad: Of the joints (n,).
-            t_s: When it was taken.
-            unsure_s: By how much that may be wrong.
-            effort: With how much of their torque the joints are pushed (n,) in [-1, 1].
+            position_rad: Shape (n,): the joints' positions [rad].
+            t_s: When they were measured [s].
+            unsure_s: Uncertainty of that time [s].
+            effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
 
         Raises:
-            SafetyStop: A joint leapt, or stands still while it is pushed about.
+            SafetyStop: A position jumped, or a joint stands still although it was pushed in both directions.
         """
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s, effort)
@@ -70,7 +78,8 @@ class Plausibility:
         n = len(position_rad)
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
         self._since_s, self._start = np.full(n, t_s), effort.copy()
-        # Rows: pushed up, down, otherwise than at first, hard up, hard down; how long until now, and at the longest.
+        # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
+        # differs from that at the start of the standstill, pushed hard up, pushed hard down.
         self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:

@@ -1,4 +1,4 @@
-"""The serial port under ROBOTIS' SDK: waits without burning a CPU, and gives up after a time that we choose."""
+"""The serial port of ROBOTIS' SDK, with waiting that uses no CPU and a configurable timeout."""
 
 from __future__ import annotations
 
@@ -18,22 +18,25 @@ BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000
 
 
 class WaitingPort(PortHandler):
-    """The SDK's port, with three things replaced.
+    """The SDK's port with three changes.
 
-    - The SDK polls the port in a busy loop; here a read sleeps in `select`, which also releases the GIL.
-    - The SDK gives a reply 34 ms more than its bytes take; here it is `reply_timeout_s`.
-    - The SDK measures timeouts by the wall clock, which may jump; here by the monotonic one.
-
-    `t_sent_ns` is when the last packet left, `wire_ns` how long it and the answer to it take on the line.
+    - A read sleeps in `select`, which releases the GIL; the SDK polls in a busy loop.
+    - A reply may take `reply_timeout_s` longer than its bytes need on the wire; with the SDK it is 34 ms.
+    - Timeouts use the monotonic clock; the SDK uses the wall clock, which may jump.
 
     Args:
         path: Device file of the port.
         baud_rate: One of `BAUD_RATES`.
-        reply_timeout_s: How long a status packet may be late, beyond the time that its bytes take.
+        reply_timeout_s: How long to wait for a status packet, beyond the time that its bytes need [s].
+
+    Attributes:
+        t_sent_ns: When the last packet was sent, CLOCK_MONOTONIC [ns].
+        wire_ns: Time that this packet and its answer need on the wire [ns].
+        fd: The port's file descriptor.
 
     Raises:
-        UsageError: No servo knows the baud rate.
-        HardwareLost: The port cannot be opened, or another process has it.
+        UsageError: Servos do not support the baud rate.
+        HardwareLost: The port cannot be opened, or another process uses it.
     """
 
     def __init__(self, path: str, baud_rate: int, reply_timeout_s: float) -> None:
@@ -56,30 +59,30 @@ class WaitingPort(PortHandler):
         return self.ser
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the timeout for status packets of so many bytes."""
+        """Start the timeout for status packets of `packet_length` bytes in total."""
         wire_ms = self.tx_time_per_byte * packet_length
         self.wire_ns += round(1e6 * wire_ms)
         self.setPacketTimeoutMillis(wire_ms + self._reply_timeout_ms)
 
     def getCurrentTime(self) -> float:
-        """Return the monotonic clock, in ms."""
+        """Return the time of the monotonic clock [ms]."""
         return time.monotonic_ns() * 1e-6
 
     def clearPort(self) -> None:
-        """Drop what has arrived and was not read: late answers to instructions given up."""
+        """Drop bytes that have arrived and were not read: late answers to earlier instructions."""
         try:
             super().clearPort()
-        except termios.error as error:  # what pyserial lets through when the adapter is unplugged
+        except termios.error as error:  # raised by pyserial when the adapter is unplugged
             raise OSError(str(error)) from error
 
     def writePort(self, packet: list[int]) -> int:
-        """Send an instruction, and remember when; return the number of bytes sent."""
+        """Send an instruction and note the time; return the number of bytes sent."""
         self.t_sent_ns = time.monotonic_ns()
         self.wire_ns = round(1e6 * self.tx_time_per_byte * len(packet))
         return os.write(self.fd, bytes(packet))
 
     def readPort(self, length: int) -> bytes:
-        """Return up to `length` bytes; waits for the first one for as long as the timeout still runs."""
+        """Return up to `length` bytes; waits for the first one until the timeout."""
         remaining_s = 1e-3 * max(0.0, self.packet_timeout - self.getTimeSinceStart())
         if length <= 0 or not select.select([self.fd], [], [], remaining_s)[0]:
             return b""

@@ -1,8 +1,8 @@
-"""DYNAMIXEL Protocol 2.0 packets: checksum, byte stuffing, building, and parsing a stream that may hold anything.
+"""DYNAMIXEL Protocol 2.0 packets: checksum, byte stuffing, building, and parsing of a stream with errors.
 
     FF FF FD 00 | id | length (2) | instruction | parameters (an error byte first in a status packet) | CRC-16 (2)
 
-The host talks through ROBOTIS' own SDK; this is the servos' side of the wire.
+The host uses ROBOTIS' own SDK; this module serves the emulated servos and the guardian.
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0".
 """
 
@@ -52,13 +52,13 @@ class StatusError(IntEnum):
 
 @dataclass(frozen=True)
 class Packet:
-    """One packet off the wire.
+    """A packet that was received.
 
     Args:
-        servo_id: Addressee, or the sender of a status packet.
-        instruction: Instruction byte; need not be one that `Instruction` knows.
-        parameters: Bytes between instruction and checksum, unstuffed.
-        crc_ok: False if the checksum does not match; the rest is then not to be trusted.
+        servo_id: Receiver, or the sender of a status packet.
+        instruction: Instruction byte, not necessarily one of `Instruction`.
+        parameters: Bytes between instruction and checksum, without stuffing.
+        crc_ok: Whether the checksum matches; if not, the other fields may be wrong.
     """
 
     servo_id: int
@@ -81,7 +81,7 @@ _CRC_TABLE: Final = _crc_table()
 
 
 def crc16(data: bytes | bytearray) -> int:
-    """Return the CRC-16 (polynomial 0x8005, initial value 0, most significant bit first) of some bytes."""
+    """Return the CRC-16 of bytes (polynomial 0x8005, initial value 0, most significant bit first)."""
     crc = 0
     for byte in data:
         crc = ((crc << 8) & 0xFF00) ^ _CRC_TABLE[(crc >> 8) ^ byte]
@@ -89,36 +89,48 @@ def crc16(data: bytes | bytearray) -> int:
 
 
 def build(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return the bytes of an instruction packet as they travel on the wire."""
-    # A header inside the body would look like the start of a packet, so a byte is stuffed behind it.
+    """Return the bytes of an instruction packet, as sent on the wire.
+
+    Args:
+        servo_id: The receiver.
+        instruction: Instruction byte.
+        parameters: Bytes after it.
+    """
+    # A header inside the body would look like the start of a packet, so a byte is inserted after it (stuffing).
     body = (bytes((instruction,)) + parameters).replace(*_STUFFED)
     packet = HEADER + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little") + body
     return packet + crc16(packet).to_bytes(2, "little")
 
 
 def build_status(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-    """Return the bytes of a status packet: a servo's answer."""
+    """Return the bytes of a status packet, a servo's answer.
+
+    Args:
+        servo_id: The sender.
+        error: Error byte.
+        parameters: Bytes after it.
+    """
     return build(servo_id, Instruction.STATUS, bytes((error,)) + parameters)
 
 
 class Parser:
-    """Finds packets in a byte stream that arrives in chunks, and finds the next packet again after garbage."""
+    """Finds packets in a byte stream that arrives in chunks, and resynchronises after garbage."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def clear(self) -> None:
-        """Forget a packet that never became complete."""
+        """Forget the beginning of an incomplete packet."""
         self._buffer.clear()
 
     def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
-        """Take the next bytes.
+        """Process the next bytes.
 
         Args:
-            chunk: Bytes as they arrived.
+            chunk: The bytes.
 
         Returns:
-            The packets completed by them; each with the number of bytes of `chunk` up to its own last byte.
+            The packets that they complete; each with the number of bytes of `chunk` up to and with its last byte.
         """
         held_bytes = len(self._buffer)
         self._buffer += chunk
@@ -132,7 +144,7 @@ class Parser:
         return packets
 
     def _next(self) -> tuple[Packet | None, int] | None:
-        """Drop leading garbage or one packet; return it and the bytes dropped, or None if more bytes are needed."""
+        """Remove a packet or leading garbage; return it (or None) and its size in bytes, None if more are needed."""
         buffer = self._buffer
         start = buffer.find(HEADER)
         if start != 0:
@@ -152,7 +164,7 @@ class Parser:
         crc_ok = crc16(buffer[: end - 2]) == int.from_bytes(buffer[end - 2 : end], "little")
         body = bytes(buffer[_PREFIX_BYTES : end - 2]).replace(_STUFFED[1], _STUFFED[0])
         packet = Packet(buffer[4], body[0], body[1:], crc_ok)
-        # A broken length may have swallowed good packets: after a bad checksum only the header is given up.
+        # After a wrong checksum, drop the header only: the length may be wrong too, and include good packets.
         used_bytes = end if crc_ok else len(HEADER)
         del buffer[:used_bytes]
         return packet, used_bytes

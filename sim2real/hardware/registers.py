@@ -1,7 +1,7 @@
 """The control table of DYNAMIXEL X-series servos (Protocol 2.0), and the units of its registers.
 
-Addresses, sizes, ranges and defaults are those of ROBOTIS' e-Manual for the XL430-W250; the other X servos keep the
-addresses and differ in limits, gains and in what address 126 holds (load or current).
+Addresses, sizes, ranges and defaults are those of ROBOTIS' e-Manual for the XL430-W250. Other X servos have the same
+addresses, and differ in limits, gains and in the meaning of address 126 (load or current).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 RAD_S_PER_COUNT: Final = 0.229 * 2.0 * math.pi / 60.0  # velocity registers count in units of 0.229 rpm
 PWM_FULL_SCALE: Final = 885  # counts at 100 % of the supply voltage
 P_GAIN_UNIT: Final = (
-    256  # P gain that gives a step of PWM for a count of error; measured on XL330, the e-Manual says 128
+    256  # P gain at which one count of position error gives one count of PWM; measured on XL330 (e-Manual: 128)
 )
 LOAD_FULL_SCALE: Final = 1000  # load registers count in units of 0.1 %
 WATCHDOG_UNIT_S: Final = 0.020
 WATCHDOG_MAX_COUNT: Final = 127
 WATCHDOG_TRIPPED: Final = -1
 RETURN_DELAY_UNIT_S: Final = 2e-6
-DRIVE_REVERSED: Final = 1  # bit of Drive Mode; the others: profiles by time instead of speed, goals switch torque on
+DRIVE_REVERSED: Final = 1  # bit of Drive Mode; others: profiles by time instead of speed, goals that switch torque on
 
 # Bits of Hardware Error Status; the servo switches its own torque off when one of them is set.
 HARDWARE_ERRORS: Final[dict[int, str]] = {
@@ -36,7 +36,7 @@ HARDWARE_ERRORS: Final[dict[int, str]] = {
 
 
 class OperatingMode(IntEnum):
-    """What the goal registers command. OFF is no register value: it is what a plant is told while torque is off."""
+    """Operating modes. OFF is not a value of the register: it is the mode that a plant gets while torque is off."""
 
     OFF = 0
     VELOCITY = 1
@@ -50,15 +50,15 @@ class Register:
     """One entry of the control table.
 
     Args:
-        name: Lower-case name of the e-Manual.
-        address: First byte.
-        size: Bytes, little endian: 1, 2 or 4.
-        minimum: Smallest value that may be written, in counts.
-        maximum: Largest value that may be written, in counts.
-        default: Value after power-up, in counts.
-        signed: Whether the value is two's complement.
-        writable: False for a read-only register.
-        eeprom: EEPROM registers cannot be written while torque is on.
+        name: The e-Manual's name, in lower case.
+        address: Address of the first byte.
+        size: Number of bytes, little endian: 1, 2 or 4.
+        minimum: Smallest value that may be written [counts].
+        maximum: Largest value that may be written [counts].
+        default: Value after power-up [counts].
+        signed: Whether the value is a two's complement.
+        writable: Whether it can be written.
+        eeprom: Whether it is in EEPROM, which cannot be written while torque is on.
     """
 
     name: str
@@ -77,11 +77,11 @@ class Register:
         return self.address + self.size
 
     def decode(self, data: bytes | bytearray) -> int:
-        """Return the value held by `size` bytes, in counts."""
+        """Return the value of `size` bytes [counts]."""
         return int.from_bytes(data, "little", signed=self.signed)
 
     def encode(self, value: int) -> bytes:
-        """Return the bytes of a value in counts, wrapped to the register's size."""
+        """Return the bytes of a value [counts], wrapped to the register's size."""
         return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
 
 
@@ -133,35 +133,35 @@ GOALS: Final = (GOAL_PWM, GOAL_VELOCITY, GOAL_POSITION)
 
 
 def rad_from_count(count: int) -> float:
-    """Return the angle in rad of a position count."""
+    """Return the angle [rad] of a position count."""
     return count * RAD_PER_COUNT
 
 
 def count_from_rad(angle_rad: float) -> int:
-    """Return the position count nearest to an angle in rad."""
+    """Return the position count nearest to an angle [rad]."""
     return round(angle_rad / RAD_PER_COUNT)
 
 
 def rad_s_from_count(count: int) -> float:
-    """Return the speed in rad/s of a velocity count (0.229 rpm)."""
+    """Return the speed [rad/s] of a velocity count (0.229 rpm)."""
     return count * RAD_S_PER_COUNT
 
 
 def count_from_rad_s(speed_rad_s: float) -> int:
-    """Return the velocity count nearest to a speed in rad/s."""
+    """Return the velocity count nearest to a speed [rad/s]."""
     return round(speed_rad_s / RAD_S_PER_COUNT)
 
 
 def fraction_from_pwm(count: int) -> float:
-    """Return the share of the supply voltage, in [-1, 1], of a PWM count."""
+    """Return the fraction of the supply voltage, in [-1, 1], of a PWM count."""
     return count / PWM_FULL_SCALE
 
 
 def pwm_from_fraction(fraction: float) -> int:
-    """Return the PWM count nearest to a share of the supply voltage in [-1, 1]."""
+    """Return the PWM count nearest to a fraction of the supply voltage in [-1, 1]."""
     return round(fraction * PWM_FULL_SCALE)
 
 
 def describe_hardware_errors(bits: int) -> str:
-    """Return the names of the bits set in Hardware Error Status, or "none"."""
+    """Return the names of the bits that are set in Hardware Error Status, or "none"."""
     return ", ".join(name for bit, name in HARDWARE_ERRORS.items() if bits >> bit & 1) or "none"

@@ -1,4 +1,4 @@
-"""One emulated servo: its register file, and what the firmware allows, refuses and stops."""
+"""One emulated servo: its registers, and the rules of its firmware."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS)
 
 
 class Servo:
-    """Registers and rules of one DYNAMIXEL X servo; it knows neither time nor wire nor physics.
+    """Registers and firmware of one DYNAMIXEL X servo, without time, bus and physics.
 
     Args:
         servo_id: Its id on the bus.
-        model_number: What it says it is.
-        return_delay_us: Return Delay Time at power-up, rounded to the register's 2 us.
-        encoder_counts: Counts per revolution of the sensor behind Present Position.
-        watchdog_stops: Whether its bus watchdog stops the motor; None: as the model's firmware does.
+        model_number: Its model number.
+        return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
+        encoder_counts: Resolution of the encoder [counts per revolution].
+        watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Servo:
         return register.decode(self._memory[register.address : register.end])
 
     def put(self, register: Register, value: int) -> None:
-        """Set a register without any of the checks that a write from the bus passes."""
+        """Set a register, without the checks of a write from the bus."""
         self._memory[register.address : register.end] = register.encode(value)
 
     @property
@@ -61,10 +61,10 @@ class Servo:
         return ALERT_BIT if self.get(reg.HARDWARE_ERROR_STATUS) else 0
 
     def command(self) -> tuple[int, float]:
-        """Return what the registers make the motor do now.
+        """Return what the motor is commanded to do, according to the registers.
 
         Returns:
-            (mode, goal): PWM with a fraction in [-1, 1], POSITION with rad, VELOCITY with rad/s, or OFF with 0.
+            (mode, goal): PWM and a fraction in [-1, 1], POSITION [rad], VELOCITY [rad/s], or OFF and 0.
         """
         if not self.get(reg.TORQUE_ENABLE):
             return OperatingMode.OFF, 0.0
@@ -79,7 +79,7 @@ class Servo:
         return OperatingMode.POSITION, reg.rad_from_count(goal_count)
 
     def controller(self) -> tuple[int, int, float]:
-        """Return P gain and D gain of the position controller, in counts, and its profile velocity in rad/s."""
+        """Return P gain and D gain of the position controller [counts], and its profile velocity [rad/s]."""
         count = self.get(reg.PROFILE_VELOCITY)
         profile_velocity_rad_s = reg.rad_s_from_count(count) if count else math.inf
         return self.get(reg.POSITION_P_GAIN), self.get(reg.POSITION_D_GAIN), profile_velocity_rad_s
@@ -88,10 +88,10 @@ class Servo:
         """Set the Present registers from a measurement of the plant.
 
         Args:
-            position_rad: Angle from the encoder's zero, in rad.
-            velocity_rad_s: Speed in rad/s.
-            load: Share of the largest load, in [-1, 1].
-            tick_ms: Milliseconds since power-up; wraps at 32768 as the servo's own counter does.
+            position_rad: Angle from the encoder's zero [rad].
+            velocity_rad_s: Speed [rad/s].
+            load: Fraction of the largest load, in [-1, 1].
+            tick_ms: Time since power-up [ms]; wraps at 32768 like the servo's own counter.
         """
         step_rad = 2.0 * math.pi / self._encoder_counts
         count = reg.count_from_rad(round(position_rad / step_rad) * step_rad)
@@ -105,16 +105,16 @@ class Servo:
         self.put(reg.REALTIME_TICK, tick_ms % 32768)
 
     def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
-        """Return the error and the bytes of a READ."""
+        """Return the error and the bytes that a READ is answered with."""
         if length == 0 or address + length > reg.TABLE_BYTES:
             return StatusError.ACCESS, b""
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> tuple[StatusError, bool]:
-        """Write registers: all of them, or, on an error, none.
+        """Write registers: all of them, or, if there is an error, none.
 
         Returns:
-            The error, and whether the motor must be told (`command`): torque or a goal was written.
+            The error, and whether torque or a goal was written, so that `command` may have changed.
         """
         pairs: list[tuple[Register, int]] = []
         error = self._split(address, data, pairs)
@@ -132,12 +132,12 @@ class Servo:
         return StatusError.NONE, moves
 
     def register_write(self, address: int, data: bytes) -> StatusError:
-        """Keep a REG_WRITE for the next ACTION."""
+        """Store a REG_WRITE until the next ACTION."""
         self._registered = (address, data)
         return StatusError.NONE
 
     def action(self) -> tuple[StatusError, bool]:
-        """Carry out the registered write; an instruction error if there is none."""
+        """Execute the stored write; without one, the result is an instruction error."""
         if self._registered is None:
             return StatusError.INSTRUCTION, False
         address, data = self._registered
@@ -145,27 +145,27 @@ class Servo:
         return self.write(address, data)
 
     def reboot(self) -> None:
-        """Return every RAM register to its power-up value, which switches torque off."""
+        """Set every RAM register to its power-up value, which switches torque off."""
         self._registered = None
         for register in reg.TABLE.values():
             if not register.eeprom:
                 self.put(register, register.default)
 
     def watchdog_deadline_ns(self) -> int | None:
-        """Return when the bus watchdog trips unless an instruction comes first; None if it is not armed."""
+        """Return when the bus watchdog trips if no instruction comes before; None if it is not armed."""
         value = self.get(reg.BUS_WATCHDOG)
         if value <= 0 or not self.get(reg.TORQUE_ENABLE):
             return None
         return self.heard_ns + round(value * reg.WATCHDOG_UNIT_S * 1e9)
 
     def trip_watchdog(self) -> None:
-        """Stop, or not, as the firmware does; either way no goal can be written until Bus Watchdog is set to 0."""
+        """Trip the bus watchdog: goals cannot be written until it is set to 0, and the motor stops on some models."""
         if self.watchdog_stops:
             self._rest_goals()
         self.put(reg.BUS_WATCHDOG, reg.WATCHDOG_TRIPPED)
 
     def overload(self) -> None:
-        """Shut down as after an overload: torque off, error bit set until reboot."""
+        """Shut down as after an overload: torque off, and an error bit set until reboot."""
         self.put(reg.HARDWARE_ERROR_STATUS, 1 << _OVERLOAD_BIT)
         self.put(reg.TORQUE_ENABLE, 0)
 
@@ -175,7 +175,7 @@ class Servo:
         self.put(reg.GOAL_POSITION, self.get(reg.PRESENT_POSITION))
 
     def _split(self, address: int, data: bytes, pairs: list[tuple[Register, int]]) -> StatusError:
-        """Cut written bytes into whole registers, appended to `pairs`."""
+        """Split written bytes into whole registers and append these to `pairs`."""
         if not data:
             return StatusError.DATA_LENGTH
         while data:
@@ -193,15 +193,15 @@ class Servo:
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
         if register in _FIXED and value != self.get(register):
-            return StatusError.RESULT_FAIL  # this emulation has no bus to move to, and knows one drive mode
+            return StatusError.RESULT_FAIL  # not emulated: other ids, baud rates and drive modes
         if register == reg.TORQUE_ENABLE and value and self.alert:
-            return StatusError.RESULT_FAIL  # after a shutdown only a reboot lets torque on again
+            return StatusError.RESULT_FAIL  # after a shutdown, torque can be switched on only after a reboot
         if not register.minimum <= value <= register.maximum:
             return StatusError.DATA_RANGE
         if register == reg.OPERATING_MODE and value not in list(OperatingMode)[1:]:
             return StatusError.DATA_RANGE
         if register in reg.GOALS and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
-            # e-Manual, Bus Watchdog(98): goals become read-only, a write is answered with a range error.
+            # e-Manual, Bus Watchdog(98): goals become read-only, and writing them gives a range error.
             return StatusError.DATA_RANGE
         return StatusError.DATA_LIMIT if self._beyond_limit(register, value) else StatusError.NONE
 

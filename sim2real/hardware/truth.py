@@ -1,7 +1,7 @@
-"""The emulator's own account of what happened when: true latencies and true states, to measure others against.
+"""The emulator's log of true states and true latencies, against which other results are measured.
 
-The file is one line of JSON (the header) and then rows of one fixed size, flushed every 0.25 s: whatever is there of a
-file cut anywhere can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
+The file is one line of JSON (the header), followed by rows of fixed size, flushed every 0.25 s, so that a file that was
+cut off can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ _MIN_VALUES: Final = 3  # a sample's position, velocity and load
 
 
 class Kind(IntEnum):
-    """What a row is about, and so what its times and values mean.
+    """The kind of a row, which says what its times and values mean.
 
-    For all: `t_host_ns` is when the emulator got the instruction's last bytes from the host.
+    In every row `t_host_ns` is when the emulator received the instruction's last bytes from the host.
 
     Attributes:
-        SAMPLE: An answered read of present values: sampled at `t_ns`, answer with the host at `t_done_ns`, which was
-            `late_ns` after plan; position (rad), velocity (rad/s), load before quantisation.
-        EFFECT: A command reached the motor at `t_ns`, a point of the plant's grid, `late_ns` (signed) after plan;
-            mode and goal. `t_host_ns` is 0 for a command that came from the servo itself.
-        STATE: The plant's true state at `t_ns`, in the order of the header's `state_names`.
+        SAMPLE: An answered read of present values. `t_ns`: when they were sampled; `t_done_ns`: when the host got the
+            answer; `late_ns`: how much later than planned. Values: position [rad], velocity [rad/s] and load, before
+            quantisation.
+        EFFECT: A command took effect. `t_ns`: when, a point of the plant's grid; `late_ns`: how much later than
+            planned, possibly negative. Values: mode and goal. `t_host_ns` is 0 for a command of the servo itself.
+        STATE: The plant's true state at `t_ns`. Values: in the order of the header's `state_names`.
         WATCHDOG: The bus watchdog tripped at `t_ns`.
-        LOSS: An answer that never left; times as of a SAMPLE.
-        REPLY: Any other answer: instruction complete on the wire at `t_ns`; otherwise as a SAMPLE.
+        LOSS: An answer was lost; times as for SAMPLE.
+        REPLY: Any other answer. `t_ns`: when the instruction was complete on the wire; otherwise as for SAMPLE.
     """
 
     SAMPLE = 1
@@ -68,7 +69,7 @@ class TruthLog:
 
     Args:
         path: The file; an existing one is replaced.
-        header: Anything JSON holds; `state_names` must be among it.
+        header: The header: JSON-able, with `state_names`.
     """
 
     def __init__(self, path: Path, header: dict[str, Any]) -> None:
@@ -92,25 +93,35 @@ class TruthLog:
         late_ns: int,
         values: Sequence[float] = (),
     ) -> None:
-        """Buffer one row; `Kind` says what the arguments mean."""
+        """Buffer one row; `Kind` says what times and values mean.
+
+        Args:
+            kind: Kind of the row.
+            servo_id: The servo; 0 for the whole plant.
+            t_host_ns: See `Kind` [ns].
+            t_ns: See `Kind` [ns].
+            t_done_ns: See `Kind` [ns].
+            late_ns: See `Kind` [ns].
+            values: See `Kind`.
+        """
         padded = (*values, *self._padding[len(values) :])
         self._rows.append(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Hand the buffered rows to the operating system if the last time is 0.25 s ago."""
+        """Pass the buffered rows to the operating system if the last time was at least 0.25 s ago."""
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._flushed_ns = now_ns
             self._flush()
 
     def close(self) -> None:
-        """Write what is left and close the file; closing twice is fine."""
+        """Write the remaining rows and close the file; may be called twice."""
         if not self._file.closed:
             self._flush()
             with contextlib.suppress(OSError):
                 self._file.close()
 
     def _flush(self) -> None:
-        """Write the buffered rows; a robot does not stop because its account cannot be written: that ends, then."""
+        """Write the buffered rows; if that fails, the log ends there, and the emulated robot goes on."""
         if self._full:
             self._rows.clear()
             return
@@ -127,15 +138,15 @@ class Truth:
     """A truth file in memory.
 
     Args:
-        header: Configuration (`config`), `servo_ids`, `start_ns`, `state_names`, and the plant's parameters (`truth`).
-        rows: Structured array; the fields are explained by `Kind`, `values` is (N, V).
+        header: The emulator's `config`, `servo_ids`, `start_ns`, `state_names`, and the plant's parameters (`truth`).
+        rows: Structured array of shape (N,), see `Kind`; `values` has shape (N, V).
     """
 
     header: dict[str, Any]
     rows: np.ndarray
 
     def of(self, kind: Kind, servo_id: int | None = None) -> np.ndarray:
-        """Return the rows of one kind, of one servo if given, in the order written."""
+        """Return the rows of one kind, optionally of one servo only, in the order in which they were written."""
         chosen = self.rows["kind"] == kind
         if servo_id is not None:
             chosen &= self.rows["servo_id"] == servo_id
@@ -147,17 +158,18 @@ class Truth:
         return self.header["truth"]
 
     def states(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return the times (N,) in ns and, by name, the true states (N,), sampled at 200 Hz."""
+        """Return times, shape (N,) [ns], and true states by name, each of shape (N,), sampled at 200 Hz."""
         rows = self.of(Kind.STATE)
         return rows["t_ns"], {name: rows["values"][:, i] for i, name in enumerate(self.header["state_names"])}
 
     def mean_latencies(self) -> dict[str, float]:
-        """Return the session's mean latencies in seconds; NaN where nothing was read or written.
+        """Return the session's mean latencies [s]; NaN if nothing was read or written.
 
         Returns:
             `sensing_s`: age of a sample when its answer reaches the host.
-            `actuation_s`: from the arrival of a goal's bytes to its effect.
-            `sample_before_request_s`: from the sample to the arrival of the read's bytes; negative if sampled after.
+            `actuation_s`: time from the arrival of a goal's bytes to its effect.
+            `sample_before_request_s`: time from the sample to the arrival of the read's bytes; negative if sampled
+            later.
         """
         samples = self.of(Kind.SAMPLE)
         effects = self.of(Kind.EFFECT)
@@ -169,7 +181,7 @@ class Truth:
         }
 
     def lateness_s(self) -> np.ndarray:
-        """Return how late after plan each answer left, (N,) in seconds: the emulator's own real-time error."""
+        """Return how much later than planned each answer was sent, shape (N,) [s]: the emulator's real-time error."""
         answers = np.isin(self.rows["kind"], (Kind.SAMPLE, Kind.REPLY))
         return self.rows["late_ns"][answers] * 1e-9
 
@@ -179,7 +191,7 @@ def _mean_s(durations_ns: np.ndarray) -> float:
 
 
 def read_truth(path: Path | str) -> Truth:
-    """Read a truth file, complete or cut off; a last row that is not whole is left out.
+    """Read a truth file, complete or cut off; an incomplete last row is left out.
 
     Raises:
         Sim2RealError: The file does not exist or has no header.

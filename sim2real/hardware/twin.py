@@ -1,7 +1,7 @@
-"""A plant made of a robot's own MJCF: the robot inside the computer where there is no hardware yet.
+"""A plant made from a robot's own MJCF model: an emulated robot for when there is no hardware yet.
 
-Its numbers differ from the model's by factors, so that there is something to identify. It is no check of the model:
-what the MJCF has wrong, its twin has wrong, too.
+Its parameters differ from the model's by given factors, so that there is something to identify. It cannot check the
+model's structure: what is wrong in the MJCF is wrong in its twin too.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _FACTORS = ("gain", "damping", "armature", "friction")
 class TwinPlant:
     """Position-controlled servos on a model's position actuators; see ``sim2real.hardware.plant.Plant``.
 
-    A joint is at 0 where its encoder shows its centre. With torque off the motor gives nothing, and what the model has
-    for damping goes on braking. Angles are compared in whole counts, as the firmware does.
+    A joint is at 0 where its encoder reads the centre of its range. With torque off the motor applies no torque, but
+    the model's damping still acts. Position errors are computed in whole counts, as in the firmware.
 
     Args:
-        mjcf: The model, with one position actuator a joint.
+        mjcf: The model, with one position actuator per joint.
         joints: Name of each joint, in the order of the servos -> its name in the model.
-        servo_ids: Their numbers on the bus.
-        p_gain: Position P Gain that the actuators' ``kp`` is for.
-        factors: By what the robot differs from the model: ``gain``, ``damping``, ``armature``, ``friction``.
+        servo_ids: The servos' ids.
+        p_gain: Position P Gain to which the actuators' ``kp`` corresponds [counts].
+        factors: Factors on the model's parameters: ``gain``, ``damping``, ``armature``, ``friction``; default: 1.
         step_s: MuJoCo's time step [s].
 
     Raises:
@@ -62,7 +62,7 @@ class TwinPlant:
         model.dof_damping[:] *= f["damping"]
         model.dof_armature[:] *= f["armature"]
         model.dof_frictionloss[:] *= f["friction"]
-        # As stiff as the solver bears: at the default what friction should hold crawls.
+        # Friction constraints as stiff as the solver allows: with the defaults, a joint held by friction creeps.
         model.dof_solref[:] = (4 * step_s, 1.0)
         model.dof_solimp[:, :3] = (0.999, 0.999, 0.001)
         self.data = MjData(model)
@@ -92,15 +92,28 @@ class TwinPlant:
             mj_step(model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
-        """Set a servo's goal [rad from the encoder's count 0]; any mode but position is torque off."""
+        """Set a servo's goal.
+
+        Args:
+            servo_id: The servo.
+            mode: Position; any other mode counts as torque off.
+            goal: Goal position [rad from the encoder's count 0].
+        """
         i = self.servo_ids.index(servo_id)
         if mode == OperatingMode.POSITION and self._goals[i] is None:
             self._references[i] = float(self.data.qpos[self._qpos[i]])
         self._goals[i] = goal - _CENTRE_RAD if mode == OperatingMode.POSITION else None
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's Position P Gain, and how fast its reference moves at most [rad/s]; inf is no limit."""
-        del d_gain  # not emulated: a drive sets it to 0
+        """Set a servo's position controller.
+
+        Args:
+            servo_id: The servo.
+            p_gain: Position P Gain [counts].
+            d_gain: Not emulated; drives set it to 0.
+            profile_velocity_rad_s: Largest speed of the setpoint [rad/s]; inf: no limit.
+        """
+        del d_gain
         i = self.servo_ids.index(servo_id)
         motor = self._motors[i]
         self._profiles[i] = profile_velocity_rad_s
@@ -108,7 +121,7 @@ class TwinPlant:
         self.model.actuator_gainprm[motor, 0], self.model.actuator_biasprm[motor, 1] = kp, -kp
 
     def measure(self, servo_id: int) -> tuple[float, float, float]:
-        """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
+        """Return angle from the encoder's count 0 [rad], velocity [rad/s], and load, a fraction of the stall torque."""
         i = self.servo_ids.index(servo_id)
         load = float(self.data.actuator_force[self._motors[i]]) / float(self._most[self._motors[i], 1])
         angle, speed = self.data.qpos[self._qpos[i]], self.data.qvel[self._dofs[i]]
@@ -120,9 +133,9 @@ class TwinPlant:
         return position | {f"velocity[{i}]": float(self.data.qvel[a]) for i, a in enumerate(self._dofs)}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can tell, under the names of ``sim2real.robots.standard``; shared ones of the first servo.
+        """Return the parameters that can be identified from a log, named as in ``sim2real.robots.standard``.
 
-        ``gain`` is that of ``p_gain``.
+        Parameters that the joints share are those of the first servo; ``gain`` belongs to ``p_gain``.
         """
         dof, motor = self._dofs[0], self._motors[0]
         dofs = zip(self.joints, self._dofs, strict=True)

@@ -1,8 +1,9 @@
-"""A half-duplex bus with emulated servos on it, in planned time: bytes and instants in, bytes and instants out.
+"""A half-duplex bus with emulated servos, computed in planned time.
 
-Everything happens at the instant that it was planned for, however late the process that calls comes around: an
-instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud; what it reads was true a
-sensing latency before, what it commands takes effect an actuation latency after.
+The times of all events are computed from the times at which the host's bytes arrive, and do not depend on how late the
+emulator's process runs: an instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud;
+the values that it reads are those of one sensing latency earlier, and its commands take effect one actuation latency
+later.
 """
 
 from __future__ import annotations
@@ -24,14 +25,18 @@ from sim2real.hardware.truth import Kind, TruthLog
 
 __all__ = ["EmulatedBus", "EmulatorConfig", "truth_header"]
 
-_STALE_PACKET_NS: Final = 5_000_000  # the rest of a packet that pauses for longer never comes
+_STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
 
 
 @dataclass
 class _Request:
-    """An instruction, when it was complete on the wire, and when its last bytes had reached the emulator.
+    """An instruction that was received.
 
-    What it commands several servos takes effect at one instant: the delay is drawn once, when it is first needed.
+    Attributes:
+        packet: The instruction.
+        t_ns: When it was complete on the wire.
+        t_host_ns: When its last bytes had reached the emulator.
+        actuation_ns: Delay until its commands take effect, the same for all servos; None until it is drawn.
     """
 
     packet: Packet
@@ -41,15 +46,15 @@ class _Request:
 
 
 class EmulatedBus:
-    """Servos on a wire, in front of a plant. Knows no port and no thread; times are CLOCK_MONOTONIC nanoseconds.
+    """Emulated servos on a bus, driving a plant; without port and threads. Times are CLOCK_MONOTONIC nanoseconds.
 
     Args:
         plant: The mechanism.
-        config: Behaviour.
-        truth: Where the truth goes.
-        send: Takes an answer's bytes at the instant the host gets them; False if they cannot be taken.
+        config: Behaviour of bus and servos.
+        truth: Log of true states and latencies.
+        send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
         start_ns: Time 0 of the plant.
-        now_ns: Clock by which lateness is judged.
+        now_ns: Clock by which lateness is measured.
     """
 
     def __init__(
@@ -101,7 +106,7 @@ class EmulatedBus:
         }
 
     def feed(self, chunk: bytes, now_ns: int) -> None:
-        """Take bytes that the host sent; call `run_until(now_ns)` next."""
+        """Process bytes that the host has sent; `run_until(now_ns)` must be called next."""
         if self._silent(now_ns):
             return
         if now_ns - self._last_bytes_ns > _STALE_PACKET_NS:
@@ -112,21 +117,21 @@ class EmulatedBus:
         for packet, end in self._parser.feed(chunk):
             t_ns = begin_ns + round(end * self._byte_ns)
             self._at(t_ns, self._execute, _Request(packet, t_ns, now_ns))
-        # These bytes may have waited while this process slept too long: its lateness must trip no watchdog.
+        # These bytes may have waited because this process was late, which must not trip a servo's watchdog.
         for servo in self.servos.values():
             deadline_ns = servo.watchdog_deadline_ns()
             if deadline_ns is not None and deadline_ns < self._wire_free_ns:
                 servo.heard_ns += self._wire_free_ns - deadline_ns + 1
 
     def next_due_ns(self) -> int | None:
-        """Return the time of the next thing to do, None if there is none."""
+        """Return the time of the next event; None if there is none."""
         due = [deadline for s in self.servos.values() if (deadline := s.watchdog_deadline_ns()) is not None]
         if self._events:
             due.append(self._events[0][0])
         return min(due, default=None)
 
     def run_until(self, t_ns: int) -> None:
-        """Do everything that is due up to `t_ns`, in the order of its time, and bring the plant there."""
+        """Process all events up to `t_ns` in order, and advance the plant to that time."""
         while (due_ns := self.next_due_ns()) is not None and due_ns <= t_ns:
             self._clock.advance(due_ns)
             for servo in self.servos.values():
@@ -150,7 +155,7 @@ class EmulatedBus:
         return round(1e9 * (latency_s + self._random.uniform(-jitter_s, jitter_s)))
 
     def _happens(self, probability: float) -> bool:
-        """Return whether a fault happens; robots without it draw the same numbers as if there were no such fault."""
+        """Return whether a fault happens; draws no random number if its probability is 0."""
         return probability > 0.0 and self._random.random() < probability
 
     def _execute(self, request: _Request) -> None:
@@ -172,7 +177,7 @@ class EmulatedBus:
             self._reply(targets[0], request, error)
 
     def _targets(self, request: _Request) -> list[Servo]:
-        """Return the addressed servos, by id; none if there is none of that id."""
+        """Return the servos that a request addresses, ordered by id."""
         if request.packet.servo_id == BROADCAST_ID:
             return list(self.servos.values())
         servo = self.servos.get(request.packet.servo_id)
@@ -251,7 +256,7 @@ class EmulatedBus:
         return error
 
     def _configure(self, servo: Servo) -> None:
-        """Tell the plant of a position controller that is not as it was told before."""
+        """Tell the plant a servo's controller settings if they have changed."""
         controller = servo.controller()
         if self._controllers.get(servo.servo_id) != controller:
             self._controllers[servo.servo_id] = controller
@@ -262,7 +267,7 @@ class EmulatedBus:
         if request.actuation_ns is None:
             request.actuation_ns = self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
         planned_ns = request.t_ns + request.actuation_ns
-        # A later command never overtakes an earlier one.
+        # Commands take effect in the order in which they were sent.
         planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
         self._last_effect_ns[servo.servo_id] = planned_ns
         self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, *servo.command())
@@ -298,7 +303,7 @@ class EmulatedBus:
         data: bytes = b"",
         sample: tuple[int, tuple[float, float, float]] | None = None,
     ) -> None:
-        """Plan a status packet: after the return delay, when the wire is free, and as long as its bytes take."""
+        """Schedule a status packet: sent after the return delay when the wire is free, delivered at its last byte."""
         answer = build_status(servo.servo_id, error | servo.alert, data)
         return_delay_ns = round(servo.get(reg.RETURN_DELAY_TIME) * reg.RETURN_DELAY_UNIT_S * 1e9)
         begin_ns = max(request.t_ns, self._wire_free_ns) + return_delay_ns
@@ -339,13 +344,19 @@ class EmulatedBus:
             self._stop_motor(servo, t_ns, OperatingMode.OFF)
 
     def _stop_motor(self, servo: Servo, t_ns: int, mode: OperatingMode) -> None:
-        """Command 0 from inside the servo: at once, and ahead of what the host still had on the way."""
+        """Stop the motor by the servo's own firmware: at once, dropping commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
 
 
 def truth_header(plant: Plant, config: EmulatorConfig, start_ns: int) -> dict[str, Any]:
-    """Return what the first line of a truth file says."""
+    """Return the header of a truth file.
+
+    Args:
+        plant: The mechanism.
+        config: Behaviour of bus and servos.
+        start_ns: Time 0 of the plant [ns].
+    """
     return {
         "start_ns": start_ns,
         "config": asdict(config),
