@@ -1,1 +1,1 @@
-"""Robots of servos on a bus: what the stages need of one, but for its model and its task."""
+"""Robots made of servos on a bus: everything that the stages need except the robot's model and its task."""

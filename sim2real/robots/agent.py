@@ -1,4 +1,4 @@
-"""The policy's node: measurements and a short history in, goals of the joints out."""
+"""The policy's node: reads measurements, keeps a short history, and sends goal positions of the joints."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from sim2real.graph.node import BaseNode
 from sim2real.robots.messages import Decision, JointReading
 
 Features = Callable[[JointReading, Any, Any], jax.Array]
+"""Returns the part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``."""
 
 
 @struct.dataclass
 class AgentParams(Base):
-    """What the agent is given for an episode.
+    """The agent's parameters for an episode.
 
     Attributes:
-        policy: A pytree with ``get_action(observation)``; None keeps the goals where they are.
-        aim: What the episode is about, ``(k,)`` in the task's units.
-        start: Goals at the start, ``(joints,)`` [rad].
+        policy: A pytree with ``get_action(observation)``; None: the goals stay constant.
+        aim: Shape ``(k,)``: what the task asks for in this episode, e.g. a target [the task's units].
+        start: Shape ``(joints,)``: goals at the start [rad].
     """
 
     policy: Any = None
@@ -33,26 +34,32 @@ class AgentParams(Base):
 
 @struct.dataclass
 class AgentState(Base):
-    """The goals ``(joints,)`` [rad], and what was seen and told before ``(steps, 3 * joints)``, newest first."""
+    """The agent's state.
+
+    Attributes:
+        goal: Shape ``(joints,)``: the goals [rad].
+        past: Shape ``(history, 3 * joints)``: positions [rad], velocities [rad/s] and goals [rad] of the last steps,
+            newest first.
+    """
 
     goal: Any
     past: Any
 
 
 class GoalAgent(BaseNode):
-    """Moves the goals of position-controlled servos: a policy's action is their speed.
+    """Sends goals to position-controlled servos; a policy's action is the speed of the goals.
 
-    So goals are continuous whatever the policy does, no faster than ``speed``, and noise of exploration averages out.
+    So the goals are continuous and of limited speed whatever the policy does, and exploration noise averages out.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
-        low: Lowest goals ``(joints,)`` [rad].
-        high: Highest goals ``(joints,)`` [rad].
-        features: What the policy sees of the present: (reading, goals, aim) -> ``(features,)``.
-        history: Past steps that it sees.
-        aims: Entries of an aim.
-        **options: As of ``BaseNode``.
+        low: Shape ``(joints,)``: lowest goals [rad].
+        high: Shape ``(joints,)``: highest goals [rad].
+        features: Part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``.
+        history: Number of past steps in the observation.
+        aims: Number of entries of an aim.
+        **options: Options of ``BaseNode``.
     """
 
     def __init__(
@@ -71,29 +78,29 @@ class GoalAgent(BaseNode):
         self._features, self._history, self._aims = features, history, aims
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
-        """Return no policy, and zeros for the rest."""
+        """Return parameters without a policy, and zeros for aim and start."""
         del rng, graph_state
         return AgentParams(aim=jnp.zeros(self._aims), start=jnp.zeros_like(self._low))
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentState:
-        """Return goals where the episode starts, and an empty history."""
+        """Return the goals at the start, and a history of zeros."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         start = jnp.asarray(params.start, jnp.float32)
         return AgentState(goal=start, past=jnp.zeros((self._history, 3 * start.size)))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Decision:
-        """Return the goals at the start."""
+        """Return a message with the goals at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return Decision(jnp.asarray(params.start, jnp.float32), jnp.asarray(params.aim, jnp.float32))
 
     def observe(self, step_state: StepState) -> jax.Array:
-        """Return what the policy sees: the features, then the history, newest first."""
+        """Return the policy's observation: the features, then the history, newest first."""
         reading, state = step_state.inputs["sensor"][-1].data, step_state.state
         now = self._features(reading, state.goal, step_state.params.aim)
         return jnp.concatenate([now, state.past.ravel()]).astype(jnp.float32)
 
     def act(self, step_state: StepState, action: Any) -> tuple[StepState, Decision]:
-        """Return the step's results for an action: speeds of the goals ``(joints,)`` [rad/s]."""
+        """Return the new step state and the message for an action ``(joints,)``: speeds of the goals [rad/s]."""
         reading, state = step_state.inputs["sensor"][-1].data, step_state.state
         goal = jnp.clip(state.goal + jnp.asarray(action, jnp.float32) / self.rate, self._low, self._high)
         row = jnp.concatenate([reading.position, reading.velocity, goal]).astype(jnp.float32)
@@ -102,7 +109,7 @@ class GoalAgent(BaseNode):
         return step_state.replace(state=new), decision  # pyright: ignore[reportAttributeAccessIssue]
 
     def step(self, step_state: StepState) -> tuple[StepState, Decision]:
-        """Ask the policy."""
+        """Make a step with the policy's action."""
         policy = step_state.params.policy
         action = jnp.zeros_like(self._low) if policy is None else policy.get_action(self.observe(step_state))
         return self.act(step_state, action)

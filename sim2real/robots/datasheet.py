@@ -1,4 +1,4 @@
-"""What a data sheet says about a servo, and what its firmware makes of it."""
+"""A servo's data sheet, and quantities that follow from it."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sim2real.hardware.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COU
 
 @dataclass(frozen=True)
 class DataSheet:
-    """A position-controlled servo, and how it is set up.
+    """Data of a position-controlled servo, and its settings.
 
     Attributes:
         stall: Torque at full duty and standstill [N m].
-        damping: Back-EMF and viscous friction together [N m s/rad]: about ``stall`` over the speed without load.
-        armature: Inertia of the rotor behind the gears [kg m^2].
+        damping: Back-EMF and viscous friction together, about ``stall`` divided by the no-load speed [N m s/rad].
+        armature: Inertia of the rotor, as seen at the gear's output [kg m^2].
         friction: Dry friction [N m].
-        p_gain: Position P Gain, in counts.
+        p_gain: Position P Gain [counts].
         profile_rad_s: Profile Velocity [rad/s].
-        model_number: What the servos say they are; a twin of the robot has that model's firmware.
+        model_number: Model number of the servos; a twin of the robot emulates that model's firmware.
     """
 
     stall: float
@@ -32,15 +32,15 @@ class DataSheet:
 
     @property
     def full_rad(self) -> float:
-        """Error at which the duty is full [rad]."""
+        """Position error at which the duty is full [rad]."""
         return PWM_FULL_SCALE * P_GAIN_UNIT / self.p_gain * RAD_PER_COUNT
 
     @property
     def gain(self) -> float:
-        """Torque per error [N m/rad]."""
+        """Torque per position error [N m/rad]."""
         return self.stall / self.full_rad
 
     @property
     def drive(self) -> PositionDrive:
-        """How the servos are set up on the bus."""
+        """The drive with these settings."""
         return PositionDrive(self.p_gain, self.profile_rad_s)

@@ -1,4 +1,4 @@
-"""Sensor and actuator in simulation, for any world: imports no MuJoCo, which takes seconds."""
+"""Sensor and actuator in simulation, for any world. Imports no MuJoCo, which would take seconds."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sim2real.robots.messages import Goals
 
 
 class SimSensor(BaseNode):
-    """The encoders in simulation: pass the world's message on, as late as ``DelayParams`` says.
+    """The encoders in simulation: passes on the world's message, with the delay in ``DelayParams``.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
         world: The world that it reads.
-        **options: As of ``BaseNode``.
+        **options: Options of ``BaseNode``.
     """
 
     def __init__(self, name: str, rate: float, world: BaseNode, **options: Any) -> None:
@@ -28,7 +28,7 @@ class SimSensor(BaseNode):
         self._world = world
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
-        """Return no delay of its own."""
+        """Return parameters without a delay."""
         del rng, graph_state
         return DelayParams()
 
@@ -37,27 +37,27 @@ class SimSensor(BaseNode):
         return self._world.init_output(rng, graph_state)
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the sensing delay, where the parameters set one."""
+        """Return the sensing delay [s], if the parameters have one."""
         del rng
         return delay_of(self.name, self._world.name, graph_state)
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Measure."""
+        """Return the world's message."""
         return step_state, step_state.inputs[self._world.name][-1].data
 
 
 class SimActuator(BaseNode):
-    """The bus in simulation: passes the agent's commands on.
+    """The bus in simulation: passes on the agent's commands.
 
-    Before the first one it is the agent's ``start``, so that joints are held where they are; zeros for agents without.
+    The default output is ``start`` of the agent's parameters, at which the joints are held, or zeros if they have none.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
-        joints: How many there are.
-        field: Field of the agent's message that is the command, ``(joints,)``.
-        message: Makes the node's message of a command.
-        **options: As of ``BaseNode``.
+        joints: Number of joints.
+        field: Field of the agent's message that is the command, shape ``(joints,)``.
+        message: Makes the node's message from a command.
+        **options: Options of ``BaseNode``.
     """
 
     def __init__(
@@ -73,16 +73,16 @@ class SimActuator(BaseNode):
         self._joints, self._field, self._message = joints, field, message
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
-        """Return no delay of its own."""
+        """Return parameters without a delay."""
         del rng, graph_state
         return DelayParams()
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return where the agent starts."""
+        """Return a message with the agent's start, or with zeros."""
         del rng
         start = getattr((graph_state or GraphState()).params.get("agent"), "start", None)
         return self._message(jnp.zeros(self._joints) if start is None else jnp.asarray(start, jnp.float32))
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Pass the newest command on."""
+        """Return the newest command."""
         return step_state, self._message(getattr(step_state.inputs["agent"][-1].data, self._field))

@@ -1,4 +1,4 @@
-"""The nodes of a servo robot on hardware, and what holds port and torque while they run."""
+"""The nodes of a servo robot on hardware, and the session that owns port and torque while they run."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sim2real.hardware.wire import EmulatorConfig
 
 @dataclass(frozen=True)
 class Embedded:
-    """The robot inside the computer, for the port ``embedded``.
+    """An emulated robot, used for the port ``embedded``.
 
     Attributes:
-        plant: ``package.module:Name`` or ``path/to/file.py:Name``.
-        emulator: Latencies and losses; its own seed does not count.
-        plant_args: Keyword arguments of the plant; must be JSON.
+        plant: ``package.module:Name`` or ``path/to/file.py:Name``; see ``load_plant``.
+        emulator: Latencies and faults; its seed is replaced by the session's.
+        plant_args: Keyword arguments of the plant: JSON-able.
     """
 
     plant: str
@@ -38,16 +38,16 @@ class Embedded:
 
 
 class ServoSession:
-    """An open robot: the rig, and the embedded robot's process where that is what the port names.
+    """An open robot: the rig, and, for the port ``embedded``, the process of the emulated robot.
 
     Args:
         bus: Port and limits of the bus; the port may be ``embedded``.
         gate: The safety gate's limits.
-        ids: The servos.
-        drive: How they are driven.
-        embedded: The embedded robot; None: there is none.
-        truth_path: Where the embedded robot writes what really happened.
-        seed: Of the embedded robot's jitter and losses.
+        ids: The servos' ids.
+        drive: How the servos are driven.
+        embedded: The emulated robot; None: there is none.
+        truth_path: File for the emulated robot's true states and latencies.
+        seed: Seed of the emulated robot's jitter and faults.
 
     Raises:
         UsageError: The port is ``embedded``, but the robot has none.
@@ -75,7 +75,7 @@ class ServoSession:
                     EmbeddedRobot(embedded.plant, config, embedded.plant_args, truth_path)
                 )
                 bus = replace(bus, port=self.embedded.port)
-                # The last command, torque off, takes its time to the motor; the truth shall show that it came.
+                # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
                 opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
             self.rig = opening.enter_context(ServoRig(bus, gate, ids, drive))
             self._stack = opening.pop_all()
@@ -85,20 +85,20 @@ class ServoSession:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Make safe and close."""
+        """Take the torque off, close the port, and stop the emulated robot."""
         self._stack.close()
 
 
 class ServoSensor(BaseNode):
-    """Reads all servos in one transaction; its time stamp is when the reading instruction left.
+    """Reads all servos in one transaction; the message's time stamp is when the read instruction was sent.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
-        rig: The robot.
-        message: Makes the node's message of a reading.
-        rest: The message of a robot at rest.
-        **options: As of ``BaseNode``.
+        rig: The servos.
+        message: Makes the node's message from a reading.
+        rest: The message of a robot at rest, which is the default output.
+        **options: Options of ``BaseNode``.
     """
 
     jittable = False
@@ -116,27 +116,27 @@ class ServoSensor(BaseNode):
         self._rig, self._message, self._rest = rig, message, rest
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return the robot at rest."""
+        """Return the message of a robot at rest."""
         del rng, graph_state
         return self._rest
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Measure."""
+        """Read the servos."""
         reading = self._rig.measure()
         ts = max(self.at(reading.transaction.t_sent_ns), float(step_state.ts))
         return step_state.replace(ts=ts), self._message(reading)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class ServoActuator(BaseNode):
-    """Sends the agent's commands through the safety gate; its output is what was sent.
+    """Sends the agent's commands through the safety gate; its output is the command that was sent.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
-        rig: The robot.
-        field: Field of the agent's message that is the command, ``(servos,)``.
-        message: Makes the node's message of what was sent.
-        **options: As of ``BaseNode``.
+        rig: The servos.
+        field: Field of the agent's message that is the command, shape ``(servos,)``.
+        message: Makes the node's message from the command that was sent.
+        **options: Options of ``BaseNode``.
     """
 
     jittable = False
@@ -148,7 +148,7 @@ class ServoActuator(BaseNode):
         self._rig, self._field, self._message = rig, field, message
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return zeros."""
+        """Return a message with zeros."""
         del rng, graph_state
         return self._message(np.zeros(len(self._rig.ids)))
 
@@ -165,7 +165,7 @@ class ServoActuator(BaseNode):
         return True
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Command."""
+        """Send the newest command."""
         message = step_state.inputs["agent"]
         now_s = self.now()
         age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
@@ -174,14 +174,17 @@ class ServoActuator(BaseNode):
 
 
 class Excitation(BaseNode):
-    """The agent's place while recording: plays a signal.
+    """Takes the agent's place during a recording: sends an excitation signal.
 
     Args:
         name: Unique in the graph.
         rate: Steps per second [Hz].
-        signal: Shape ``(N, servos)``: one command a step; zeros afterwards.
-        message: Makes the node's message of a command.
-        **options: As of ``BaseNode``.
+        signal: Shape ``(N, servos)``: one command per step; after its end zeros are sent.
+        message: Makes the node's message from a command.
+        **options: Options of ``BaseNode``.
+
+    Raises:
+        UsageError: The signal is not finite.
     """
 
     jittable = False
@@ -195,7 +198,7 @@ class Excitation(BaseNode):
         self._signal, self._message = signal, message
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return zeros."""
+        """Return a message with zeros."""
         del rng, graph_state
         return self._message(np.zeros(self._signal.shape[1]))
 

@@ -1,4 +1,4 @@
-"""A servo robot for the identify stage."""
+"""A servo robot as a model for the identify stage."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class IdentifiableServos:
-    """Recorded goals in, joint positions and velocities out; see ``sim2real.identify.model.IdentifiableModel``.
+    """Simulates joint positions and velocities from recorded goals; an ``identify.model.IdentifiableModel``.
 
     Args:
         robot: The robot.
-        max_delay_s: Upper bound of each delay [s].
+        max_delay_s: Upper bound of each of the two delays [s].
     """
 
     sensor = "sensor"
@@ -40,14 +40,19 @@ class IdentifiableServos:
         )
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
-        """Return sensor, actuator and world, with delays of up to ``max_delay_s`` [s] between them."""
+        """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
         robot, world = self._robot, self._robot.make_world(resumed=True)
         sensor = SimSensor("sensor", robot.RATE_HZ, world)
         actuator = SimActuator("actuator", robot.RATE_HZ, len(robot.servos.joints))
         return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        """Return node parameters for values and initial positions, then velocities ``(2 * joints,)``."""
+        """Return the nodes' parameters.
+
+        Args:
+            values: Identified parameters by name.
+            start: Shape ``(2 * joints,)``: initial positions [rad], then velocities [rad/s].
+        """
         n = len(self._robot.servos.joints)
         start = jnp.asarray(start)
         params = self._robot.node_params(values, start[:n], start[n:], jnp.zeros(len(self._robot.aim)))

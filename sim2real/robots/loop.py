@@ -1,4 +1,4 @@
-"""The control loop of sensor, agent, actuator and world: how they are connected, and how late messages are."""
+"""The control loop of sensor, agent, actuator and world: connections and delays."""
 
 from __future__ import annotations
 
@@ -16,28 +16,43 @@ from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identify.parameters import Parameter
 
 BURST = 3
-"""After a hiccup of a thread, commands that waited for it leave at once: so many more than the rate explains."""
+"""Extra messages in the world's window of commands. After a hiccup, the actuator makes its missed steps one right after
+the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
+"""Names of the two delays: from the world to the sensor, and from the actuator to the world."""
 
 
 @struct.dataclass
 class DelayParams(Base):
-    """The delay of a node's connection with the world [s]; None leaves the connection's own."""
+    """Parameters of a simulated sensor or actuator.
+
+    Attributes:
+        delay: Delay of its connection with the world [s]; None: as the connection was made.
+    """
 
     delay: Any = None
 
 
 def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:
-    """Return the delay of an input [s] as ``init_delays`` does, where a node's ``DelayParams`` set one."""
+    """Return what ``init_delays`` returns: the delay in a node's ``DelayParams``, if it has one.
+
+    Args:
+        node: The node whose parameters have the delay.
+        input_name: The input that it belongs to.
+        graph_state: The graph's state, with the parameters; None: no delay.
+
+    Returns:
+        Input name -> delay [s], or empty.
+    """
     delay = getattr((graph_state or GraphState()).params.get(node), "delay", None)
     return {} if delay is None else {input_name: delay}
 
 
 def delay_parameters(max_delay_s: float) -> list[Parameter]:
-    """Return the delays to identify: from the world to the sensor, and from the actuator to the world.
+    """Return the delays as parameters to identify: from the world to the sensor, and from the actuator to the world.
 
     Args:
-        max_delay_s: Upper bound of each [s].
+        max_delay_s: Upper bound of each delay [s].
     """
     delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     about = "from motion to measurement's time stamp", "from command's departure to the motor"
@@ -50,13 +65,16 @@ def delay_parameters(max_delay_s: float) -> list[Parameter]:
 def delay_bounds(
     values: Mapping[str, float], tick_s: float, spread_s: float, lead_s: float = 0.0
 ) -> dict[str, tuple[float, float, float]]:
-    """Return each delay with room around it for training: name -> (value, min, max) [s].
+    """Return the bounds of the trainable delays for training.
 
     Args:
         values: Both delays by name [s].
-        tick_s: The world's period [s]: the sensor interpolates over one.
-        spread_s: By how much delays vary between episodes, either way [s].
-        lead_s: By how much the world adds to the actuator's delay [s].
+        tick_s: The world's period [s], over which the sensor interpolates.
+        spread_s: Largest deviation of an episode's delay from its value [s].
+        lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
+
+    Returns:
+        Name -> (value, min, max) [s].
     """
     room = tick_s + spread_s
     added = dict(zip(DELAYS, (0.0, lead_s), strict=True))
@@ -64,15 +82,15 @@ def delay_bounds(
 
 
 def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> dict[str, float]:
-    """Return parameters whose delays a closed loop can simulate: as much as it needs of them moves to the sensor.
+    """Return parameters with part of the actuator's delay moved to the sensor, as far as a simulated loop needs it.
 
-    The sensor interpolates between ticks of the world, and what comes within the next tick is not simulated yet. Where
-    in the loop a delay is makes no difference to what a policy sees of its commands.
+    The simulated sensor interpolates between ticks of the world, so its delay must be at least one tick: the next tick
+    is not simulated yet. Only the sum of both delays affects what a policy sees of the effect of its commands.
 
     Args:
-        values: Parameters by name, both delays among them or none [s].
+        values: Parameters by name, with both delays [s] or neither.
         tick_s: The world's period [s].
-        spread_s: By how much delays vary between episodes, either way [s].
+        spread_s: Largest deviation of an episode's delay from its value [s].
     """
     if not set(DELAYS) <= set(values):
         return dict(values)
@@ -82,13 +100,21 @@ def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> di
 
 
 def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
-    """Connect the loop that runs on hardware and in simulation alike.
+    """Connect sensor, agent and actuator, on hardware as in simulation.
 
-    Whoever waits for another catches up after a hiccup: agent and actuator make up for the steps that they missed, back
-    to back, and return to their grid (``Scheduling.PHASE``). With ``FREQUENCY`` one step of 100 ms would move their
-    schedules for good, and every later action would be made of data that is 80 ms old while newer messages wait. The
-    sensor sets the pace and keeps its frequency: nobody waits in front of it, so what it sends is never old, and no
-    two samples lie closer together than its period. As long as no step overruns, both rules are one and the same.
+    Agent and actuator have blocking inputs and ``Scheduling.PHASE``: after a hiccup they make the steps that they
+    missed one right after the other and return to their grid. With ``FREQUENCY``, a single step of 100 ms would delay
+    their schedules for good, and all later actions would use data that are 80 ms old while newer messages wait. The
+    sensor has no blocking input and keeps ``FREQUENCY``, so its samples are never old nor closer together than its
+    period. Without overruns the two options are the same.
+
+    Args:
+        sensor: Measures.
+        agent: Decides.
+        actuator: Sends commands.
+
+    Returns:
+        The three nodes by name.
     """
     agent.connect(sensor, blocking=True)
     actuator.connect(agent, blocking=True)
@@ -103,20 +129,23 @@ def simulated_loop(
     world: BaseNode,
     delays: Mapping[str, tuple[float, float, float]] | None,
 ) -> dict[str, BaseNode]:
-    """Connect the whole loop in simulation, for training and for comparison.
+    """Connect the whole loop in simulation, for training and for comparison with hardware.
 
     Args:
         sensor: Reads the world.
         agent: Decides.
-        actuator: Drives the world.
-        world: The robot and what surrounds it.
-        delays: As of ``delay_bounds``; None: no delays at all.
+        actuator: Sends commands to the world.
+        world: The robot and its environment.
+        delays: What ``delay_bounds`` returns; None: no delays.
+
+    Returns:
+        The four nodes by name.
     """
     nodes = control_nodes(sensor, agent, actuator)
     to_world = TrainableDist.create(*delays[DELAYS[1]], "zoh_mean", BURST) if delays else None
     from_world = TrainableDist.create(*delays[DELAYS[0]], "linear") if delays else None
     world.connect(actuator, skip=True, delay_dist=to_world)
-    # The expected delay stays out of the phases: on the robot nothing waits for the world either.
+    # skip=True: the delay must not shift the sensor's phase, as a real sensor does not wait for the world either.
     sensor.connect(world, skip=True, delay_dist=from_world)
     return {**nodes, world.name: world}
 
@@ -124,15 +153,18 @@ def simulated_loop(
 def recorded_loop(
     sensor: BaseNode, actuator: BaseNode, world: BaseNode, max_delay_s: float, ahead_s: float, lead_s: float = 0.0
 ) -> dict[str, BaseNode]:
-    """Connect what identification simulates: recorded commands in, measurements out.
+    """Connect the nodes that identification simulates: recorded commands drive the world, the sensor measures it.
 
     Args:
         sensor: Reads the world.
-        actuator: What it sent was recorded.
-        world: The robot and what surrounds it.
+        actuator: Stands for the recorded commands.
+        world: The robot and its environment.
         max_delay_s: Upper bound of the delays [s].
-        ahead_s: By how much later than recorded the sensor's steps are simulated [s].
-        lead_s: By how much the world adds to the actuator's delay [s].
+        ahead_s: How much later than recorded the sensor's steps are simulated [s].
+        lead_s: Time that the world adds to the actuator's delay [s].
+
+    Returns:
+        The three nodes by name.
     """
     start = max_delay_s / 4
     to_world = TrainableDist.create(start, 0.0, max_delay_s + lead_s, "zoh_mean", burst=BURST)
@@ -149,8 +181,12 @@ def draw_values(
     Args:
         key: JAX key.
         values: Parameters by name.
-        draws: Dynamics that episodes take instead, ``(K,)`` each; one row is drawn for all of them.
-        spread_s: Delays vary by this much either way [s].
+        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn in place of the
+            values.
+        spread_s: Largest deviation of an episode's delay from its value [s].
+
+    Returns:
+        Parameters by name.
     """
     row_key, *own = jax.random.split(key, 1 + len(values))
     keys = dict(zip(values, own, strict=True))

@@ -1,4 +1,4 @@
-"""What the nodes of a servo robot tell each other."""
+"""The messages between the nodes of a servo robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from sim2real.graph.base import Base
 
 @struct.dataclass
 class JointReading(Base):
-    """Positions ``(joints,)`` [rad] and velocities ``(joints,)`` [rad/s]."""
+    """A measurement.
+
+    Attributes:
+        position: Shape ``(joints,)`` [rad].
+        velocity: Shape ``(joints,)`` [rad/s].
+    """
 
     position: Any
     velocity: Any
@@ -19,18 +24,22 @@ class JointReading(Base):
 
 @struct.dataclass
 class Goals(Base):
-    """Where the joints are told to be, ``(joints,)`` [rad]."""
+    """A command.
+
+    Attributes:
+        goal: Shape ``(joints,)``: goal positions [rad].
+    """
 
     goal: Any
 
 
 @struct.dataclass
 class Decision(Base):
-    """What the policy decided, and what for.
+    """The agent's message: a command, and what the task asks for.
 
     Attributes:
-        goal: Where the joints shall be, ``(joints,)`` [rad].
-        aim: What the episode is about, in the task's units, such as a target's position ``(3,)`` [m].
+        goal: Shape ``(joints,)``: goal positions [rad].
+        aim: Shape ``(k,)``: what the task asks for in this episode, e.g. a target's position ``(3,)`` [m].
     """
 
     goal: Any

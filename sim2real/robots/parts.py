@@ -1,4 +1,4 @@
-"""Parts of worlds: a position-controlled servo, robots driven by such, and tasks whose action is their goals."""
+"""Parts of composed worlds: position-controlled servos, robots made of them, and tasks that command their goals."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from sim2real.composer.task import Task
 from sim2real.robots.datasheet import DataSheet
 
 GOAL, REFERENCE = "goal", "reference"
-"""Variables of the physics: where the servos are told to be, and where their profile has come ``(joints,)`` [rad]."""
+"""Variables of the physics, each ``(joints,)`` [rad]: the goal positions, and the setpoints of the servos' position
+controllers, which move to the goals no faster than the profile velocity."""
 
 
 class Servo(Robot):
-    """A position-controlled servo: torque = gain * (reference - angle), and no more than the stall torque.
+    """A position-controlled servo: torque = gain * (setpoint - angle), limited to the stall torque.
 
-    Back-EMF and viscous friction together are the joint's damping. What it drives is attached to ``horn``.
+    The joint's damping is back-EMF and viscous friction together. The driven part is attached to the site ``horn``.
 
     Args:
-        name: Of the model.
-        axis: About which the horn turns.
-        sheet: Its numbers.
+        name: Name of the model.
+        axis: Axis of rotation.
+        sheet: The servo's data.
     """
 
     def _build(self, name: str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
@@ -46,19 +47,19 @@ class Servo(Robot):
 
     @property
     def mjcf_model(self) -> Any:
-        """The model."""
+        """The servo's model."""
         return self._model
 
     @property
     def actuators(self) -> list[Any]:
-        """The motor."""
+        """The motor, as a list."""
         return [self.actuator]
 
 
 class ServoDriven(Robot):
-    """A robot of servos. As their firmware does, it moves each reference to its goal no faster than the profile allows.
+    """A robot made of servos, whose setpoints move to their goals with limited speed, as in the firmware.
 
-    Subclasses fill ``servos`` when they build their model; the action is one goal a servo, in their order.
+    Subclasses set ``servos`` when they build their model. The action is one goal per servo, in the same order.
 
     Attributes:
         servos: The servos.
@@ -77,25 +78,26 @@ class ServoDriven(Robot):
         return [s.actuator for s in self.servos]
 
     def initialize_episode(self, physics: Any, random_state: Any) -> None:
-        """Hold the joints where they are."""
+        """Set goals and setpoints to the joints' positions."""
         del random_state
         here = physics.np.array(physics.bind(self.joints).qpos)
         physics.variables[GOAL], physics.variables[REFERENCE] = here, here
 
     def before_substep(self, physics: Any, random_state: Any) -> None:
-        """Move the references towards the goals."""
+        """Move the setpoints towards the goals by one time step."""
         del random_state
         most = np.array([s.profile_rad_s for s in self.servos]) * physics.timestep()
         before = physics.variables[REFERENCE]
         move = physics.np.clip(physics.variables[GOAL] - before, -most, most)
         physics.variables[REFERENCE] = before + move
-        # Its mean over the step. With its end the arm of pipelines/arm was 2 to 4 mrad off a simulation in steps a
-        # fifth as long, and half a step early; so it is 0.4 to 1.2 mrad off.
+        # The control is the setpoint's mean over the step. Compared with steps a fifth as long, the arm of
+        # pipelines/arm is then off by 0.4 to 1.2 mrad; with the setpoint at the step's end it is half a step early, 2
+        # to 4 mrad.
         physics.set_control(before + move * (1.0 - 0.5 * physics.np.abs(move) / most))
 
 
 class GoalTask(Task):
-    """A task for one ``ServoDriven`` robot, the only one in its world that is driven: the action is its goals [rad]."""
+    """A task for a ``ServoDriven`` robot, which has all actuators of its world: the action is its goals [rad]."""
 
     robot: ServoDriven
 
@@ -105,6 +107,12 @@ class GoalTask(Task):
         return self.robot.joints
 
     def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
-        """Take the goals ``(joints,)`` [rad]."""
+        """Set the goals.
+
+        Args:
+            physics: The physics.
+            action: Shape ``(joints,)``: goals [rad].
+            random_state: Not used.
+        """
         del random_state
         physics.variables[GOAL] = physics.np.asarray(action)

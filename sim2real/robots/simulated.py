@@ -1,4 +1,4 @@
-"""The nodes of a servo robot in simulation: its world; its sensor and actuator are those of any robot."""
+"""The world of a servo robot in simulation; sensor and actuator are those of ``devices.py``."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ __all__ = ["ServoWorld", "SimActuator", "SimSensor"]
 
 
 class ServoWorld(ComposedWorld):
-    """A composed task whose joints are told where to be by the ``actuator`` input, and which shows where they are.
+    """A composed task as a world: its input ``actuator`` has the joints' goals, its output their measured motion.
 
     Args:
         name: Unique in the graph.
         task: The task.
-        parameters: What differs from copy to copy: name -> (elements, attribute).
-        resumed: Whether episodes begin in the middle of a recording: the servos' references, which nobody measured,
-            then begin at the goals of that time. Otherwise they begin where the joints are, as torque goes on.
-        **options: As of ``ComposedWorld``.
+        parameters: Parts of the model that differ between copies: name -> (elements, attribute).
+        resumed: Whether episodes begin in the middle of a recording. The servos' setpoints, which are not recorded,
+            then start at the goals of that time; otherwise they start at the joints' positions, as when torque goes on.
+        **options: Options of ``ComposedWorld``.
     """
 
     def __init__(self, name: str, task: GoalTask, parameters: Any, resumed: bool = False, **options: Any) -> None:
@@ -38,13 +38,13 @@ class ServoWorld(ComposedWorld):
         self._qvel = jnp.array([int(j.dofadr[0]) for j in joints])
 
     def output(self, state: Any) -> JointReading:
-        """Return where the joints are, and how fast."""
-        # A leapfrog's speeds are those of half a step ago.
+        """Return positions and velocities of the joints."""
+        # In a leapfrog scheme velocities belong to half a step earlier: extrapolated by the acceleration.
         speed = state.data.qvel + self.lead_s * state.data.qacc
         return JointReading(state.data.qpos[self._qpos], speed[self._qvel])
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Take a control step under the newest goals."""
+        """Make a control step with the newest goals."""
         if self._resumed:
             state, goal = step_state.state, step_state.inputs["actuator"][-1].data.goal
             reference = jnp.where(state.steps == 0, goal, state.variables[REFERENCE])
@@ -53,10 +53,10 @@ class ServoWorld(ComposedWorld):
         return super().step(step_state)
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay of the goals, where the actuator's parameters set one.
+        """Return the delay of the goals, if the actuator's parameters have one.
 
-        MuJoCo's step moves a joint as if its force had acted since half a step earlier (a leapfrog): that much is
-        added, so that a delay that is fitted with it is the robot's.
+        MuJoCo's integrator (a leapfrog scheme) moves a joint as if a force had acted half a time step earlier. Half a
+        step is therefore added to the delay, so that an identified delay is that of the real robot.
         """
         del rng
         found = delay_of("actuator", "actuator", graph_state)

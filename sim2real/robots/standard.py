@@ -1,4 +1,4 @@
-"""The parameters of robots whose servos are of one kind: what they share, and the friction of each joint."""
+"""The parameters of a robot whose servos are all of one model: shared ones, and the friction of each joint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim2real.robots.parts import ServoDriven
 
 
 def parameters(sheet: DataSheet, joints: Sequence[str]) -> list[Parameter]:
-    """Return gain, damping, rotor inertia and each joint's friction, within factors of 3 to 8 of the data sheet."""
+    """Return gain, damping, rotor inertia and each joint's friction, bounded to factors of 3 to 8 of the data sheet."""
     s = sheet
     return [
         Parameter("gain", "N m/rad", s.gain, s.gain / 3, s.gain * 3, about="torque per error, at the P gain in use"),
@@ -28,7 +28,7 @@ def parameters(sheet: DataSheet, joints: Sequence[str]) -> list[Parameter]:
 
 
 def fields(robot: ServoDriven) -> dict[str, tuple[Any, str]]:
-    """Return where these parameters stand in a composed model: name -> (elements, attribute)."""
+    """Return the parts of a composed model that the parameters set: name -> (elements, attribute)."""
     return {
         "gain": (robot.actuators, "gainprm"),
         "bias": (robot.actuators, "biasprm"),
@@ -46,17 +46,17 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str], st
         values: Parameters by name.
         sheet: The servo's data sheet.
         joints: Names of the joints.
-        step_s: Of the physics [s].
+        step_s: The physics' time step [s].
     """
     n = len(joints)
     gain, damping = (jnp.asarray(values[name], jnp.float32) for name in ("gain", "damping"))
-    # MuJoCo's implicit step brakes with the speed after it: as if a joint were heavier by half a step of damping. At
-    # 2.5 ms that is 6 % of the rotors' inertia of pipelines/arm, which an identification would take off.
+    # MuJoCo's implicit integration of damping acts like an additional inertia of half a step times the damping, which
+    # is subtracted here. At 2.5 ms it is 6 % of the rotors' inertia of pipelines/arm.
     armature = jnp.maximum(jnp.asarray(values["armature"]) - 0.5 * step_s * damping, 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain),
         "bias": jnp.zeros((n, 10)).at[:, 1].set(-gain),
-        # Duty ends at 1: a stronger motor pushes harder there, too.
+        # The torque limit is that at full duty, so it is proportional to the gain.
         "most": gain * sheet.full_rad * jnp.tile(jnp.array([[-1.0, 1.0]]), (n, 1)),
         "damping": jnp.full(n, damping),
         "armature": jnp.full(n, armature),
@@ -67,7 +67,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str], st
 def identified_mjcf(
     mjcf: str, robot: ServoDriven, values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[str]
 ) -> str:
-    """Return a model's MJCF with these parameters in it, for any tool that reads it.
+    """Return a model's MJCF with given parameters, for use in other tools.
 
     Args:
         mjcf: The composed model.

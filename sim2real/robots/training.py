@@ -1,4 +1,4 @@
-"""The task of a servo robot for training: what a composed task says, with draws of dynamics, delays and starts."""
+"""The training task of a servo robot: a composed task with random dynamics, delays and starts."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ if TYPE_CHECKING:
 
 
 class ServoTask:
-    """See ``sim2real.train.env.Task``.
+    """The training task of a servo robot; see ``sim2real.train.env.Task``.
 
     Args:
         robot: The robot.
-        agent: The agent's node of the graph.
-        values: Parameters to train on, by name.
-        draws: Values that episodes take instead, ``(K,)`` each, drawn together; values not named are fixed.
-        delay_spread_s: Delays vary by this much either way [s].
+        agent: The agent's node in the graph.
+        values: Parameters by name.
+        draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
+            in place of the values.
+        delay_spread_s: Largest deviation of an episode's delay from its value [s].
     """
 
     supervisor = "agent"
@@ -46,7 +47,7 @@ class ServoTask:
         self.action_low, self.action_high = -speed, speed
 
     def params(self, key: jax.Array) -> dict[str, Any]:
-        """Draw dynamics, delays, aim and start of an episode: half of them from rest, half from anywhere."""
+        """Draw dynamics, delays, aim and start of an episode: half of the starts are at rest, half at any position."""
         k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
         drawn = draw_values(k_values, self.values, self.draws, self.delay_spread_s)
         servos = self.robot.servos
@@ -56,17 +57,17 @@ class ServoTask:
         return self.robot.node_params(drawn, start, jnp.zeros_like(start), self.robot.draw_aim(k_aim))
 
     def observe(self, step_state: StepState) -> jax.Array:
-        """Return what the agent's node shows the policy."""
+        """Return the policy's observation, made by the agent's node."""
         return self.agent.observe(step_state)
 
     def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, Any]:
-        """Let the agent's node move its goals."""
+        """Return the agent's new step state and its message for an action."""
         return self.agent.act(step_state, action)
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        """Return the robot's reward of the row."""
+        """Return the robot's reward of a row."""
         return self.robot.reward(graph_state.state["world"], action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the robot is where the task wants it."""
+        """Return whether the task is fulfilled."""
         return self.robot.success(graph_state.state["world"])
