@@ -74,16 +74,21 @@ def write_truth(path: Path) -> None:
     log.close()
 
 
-def parameters(truth: bool = True) -> dict[str, Any]:
-    def entry(name: str, unit: str, kind: str, estimate: float, se: float | None, nominal: float, true: float) -> dict:
-        low, high = (None, None) if se is None else (estimate - 2 * se, estimate + 2 * se)
-        return {
-            "name": name, "unit": unit, "kind": kind, "about": f"about {name}", "nominal": nominal,
-            "estimate": estimate, "standard_error": se, "low95": low, "high95": high,
-            "lower": 0.0 if kind != "dynamics" else nominal / 4, "upper": 0.06 if unit == "s" else nominal * 4,
-            "verdict": "accepted", "truth": true if truth else None,
-        }  # fmt: skip
+def entry(
+    name: str, unit: str, kind: str, estimate: float, se: float | None, nominal: float, truth: float | None
+) -> dict[str, Any]:
+    """Return an identified parameter as in parameters.json; without a standard error it has no interval either."""
+    low, high = (None, None) if se is None else (estimate - 2 * se, estimate + 2 * se)
+    return {
+        "name": name, "unit": unit, "kind": kind, "about": f"about {name}", "nominal": nominal,
+        "estimate": estimate, "standard_error": se, "low95": low, "high95": high,
+        "lower": 0.0 if kind != "dynamics" else nominal / 4, "upper": 0.06 if unit == "s" else nominal * 4,
+        "verdict": "accepted", "truth": truth,
+    }  # fmt: skip
 
+
+def parameters(truth: bool = True) -> dict[str, Any]:
+    """Return parameters.json; ``truth``: with the true values, as of an emulated robot."""
     names = [EVIL, "friction", "sensor_delay"]
     return {
         "format": 3,
@@ -98,10 +103,10 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         },
         "misfit": 1.25,
         "parameters": [
-            entry(EVIL, "rad/s^2/V", "dynamics", 21.0784, 0.0231, 26.96, 21.10),
-            entry("friction", "rad/s^2", "dynamics", 8.507, None, 6.097, 8.482),
-            entry("sensor_delay", "s", "delay", 0.01234, 0.0005, 0.0, 0.0119),
-            entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446),
+            entry(EVIL, "rad/s^2/V", "dynamics", 21.0784, 0.0231, 26.96, 21.10 if truth else None),
+            entry("friction", "rad/s^2", "dynamics", 8.507, None, 6.097, 8.482 if truth else None),
+            entry("sensor_delay", "s", "delay", 0.01234, 0.0005, 0.0, 0.0119 if truth else None),
+            entry("round_trip_delay", "s", "derived", 0.0448, 0.0001, 0.0, 0.0446 if truth else None),
         ],
         "correlation": {"names": names, "matrix": (np.eye(3) * 0.5 + 0.5).tolist()},
         "search": {
