@@ -68,7 +68,7 @@ class GateConfig:
 
 @dataclass
 class GateCounts:
-    """Number of commands that passed the gate, and that each of its limits changed.
+    """How often the gate was passed, and how often each of its limits changed a command.
 
     Args:
         passed: Calls that returned a command.

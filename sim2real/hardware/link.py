@@ -98,7 +98,7 @@ class Transaction:
 
 
 class BusLink:
-    """Owner of port and lock. All methods may be called from any thread.
+    """Owner of port and lock. Every method may be called from any thread.
 
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
 
