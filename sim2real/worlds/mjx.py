@@ -46,21 +46,21 @@ class JointState(Base):
 
 
 class MjxWorld(BaseWorld):
-    """A MuJoCo model that is stepped by MJX; its controls come from one input.
+    """A MuJoCo model that ticks in MJX; its controls come from one input.
 
     Args:
         name: Unique in the graph.
-        rate: Ticks per second [Hz]; a tick must be a whole number of the model's time steps.
-        model: The MuJoCo model.
-        command: Name of the input with the controls.
-        field: Field of that input's message that has the controls, shape ``(nu,)`` [the actuators' units].
+        rate: Ticks per second [Hz]; a tick is a whole number of the model's time steps.
+        model: The model.
+        command: Name of the input that carries the controls.
+        field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
         color: Colour in drawings.
         order: Place in drawings.
 
     Raises:
-        UsageError: When the tick is not a whole number of time steps, or the model uses a feature that MJX lacks or
-            computes differently: delays of actuators and sensors (connections of the graph have them instead), the
-            no-slip solver, some integrators, springs without dampers.
+        UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
+            delays of its own (ignored or misplaced there; they belong to the graph), the no-slip solver, an integrator
+            that it does not have, springs without dampers.
     """
 
     def __init__(
@@ -90,12 +90,12 @@ class MjxWorld(BaseWorld):
         self._mjx_model = mjx.put_model(model)
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:
-        """Return the model, with its reference position and zero velocity as the start."""
+        """Return the model and its reference position at rest."""
         del rng, graph_state
         return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(self.model.nv))
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
-        """Return MJX data at the start position and velocity in the parameters."""
+        """Return MJX data at the parameters' start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         data = mjx.make_data(self.model).replace(qpos=params.qpos, qvel=params.qvel)
         return mjx.forward(params.model, data)
@@ -106,7 +106,7 @@ class MjxWorld(BaseWorld):
         return JointState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
 
     def step(self, step_state: StepState) -> tuple[StepState, JointState]:
-        """Integrate over one tick with the newest controls."""
+        """Integrate over one tick under the newest control."""
         model = step_state.params.model
         control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
         data = step_state.state.replace(ctrl=jnp.asarray(control, jnp.float32))
