@@ -131,7 +131,7 @@ class MakeNode(Protocol):
             name: Unique in the graph.
             rate: Steps per second [Hz].
             world: Whether to make a world.
-            options: Of ``BaseNode``; none for a world.
+            **options: Options of ``BaseNode``; none for a world.
         """
         ...
 
@@ -143,7 +143,7 @@ def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
         name: Unique in the graph.
         rate: Steps per second [Hz].
         world: Whether it is a world.
-        options: Of ``BaseNode``; not used by a world.
+        **options: Options of ``BaseNode``; not used by a world.
     """
     return HashWorldInPython(name, rate) if world else HashInPython(name, rate, **options)
 
@@ -155,7 +155,7 @@ def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNo
         name: Unique in the graph.
         rate: Steps per second [Hz].
         world: Whether it is a world.
-        options: Of ``BaseNode``; not used by a world.
+        **options: Options of ``BaseNode``; not used by a world.
     """
     return HashWorldInJax(name, rate) if world else HashInJax(name, rate, **options)
 
@@ -167,7 +167,7 @@ def contracting_node(name: str, rate: float, world: bool, **options: Any) -> Bas
         name: Unique in the graph.
         rate: Steps per second [Hz].
         world: Whether it is a world.
-        options: Of ``BaseNode``; not used by a world.
+        **options: Options of ``BaseNode``; not used by a world.
     """
     return ContractingWorld(name, rate) if world else Contraction(name, rate, **options)
 
