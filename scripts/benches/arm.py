@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,7 @@ QUICK = demo.QUICK
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--keep", type=Path, help="keep the run folders here")
-    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+    stages.add_flags(parser, seeds=[0])
     parser.add_argument("--train", type=Path, metavar="RUN", help="only train, on an accelerator, in this run folder")
     parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run arm`, with --train of `train arm`")
 
@@ -38,9 +35,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     """Run the arm once a seed, or train it; return the rows and a record of every seed."""
     if options.train:
         return {"rows": train_rows(options.train.resolve(), options.flags)}
-    with tempfile.TemporaryDirectory() as scratch:
-        root = (options.keep or Path(scratch)).resolve()
-        seeds = [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
+    seeds = stages.run_seeds(options, run_seed)
     return {"rows": rows(seeds), "seeds": seeds}
 
 

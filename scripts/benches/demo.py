@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +29,13 @@ QUICK = {
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--keep", type=Path, help="keep the run folders here")
-    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+    stages.add_flags(parser, seeds=[0, 1, 2, 3, 4])
     parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run pendulum`")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Run the demo once a seed; return the rows and a record of every seed."""
-    with tempfile.TemporaryDirectory() as scratch:
-        root = (options.keep or Path(scratch)).resolve()
-        seeds = [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
+    seeds = stages.run_seeds(options, run_seed)
     return {"rows": rows(seeds), "seeds": seeds}
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +17,24 @@ from benches.figures import row
 from sim2real.artifacts.run_folder import STAGES, StageFolder, finished
 
 
+def add_flags(parser: argparse.ArgumentParser, seeds: list[int]) -> None:
+    """Add the flags of a bench of whole runs, with its default seeds."""
+    parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
+    parser.add_argument("--keep", type=Path, help="keep the run folders here")
+    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+
+
+def run_seeds(
+    options: argparse.Namespace, run_seed: Callable[[int, Path, argparse.Namespace], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return what ``run_seed(seed, folder, options)`` measures with each seed, every one in a folder of its own."""
+    with tempfile.TemporaryDirectory() as scratch:
+        root = (options.keep or Path(scratch)).resolve()
+        return [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
+
+
 def sim2real(*arguments: str) -> None:
-    """Run a command in a process of its own, as a user does; what it says goes to stderr."""
+    """Run a command in a separate process, as a user does; what it prints goes to stderr."""
     print("sim2real", *arguments, file=sys.stderr)
     subprocess.run([sys.executable, "-m", "sim2real.cli", *arguments], check=True, stdout=subprocess.DEVNULL)
 
