@@ -1,4 +1,4 @@
-"""What to do about a recording, in plain words, from what a check found."""
+"""Advice on a recording, in sentences, from the results of a check."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.pipeline import Pipeline
 
 _GOAL = 0.01
-"""The standard error to aim at, as a share of the nominal value."""
+"""Standard error to aim at, as a fraction of the nominal value."""
 _SHORT_S = 12.0
 _MOVING, _COVERED, _ONE_SIDED = 0.3, 0.5, 0.2
 
 
 def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
-    """Return sentences: what is wrong with the data first, then what to do next.
+    """Return sentences: first the problems of the data, then what to do next.
 
     Args:
-        found: What ``check.judge`` returned.
+        found: The result of ``check.judge``.
         pipeline: The pipeline's name.
     """
     planned = found["source"] != "log"
@@ -41,13 +41,14 @@ def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
 
 
 def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) -> str:
-    """Return the command that identifies again as before, with further flags; empty without any.
+    """Return the command line of an identification with the same settings and further flags; "" without any.
 
     Args:
-        pipeline: The robot; what ``config`` has in common with its defaults needs no flag.
-        config: What it was identified with.
+        pipeline: The robot; settings that equal its defaults need no flag.
+        config: The settings of the last identification.
         root: Folder of all runs.
-        flags: What is new; of the same flag, or bounds and fixed value of the same parameter, it replaces the old.
+        flags: The further flags; they replace equal flags of the settings, and bounds or fixed values of the same
+            parameters.
     """
     if not flags:
         return ""
@@ -71,7 +72,7 @@ def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) ->
 
 
 def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
-    """Yield what is wrong with one recording."""
+    """Yield the problems of one recording."""
     which = f"{recording['name']}: " if several else ""
     s = recording["sampling"]
     if s["duration_s"] < _SHORT_S:
@@ -94,7 +95,7 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
 
 
 def _enough(found: Mapping[str, Any]) -> str:
-    """Return for how long to record, judged by the parameter that is known worst."""
+    """Return how long to record, judged by the parameter with the largest standard error."""
     known = [p for p in found["parameters"] if p["percent_of_nominal"] is not None and p["determined"] == "alone"]
     if not known:
         return ""

@@ -1,4 +1,4 @@
-"""What a command prints: data on stdout, talk on stderr, no colour."""
+"""The output of commands: results on stdout, progress and messages on stderr, without colour."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-# A line of progress in a log file, at most so often: few to read, and none of them a sign that nothing goes on.
+# Shortest time between two lines of progress in a log file.
 _LINE_EVERY_S = 15.0
 
-# What makes a terminal do something: control characters but line feed and tab, and what turns the direction of text.
+# Characters that control a terminal: control characters except line feed and tab, and changes of text direction.
 _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def clean(text: str) -> str:
-    """Return a text as it may go to a terminal: names in files of others may hold sequences that a terminal obeys."""
+    """Return a text with control sequences escaped: names in foreign files must not control the user's terminal."""
     return _ACTS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -> str:
-    """Return rows as aligned plain text: numbers to the right, everything else to the left.
+    """Return rows as aligned plain text: numbers to the right, all else to the left.
 
     Args:
         rows: Cells by row; rows may differ in length. Floats are shown with 4 significant digits, None as '-'.
-        headers: Column titles; None leaves them and the rule below them out.
+        headers: Column titles; None: no titles and no rule below them.
 
     Returns:
         Lines without trailing spaces and without a final newline; '' for an empty table without headers.
@@ -49,12 +49,12 @@ def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -
 
 
 def pairs(values: Mapping[str, Any]) -> str:
-    """Return names and values, one pair a line."""
+    """Return names and values as text, one pair per line."""
     return "\n".join(line.rstrip() for line in table([[name, _cell(v)] for name, v in values.items()]).splitlines())
 
 
 class Bar(Protocol):
-    """What `progress` shows: as much of tqdm's bar as is used."""
+    """A progress display; the part of tqdm's interface that is used."""
 
     n: float
     total: float | None
@@ -64,21 +64,21 @@ class Bar(Protocol):
         ...
 
     def refresh(self) -> Any:
-        """Show the state."""
+        """Show the present state."""
         ...
 
     def set_description_str(self, desc: str) -> None:
-        """Say what is being done now."""
+        """Set the description of what is being done."""
         ...
 
     def set_postfix_str(self, s: str) -> None:
-        """Say how far it has come."""
+        """Set the text after the bar, e.g. an intermediate result."""
         ...
 
 
 @contextmanager
 def progress(total: int | None, desc: str) -> Iterator[Bar]:
-    """Show a progress bar on stderr; plain lines where that is no terminal, such as a log file.
+    """Show a progress bar on stderr, or plain lines if that is not a terminal (a log file).
 
     Args:
         total: Number of steps; None if unknown.
@@ -100,7 +100,7 @@ def progress(total: int | None, desc: str) -> Iterator[Bar]:
 
 
 class _Lines:
-    """Progress as lines: one when something begins, one when it ends, and in between one now and then."""
+    """Progress as lines of text: one at the start, one at the end, and one every 15 s in between."""
 
     def __init__(self, total: float | None, desc: str) -> None:
         self.n: float = 0
@@ -138,7 +138,7 @@ class _Lines:
 
 
 def note(text: str) -> None:
-    """Tell the user something, on stderr; progress bars on the screen stay whole."""
+    """Print a message on stderr, without breaking a progress bar."""
     if "tqdm" in sys.modules:
         from tqdm import tqdm
 
@@ -149,12 +149,12 @@ def note(text: str) -> None:
 
 
 def wrote(path: Path | str) -> None:
-    """Name a file or folder that was written, on stdout."""
+    """Print the name of a file or folder that was written, on stdout."""
     print(f"wrote {clean(shown(path))}", flush=True)
 
 
 def shown(path: Path | str) -> str:
-    """Return a path as the user would type it: relative to the working directory where it lies inside."""
+    """Return a path for display: relative to the working directory if it is inside that."""
     absolute = Path(os.path.abspath(path))
     here = Path.cwd()
     return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
@@ -175,6 +175,6 @@ def _cell(value: Any) -> str:
 
 
 def _is_numeric(column: Sequence[Any]) -> bool:
-    """Whether a column holds numbers, and perhaps gaps."""
+    """Return whether a column has numbers only, apart from missing values."""
     values = [value for value in column if value is not None]
     return bool(values) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)

@@ -1,4 +1,4 @@
-"""How a command that failed ends: what it says, its exit code, and its process."""
+"""The end of a command that failed: its message, its exit code, and the end of its process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEBUG = "SIM2REAL_DEBUG"
 
 
 def failed(error: Sim2RealError) -> int:
-    """Say what went wrong and return the exit code that stands for it."""
+    """Print the error's message, notes and hint; return its exit code."""
     if os.environ.get(DEBUG):
         traceback.print_exc()
     # The notes name nodes and what failed on the way out; the hint stays last.
@@ -30,7 +30,7 @@ def failed(error: Sim2RealError) -> int:
 
 
 def refused(error: OSError) -> int:
-    """Say what the operating system refused, and about which file; return the exit code."""
+    """Print an operating system's error about a file; return the exit code."""
     if not isinstance(error.filename, str | bytes):
         return unexpected(error)
     if os.environ.get(DEBUG):
@@ -41,7 +41,7 @@ def refused(error: OSError) -> int:
 
 
 def unexpected(error: Exception) -> int:
-    """Say which error nobody foresaw, and where its traceback is; return the exit code."""
+    """Print an unexpected exception, and save its traceback to a file; return the exit code."""
     if os.environ.get(DEBUG):
         traceback.print_exc()
     reason = " ".join(str(error).split()) or "no message"
@@ -50,16 +50,16 @@ def unexpected(error: Exception) -> int:
 
 
 def ended_by(number: int) -> int:
-    """Say which signal ended the command and return its exit code."""
+    """Print which signal ended the command; return the exit code."""
     _complain("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
     return 128 + number
 
 
 def leave(code: int) -> NoReturn:
-    """End this process, which is a command that ended early, at once.
+    """End this process at once, without the interpreter's shutdown; for commands that ended early.
 
-    Everything of ours has been unwound by now. But a program of XLA's that was begun goes on in threads of its own, and
-    taking the interpreter down under them is a segmentation fault, or a wait until they are done.
+    The project's own clean-up is done by now. A compiled program that is still running in XLA's threads would make the
+    interpreter's shutdown wait for it, or end in a segmentation fault.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
@@ -72,15 +72,15 @@ def _complain(*lines: str) -> None:
 
 
 def _notes(error: BaseException) -> list[str]:
-    """Return an exception's notes, one line each."""
+    """Return an exception's notes, each as one line."""
     return [f"  {' '.join(note.split())}" for note in getattr(error, "__notes__", [])]
 
 
 def _save_traceback() -> str:
-    """Write the traceback of the exception at hand to a file and say where it is."""
+    """Write the traceback of the current exception to a file; return a text that says where."""
     try:
         with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
             file.write(traceback.format_exc())
-    except OSError:  # a full disk, perhaps the very error at hand
+    except OSError:  # e.g. a full disk, which may be the exception itself
         return f"{DEBUG}=1 shows the traceback"
     return f"traceback in {file.name}"

@@ -1,4 +1,4 @@
-"""Command signals that make a robot show its dynamics."""
+"""Excitation signals: commands that make a robot's dynamics identifiable."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ from sim2real.stages.config import RecordConfig
 
 
 def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.ndarray:
-    """Return the commands of every step, shape ``(N,)`` for one command, else ``(N, commands)`` [the command's unit].
+    """Return the commands of all steps, shape ``(N,)`` for one command, else ``(N, commands)`` [the command's unit].
 
-    ``multisine`` holds twelve lines of random phase between ``low_hz`` and ``high_hz``; ``chirp`` sweeps from one to
-    the other and back every 10 s; ``steps`` holds random levels for random times of half a period of these frequencies.
-    All start from zero within half a second and stay within the amplitude. Several commands are independent.
+    ``multisine`` is a sum of twelve sines with random phases between ``low_hz`` and ``high_hz``; ``chirp`` sweeps
+    between these in 10 s, and back; ``steps`` has random levels, each held for half a period of a random frequency
+    between them. All grow from zero during the first 0.5 s and stay within the amplitude. Several commands are
+    independent.
+
+    Args:
+        config: Kind of excitation, duration, amplitude, frequencies and seed.
+        rate_hz: Commands per second [Hz].
+        commands: Number of commands.
 
     Raises:
         UsageError: When the highest frequency is above half the rate of steps.
@@ -35,7 +41,7 @@ def _multisine(t: np.ndarray, low_hz: float, high_hz: float, rng: np.random.Gene
     lines_hz = np.geomspace(low_hz, high_hz, 12)
     phases = rng.uniform(0, 2 * np.pi, lines_hz.size)
     signal = np.sin(2 * np.pi * np.outer(t, lines_hz) + phases).sum(axis=1)
-    # Scaled to three deviations: the rare peaks beyond are cut, and the rest has twice the power of an uncut one.
+    # Peaks beyond 2.1 standard deviations are clipped at 1: twice the power of a scaling to 3 standard deviations.
     return signal / (3 * signal.std() / np.sqrt(2))
 
 

@@ -1,4 +1,4 @@
-"""Ending a command by a signal."""
+"""Ending a command by a signal, with clean-up."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ _LOOK_S = 0.25
 class Signals:
     """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
 
-    Only the first one is raised. A second Ctrl-C must not break off the clean-up that takes the torque away. One that
-    is raised where Python drops exceptions (a finaliser, a callback of the garbage collector) is sent again.
+    Only the first signal raises an exception: a second Ctrl-C must not interrupt the clean-up that takes the torque
+    off. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the garbage
+    collector), the signal is sent again.
 
     Attributes:
-        received: Number of the signal that was raised; 0 before one.
+        received: Number of the signal that raised an exception; 0 before.
     """
 
     def __init__(self) -> None:
@@ -33,7 +34,7 @@ class Signals:
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
             numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-            # nohup and background jobs of a shell start with signals ignored; they stay ignored.
+            # Signals that are ignored at the start, as under nohup and in background jobs, stay ignored.
             self._before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
             sys.unraisablehook = self._dropped
             for number in self._before:
@@ -60,19 +61,22 @@ class Signals:
             self._hook(unraisable)
             return
         self._raised = None
-        # A moment later: until this hook returns, it would be dropped again.
+        # Sent a moment later: before this hook returns, the exception would be ignored again.
         threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
 
 
 def patiently(work: Callable[[], Result]) -> Result:
-    """Run a long computation so that a signal ends the wait for it at once.
+    """Run a long computation in another thread, so that a signal is handled at once.
 
-    Python raises what a signal becomes between two of its own instructions of the main thread. XLA compiles for a
-    minute in one instruction, so the work is done beside the main thread. No signal ends it: a command that is
-    interrupted takes it along when it ends its process, so it must do nothing but compute.
+    Python handles signals between bytecode instructions of the main thread, and a single call into XLA may compile for
+    a minute. The signal does not stop the computation itself, which ends with the process; so it must not do anything
+    but compute.
 
     Args:
-        work: What to do; what it raises is raised here.
+        work: The computation; an exception in it is raised here.
+
+    Returns:
+        What ``work`` returned.
     """
     outcome: list[Result] = []
     failure: list[BaseException] = []
@@ -87,7 +91,7 @@ def patiently(work: Callable[[], Result]) -> Result:
             done.set()
 
     threading.Thread(target=run, name="sim2real:work", daemon=True).start()
-    while not done.wait(_LOOK_S):  # a signal that another thread of the process gets does not wake this one
+    while not done.wait(_LOOK_S):  # polls, as a signal that arrives in another thread does not wake this one
         pass
     if failure:
         raise failure[0]

@@ -1,4 +1,4 @@
-"""What a robot's folder under ``pipelines/`` provides, and how it is found."""
+"""Pipelines: what a robot's folder under ``pipelines/`` defines, and how it is found."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Pipeline:
     """One robot, from its bus to its task.
 
     ``pipelines/NAME/__init__.py`` defines ``PIPELINE``, an instance of this class, and imports neither JAX nor MuJoCo.
-    The heavy parts stand in modules beside it and are imported when a stage needs them.
+    Parts that do are in other modules of the folder, which are imported when a stage needs them.
 
     Attributes:
-        name: The folder's name; what the command line calls it.
+        name: The folder's name, used on the command line.
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
-        robot: Module in the package with the robot's parts for the stages (see ``sim2real.stages.robot.Robot``): its
-            functions, or an object ``ROBOT``.
-        scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None draws none.
-        record: Defaults of the stage; its fields become the flags.
+        robot: Module in the package that fulfils ``sim2real.stages.robot.Robot`` by its functions, or has an object
+            ``ROBOT`` that does.
+        scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None: not drawn.
+        record: Defaults of the stage; its fields become flags.
         identify: Defaults of the stage.
         train: Defaults of the stage.
         deploy: Defaults of the stage.
@@ -49,17 +49,17 @@ class Pipeline:
 
     @property
     def folder(self) -> Path:
-        """Where the pipeline's files are."""
+        """The folder of the pipeline's files."""
         return Path(str(importlib.import_module(self.package).__file__)).parent
 
     def load(self, module: str | None = None) -> Any:
-        """Import a module of the pipeline's package; default: the robot's parts, or the ``ROBOT`` that it defines."""
+        """Import a module of the pipeline's package; default: the robot's, or the ``ROBOT`` in it if there is one."""
         found = importlib.import_module(f"{self.package}.{module or self.robot}")
         return found if module else getattr(found, "ROBOT", found)
 
 
 def available() -> dict[str, Any]:
-    """Return the names of all pipelines and where each comes from: entry points, ./pipelines, those of the package."""
+    """Return name -> source of all pipelines: entry points, folders in ./pipelines, and those of the package."""
     found: dict[str, Any] = {}
     for folder in reversed(_folders()):
         found.update({p.parent.name: p.parent for p in sorted(folder.glob("*/__init__.py"))})
@@ -71,7 +71,7 @@ def load_pipeline(name: str) -> Pipeline:
     """Return a pipeline by name.
 
     Raises:
-        UsageError: When there is none of this name; the message lists those that there are.
+        UsageError: When there is no such pipeline, or it does not define a ``PIPELINE`` of this name.
     """
     found = available()
     if name not in found:
@@ -99,7 +99,7 @@ def _folders() -> list[Path]:
 
 
 def _import_folder(folder: Path) -> ModuleType:
-    """Import a pipeline's package under a name of its own, so that no top-level ``pipelines`` is needed."""
+    """Import a pipeline's package as ``sim2real_pipelines.NAME``, so that no top-level ``pipelines`` is needed."""
     parent = "sim2real_pipelines"
     if parent not in sys.modules:
         sys.modules[parent] = ModuleType(parent)
@@ -109,7 +109,7 @@ def _import_folder(folder: Path) -> ModuleType:
     if name in sys.modules:
         if sys.modules[name].__file__ == str(path):
             return sys.modules[name]
-        # Another folder of this name, from another working directory.
+        # A folder of the same name was imported from elsewhere, e.g. another working directory: forget it.
         for stale in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
             del sys.modules[stale]
     spec = importlib.util.spec_from_file_location(name, path, submodule_search_locations=[str(folder)])

@@ -1,4 +1,4 @@
-"""Save what is readable of a damaged log."""
+"""``sim2real log recover``: copies what is readable of a damaged log."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from sim2real.stages.console import note, table, wrote
 
 
 def run(config: RecoverConfig) -> None:
-    """Write the new file, and tell what is in it and what was lost.
+    """Write the new file, and print what it has and what was lost.
 
     Raises:
-        Sim2RealError: When there is no such file, it is no MCAP file, or the new one exists or cannot be written.
+        Sim2RealError: When the file is missing or not an MCAP file, or the new file exists or cannot be written.
     """
     source = config.source
     target = config.out or source.with_name(f"{source.stem}.recovered.mcap")

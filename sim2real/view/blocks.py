@@ -1,4 +1,4 @@
-"""What a page consists of: figures, tables and notes; and how numbers are written in them."""
+"""The parts of a page (figures, tables, notes), and the formatting of numbers in them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-MISSING = "–"  # noqa: RUF001 - a dash, as tables have it
+MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
 _UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_nm": "N m", "_v": "V", "_m": "m", "_s": "s"}
 
 
 @dataclass(frozen=True)
 class FigureBlock:
-    """A figure: its SVG and what to see in it; two narrow ones stand beside each other where there is room."""
+    """A figure.
+
+    Attributes:
+        svg: The figure as SVG.
+        caption: What it shows.
+        narrow: Whether two such figures fit side by side.
+        kind: The kind of block, for the template.
+    """
 
     svg: str
     caption: str
@@ -27,13 +34,13 @@ class TableBlock:
     """A table.
 
     Attributes:
-        caption: What it is about.
-        columns: Headers.
+        caption: What it shows.
+        columns: Headers of the columns.
         rows: Cells as text; the first of each row is its header.
-        text_columns: Indices of columns that are no numbers, aligned left.
-        remarks: For each row a remark, shown small below its header.
-        folded: Whether it is folded away at first.
-        kind: What the template tells blocks apart by.
+        text_columns: Indices of columns with text, which are aligned left.
+        remarks: A remark for each row, shown small below its header.
+        folded: Whether it is collapsed at first.
+        kind: The kind of block, for the template.
     """
 
     caption: str
@@ -47,7 +54,7 @@ class TableBlock:
 
 @dataclass(frozen=True)
 class NoteBlock:
-    """Something the reader has to know first."""
+    """A note that the reader should see first."""
 
     text: str
     kind: str = "note"
@@ -55,7 +62,7 @@ class NoteBlock:
 
 @dataclass(frozen=True)
 class FoldBlock:
-    """Tables that are folded away at first: there for who wants to know."""
+    """Tables with details, collapsed at first."""
 
     caption: str
     tables: Sequence[TableBlock]
@@ -64,7 +71,7 @@ class FoldBlock:
 
 @dataclass(frozen=True)
 class ListBlock:
-    """Sentences below a heading."""
+    """A list of sentences with a heading."""
 
     caption: str
     items: Sequence[str]
@@ -78,7 +85,7 @@ MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
 
 @dataclass(frozen=True)
 class Banner:
-    """A judgement, above everything else of a section: its colour says no more than its sign and its words."""
+    """A verdict at the top of a section; its sign and its words say all that its colour does."""
 
     tone: Tone
     title: str
@@ -92,7 +99,7 @@ class Banner:
 
 @dataclass(frozen=True)
 class Tile:
-    """A number that matters: shown large, at the top."""
+    """An important number, shown large at the top."""
 
     label: str
     value: str
@@ -112,7 +119,7 @@ class Section:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """Write a number with so many significant digits; other values as they are."""
+    """Return a number as text with ``digits`` significant digits; other values as ``str`` does."""
     if value is None:
         return MISSING
     if isinstance(value, bool):
@@ -125,7 +132,7 @@ def number(value: Any, digits: int = 4) -> str:
         return MISSING if math.isnan(value) else ("∞" if value > 0 else "\u2212∞")
     if not value:
         return "0"
-    # Trailing zeros stay: they say how exactly a number is known.
+    # Trailing zeros stay: they show how precisely a number is known.
     text = f"{value:#.{digits}g}".rstrip(".")
     if "e" in text:
         mantissa, exponent = text.split("e")
@@ -134,31 +141,37 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def fixed(value: float | None, decimals: int) -> str:
-    """Write a number with so many decimals."""
+    """Return a number as text with a fixed number of decimals."""
     if value is None or math.isnan(value):
         return MISSING
     return f"{value:.{decimals}f}".replace("-", "\u2212") if math.isfinite(value) else number(value)
 
 
 def interval(low: float | None, high: float | None, digits: int = 4) -> str:
-    """Write an interval."""
+    """Return an interval as text.
+
+    Args:
+        low: Lower end; None: unknown.
+        high: Upper end; None: unknown.
+        digits: Significant digits.
+    """
     return MISSING if low is None or high is None else f"{number(low, digits)} to {number(high, digits)}"
 
 
 def decimals_for(error: float | None, value: float) -> int:
-    """Return with how many decimals a value is worth writing, two digits of its standard error."""
+    """Return the number of decimals that shows two digits of a value's standard error; without one, four digits."""
     if not error or not math.isfinite(error):
         return max(0, 3 - math.floor(math.log10(abs(value)))) if value and math.isfinite(value) else 3
     return min(9, max(0, 1 - math.floor(math.log10(error))))
 
 
 def pretty_unit(unit: str) -> str:
-    """Write a unit, or a formula, with its powers as such."""
+    """Return a unit or a formula with powers as superscripts."""
     return unit.replace("^2", "²").replace("^3", "³") or "1"
 
 
 def spoken(name: str) -> tuple[str, str]:
-    """Return a quantity's name in words, and the unit that it carries: ``angle_rms_rad`` is an angle rms in rad."""
+    """Split a quantity's name into words and unit, e.g. ``angle_rms_rad`` into "angle rms" and "rad"."""
     for suffix, unit in _UNITS.items():
         if name.endswith(suffix):
             return name.removesuffix(suffix).replace("_", " "), unit
@@ -166,7 +179,7 @@ def spoken(name: str) -> tuple[str, str]:
 
 
 def flat(tree: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
-    """Yield dotted name and value of every leaf of nested dicts."""
+    """Yield dotted name and value, as text, of every leaf of nested dictionaries."""
     if isinstance(tree, Mapping) and tree:
         for name, value in tree.items():
             yield from flat(value, f"{prefix}.{name}" if prefix else str(name))

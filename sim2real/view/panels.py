@@ -1,4 +1,4 @@
-"""Panels above each other on an axis of time: what most figures consist of."""
+"""Figures with panels one above the other over a time axis."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, t
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a panel; ``role`` is a name in ``style.ROLES`` and says how it looks."""
+    """One line of a panel; ``role``, a name in ``style.ROLES``, determines its appearance."""
 
     t_s: np.ndarray
     values: np.ndarray
     label: str
     role: str
     held: bool = False
-    """Whether the value holds until the next one: a command."""
+    """Whether each value holds until the next one, like a command; drawn as steps."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Panel:
     """One pair of axes over time.
 
     Attributes:
-        label: Of the vertical axis.
-        lines: What is drawn.
-        title: Above it, if anything.
-        spans: Intervals [s] that are shaded.
-        zoom: An interval [s] that a second column shows closer.
-        framed: Roles of the lines that the vertical axis makes room for; what is beyond is cut. Empty: all.
+        label: Label of the vertical axis.
+        lines: The lines.
+        title: Title; empty for none.
+        spans: Shaded intervals [s].
+        zoom: Interval that a second column shows enlarged [s]; None: none.
+        framed: Roles of the lines that determine the vertical axis' range; other lines may be cut. Empty: all.
     """
 
     label: str
@@ -51,13 +51,13 @@ class Panel:
 
 
 def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held out") -> str:
-    """Draw panels above each other; those that show the same time share its axis.
+    """Draw panels one above the other; panels over the same time share an axis. Returns SVG.
 
     Args:
-        panels: What to draw.
+        panels: The panels.
         name: Name of the figure, unique on its page.
-        label: What it shows, in words.
-        shade: What the legend calls the shaded intervals.
+        label: Description of the figure, for screen readers.
+        shade: Legend of the shaded intervals.
     """
     zooms = {panel.zoom for panel in panels}
     closer = zooms != {None}
@@ -94,13 +94,25 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
 
 
 def with_unit(label: str, units: Mapping[str, str], field: str | None = None) -> str:
-    """Return an axis's label: what it shows, and its unit if that is known."""
+    """Return an axis label with the unit, if that is known.
+
+    Args:
+        label: The label without unit.
+        units: Field -> unit.
+        field: Field that the axis shows; None: ``label``.
+    """
     unit = unit_of(field or label, units)
     return f"{label} [{unit}]" if unit else label
 
 
 def with_gaps(t_s: np.ndarray, values: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Break a line where one piece ends and the next begins."""
+    """Return times and values with a NaN between pieces, so that no line connects them.
+
+    Args:
+        t_s: Times ``(N,)`` [s].
+        values: Values ``(N,)``.
+        piece: Number of the piece that each belongs to, ``(N,)``.
+    """
     cuts = np.flatnonzero(np.diff(piece)) + 1
     return np.insert(t_s.astype(float), cuts, np.nan), np.insert(values.astype(float), cuts, np.nan)
 

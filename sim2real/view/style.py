@@ -1,4 +1,4 @@
-"""How every figure looks, and how it becomes a string of SVG that follows the page's colours."""
+"""The common style of all figures, and their conversion to SVG that uses the page's colours."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-# The page may redefine each colour, for dark mode and for print; alone, a figure shows the value that stands here.
-# The hues are those of Okabe and Ito, darkened until text in them is readable on white.
+# A page may redefine each colour, for dark mode and for print; a figure by itself has the values below. The hues are
+# those of Okabe and Ito, darkened so that text is readable on white.
 INK, MUTED, GRID, SHADE = "#1b2430", "#5c6875", "#d9dfe6", "#eef2f6"
 BLUE, ORANGE, GREEN, PURPLE = "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
 _VARIABLES = {
@@ -31,9 +31,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 WIDTH_IN = 10.5
 
 _RC: dict[str, Any] = {
-    "svg.fonttype": "none",  # text stays text: it can be searched, read aloud and copied
+    "svg.fonttype": "none",  # as text, not as outlines: can be searched, read aloud and copied
     "svg.hashsalt": "sim2real",
-    "text.parse_math": False,  # a $ in a name is a $
+    "text.parse_math": False,  # names may contain a $
     "font.family": "sans-serif",
     "font.size": 8.5,
     "axes.titlesize": 9.0,
@@ -77,7 +77,7 @@ _RC: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Role:
-    """How the line of one voice looks, in every figure the same."""
+    """The appearance of a kind of line, the same in every figure."""
 
     color: str
     dash: Any
@@ -93,35 +93,35 @@ ROLES = {
     "truth": Role(GREEN, DASHES[3], 1.3, 2.0),
     "command": Role(PURPLE, DASHES[0], 1.0, 3.0),
 }
-"""The robot is drawn solid and dark; what a model says is dashed; what is only known in hindsight is thin."""
+"""Name of a kind of line -> its appearance: measurements are solid and dark, results of models dashed."""
 
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Make figures and save them inside of this."""
+    """Apply the style in the block, in which figures must be made and saved."""
     with mpl.rc_context(cast(Any, _RC)):
         yield
 
 
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """Return an empty figure that lays itself out."""
+    """Return an empty figure with automatic layout."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasSVG(figure)
     return figure
 
 
 def to_svg(figure: Figure, name: str, label: str) -> str:
-    """Return a figure as one ``<svg>`` element, for a page or, as it is, for a file.
+    """Return a figure as an ``<svg>`` element, for a page or a file.
 
     Args:
-        figure: The figure; made inside of ``styled()``.
-        name: Prefix of all ids in it, so that several figures fit in one page.
-        label: What it shows, in words, for who cannot see it.
+        figure: The figure, made inside ``styled()``.
+        name: Prefix of all ids in it, which must be unique on a page.
+        label: Description of the figure, for screen readers.
     """
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
-    text = text[text.index("<svg") :].strip()  # without XML declaration and DOCTYPE: neither belongs inside HTML
+    text = text[text.index("<svg") :].strip()  # without XML declaration and DOCTYPE, which HTML does not allow
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
     text = text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1)
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)
@@ -129,13 +129,13 @@ def to_svg(figure: Figure, name: str, label: str) -> str:
 
 
 def legend_above(figure: Figure, entries: Sequence[Artist]) -> None:
-    """Put one legend, in a row, above all panels of a figure."""
+    """Add one legend, in a row, above all panels of a figure."""
     if entries:
         figure.legend(handles=entries, loc="outside upper left", ncols=min(6, len(entries)), borderaxespad=0.2)
 
 
 def plain_log(axis: Axis) -> None:
-    """Number a logarithmic axis without powers: as they are not parsed, they would stand there as source."""
+    """Label a logarithmic axis with plain numbers: powers would appear as TeX source, as it is not parsed."""
     axis.set_major_locator(LogLocator(base=10, subs=(1.0,)))
     low, high = axis.get_view_interval()
     if high < 30 * low:

@@ -1,4 +1,4 @@
-"""Figures and numbers about when things happened: periods, lateness, and who waited for whom."""
+"""Figures and numbers on timing: periods, lateness, and the schedule."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _PERIODS_SHOWN = 4.5
 
 @dataclass(frozen=True)
 class Times:
-    """What one node's steps took, each ``(N,)`` [ms]; ``period`` has one entry less.
+    """Times of one node's N steps [ms].
 
     Attributes:
-        period: From one awakening to the next.
-        lateness: From the start that the rules give to the awakening.
-        computation: From the awakening to the end.
+        period: Shape ``(N - 1,)``: from one wake-up to the next.
+        lateness: Shape ``(N,)``: from the start by the timing rules to the wake-up.
+        computation: Shape ``(N,)``: from the wake-up to the end.
     """
 
     period: np.ndarray
@@ -42,7 +42,7 @@ def times(steps: Steps) -> Times:
 
 
 def in_order(episode: Episode) -> list[str]:
-    """Return the nodes: those with an ``order`` of their own first, then senders before their readers, loops aside."""
+    """Return the nodes' names: those with an ``order`` first, then the others, senders before readers if possible."""
     senders: Mapping[str, set[str]] = {
         n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
     }
@@ -54,11 +54,17 @@ def in_order(episode: Episode) -> list[str]:
         left.remove(ready[0])
     own = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
     place = {n: own[n] if isinstance(own.get(n), int) else math.inf for n in order}
-    return sorted(order, key=lambda n: place[n])  # of equals, as they were
+    return sorted(order, key=lambda n: place[n])  # a stable sort: equal ones keep their order
 
 
 def color_of(episode: Episode, node: str, default: str) -> str:
-    """Return a node's own colour as ``#rrggbb``; ``default`` where it has none that matplotlib knows."""
+    """Return a node's colour as ``#rrggbb``.
+
+    Args:
+        episode: The log, whose metadata may have the node's colour.
+        node: The node.
+        default: Returned if the node has no colour that matplotlib knows.
+    """
     own = episode.metadata.get("graph", {}).get(node, {}).get("color")
     return to_hex(own) if isinstance(own, str) and is_color_like(own) else default
 
@@ -70,7 +76,7 @@ def slowest_period_s(episode: Episode) -> float:
 
 
 def histograms(episode: Episode, name: str) -> str:
-    """Draw how period, lateness, computation and the age of inputs are distributed, a row for each node."""
+    """Draw histograms of period, lateness, computation and age of inputs, one row per node."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n]) > 1]
     ages = {n: 1e3 * oldest_input(episode, n) for n in nodes}
     oldest = max((float(a.max()) for a in ages.values() if a.size), default=0.0)
@@ -103,7 +109,7 @@ def histograms(episode: Episode, name: str) -> str:
 
 
 def schedule(episode: Episode, name: str) -> str:
-    """Draw who computed and who waited: in the middle of the episode, and around the step that woke latest."""
+    """Draw when nodes computed and waited, in the middle of the episode and around the latest wake-up."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
     length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
     late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
@@ -147,8 +153,8 @@ def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float], color:
 
 
 def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:
-    """Draw the steps of one node that overlap an interval [us], computing in ``color``."""
-    # A step is due before the last one has ended when that one overran: it waits from there on.
+    """Draw the steps of one node that overlap an interval [us]; computation is drawn in ``color``."""
+    # After an overrun a step is due before the previous one has ended; its waiting is drawn from that end on.
     free = np.concatenate([[0], steps.end[:-1]])
     due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
     near = (steps.end >= begin) & (due_at <= end)
@@ -156,7 +162,7 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: s
     kinds: tuple[tuple[np.ndarray, np.ndarray, dict[str, Any]], ...] = (
         (due, start, {"facecolor": "none", "edgecolor": MUTED, "hatch": "////", "lw": 0.6}),
         (start, woken, {"facecolor": ORANGE}),
-        (woken, done, {"facecolor": color, "edgecolor": color, "lw": 0.8}),  # the edge: a short step stays visible
+        (woken, done, {"facecolor": color, "edgecolor": color, "lw": 0.8}),  # edge: keeps short steps visible
     )
     for first, last, look in kinds:
         wide = last > first
@@ -164,7 +170,7 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: s
 
 
 def _arrows(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: float) -> None:
-    """Draw the messages between an interval's steps, from the sender's end to the reader's start."""
+    """Draw the messages in an interval as arrows, from the sender's end to the reader's start."""
     graph = episode.metadata.get("graph", {})
     for (node, given), messages in episode.messages.items():
         sender = graph.get(node, {}).get("inputs", {}).get(given, {}).get("from")
