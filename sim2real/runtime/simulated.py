@@ -58,7 +58,7 @@ class _Link:
         return self._told[self._told_bounds[k] : self._told_bounds[k + 1]].tolist()
 
     def put(self, m: int, leaves: list[np.ndarray]) -> None:
-        """Keep message ``m``, if a step will consume it."""
+        """Keep message ``m`` if a step will consume it."""
         if self.seq_in[m] >= 0:
             self.waiting[m] = leaves
 
