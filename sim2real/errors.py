@@ -1,4 +1,4 @@
-"""What can go wrong, and the exit code that each kind ends a command with."""
+"""The errors of sim2real; each kind has its exit code."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ DEADLINE = 5
 
 
 class Sim2RealError(ValueError):
-    """A failure with a message for the user: what happened, which name, what was available.
+    """An error with a message for the user: what happened, to which name, and what was available.
 
     Args:
         message: What happened.
-        hint: What to do next; printed on a line of its own.
+        hint: What to do next; printed as a separate paragraph.
+
+    Attributes:
+        exit_code: Exit code of a command that ends with this error.
     """
 
     exit_code: int = ERROR
@@ -25,19 +28,19 @@ class Sim2RealError(ValueError):
         self.hint = hint
 
     def __str__(self) -> str:
-        """Return the message, followed by the hint on a paragraph of its own."""
+        """Return the message, followed by the hint as a separate paragraph."""
         message = super().__str__()
         return f"{message}\n\nhint: {self.hint}" if self.hint else message
 
 
 class UsageError(Sim2RealError):
-    """The command or its configuration makes no sense (exit code 2)."""
+    """A command, its configuration or an argument is wrong (exit code 2)."""
 
     exit_code = USAGE
 
 
 class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the program
-    """A limit, a watchdog or a value that is no number stopped the robot (exit code 3)."""
+    """The robot was stopped by a limit, a watchdog or a value that is not finite (exit code 3)."""
 
     exit_code = SAFETY_STOP
 

@@ -16,7 +16,7 @@ def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, Bas
         nodes: The nodes, as a list or by name.
 
     Raises:
-        UsageError: When an entry is no node, two nodes have the same name, or a key is not its node's name.
+        UsageError: When an entry is not a node, two nodes have the same name, or a key is not its node's name.
     """
     if not isinstance(nodes, Mapping | Sequence) or isinstance(nodes, str):
         raise UsageError(

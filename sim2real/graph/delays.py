@@ -222,9 +222,9 @@ class TrainableDist(Base, DelayDistribution):
 
         - ``zoh``: the last ``window`` messages that have arrived.
         - ``linear``: linear interpolation between messages over their arrival times. The newest entry is the value at
-          the step's start, between the last message that has arrived and the next one, which has not. Each entry
-          before it lies as far back as its message arrived before the newest one. Empty slots hold the default output,
-          which counts as having arrived at time 0.
+          the step's start, between the last message that has arrived and the next one, which has not. The entries
+          before it are values at earlier times: as much earlier as their messages arrived before the newest one. An
+          empty slot has the default output, which counts as having arrived at time 0.
         - ``linear_real_only``: the same, but the default output counts as having arrived infinitely long ago: the
           first message's value is then used even before it arrives.
         - ``zoh_mean``: the mean over the reader's period of the message that holds.

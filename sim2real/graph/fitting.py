@@ -25,7 +25,7 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
         A constant, or a ``distrax.MixtureSameFamily``, clipped at 0 when drawn from.
 
     Raises:
-        UsageError: When there are too few samples or they are no delays.
+        UsageError: When there are too few samples, or one is negative or not finite.
     """
     x = _checked(samples)
     if x.std() < _CONSTANT_S:
@@ -59,7 +59,7 @@ def resample(samples: np.ndarray) -> EmpiricalDist:
         samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
 
     Raises:
-        UsageError: When they are no delays.
+        UsageError: When there are fewer than 2 samples, or one is negative or not finite.
     """
     x = _checked(samples)
     spread = x - x.mean()

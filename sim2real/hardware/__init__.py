@@ -1,1 +1,1 @@
-"""Servos on a bus: the owner of the port, an emulator that takes any plant, and the safety gate for commands."""
+"""Servos on a bus: driver, emulator with any plant, safety gate and guardian."""

@@ -31,7 +31,7 @@ _INDEX_BYTES = struct.Struct("<2xI")
 _LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
 _CHUNK_NAME_AT = 37
 _METADATA_NAME_AT = _PREFIX.size
-# LZ4 compresses at most 255 to 1. A chunk that claims more is no log, and decompressing it could fill the memory.
+# LZ4 compresses at most 255 to 1. A chunk that claims more is not genuine, and decompressing it could fill the memory.
 _TIGHTEST = 256
 # Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
 _SMALL_BYTES = 64 * 1024
