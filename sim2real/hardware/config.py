@@ -16,16 +16,13 @@ class GateLimits:
     slew_per_s: float = 400.0
     """Largest rate of change of a command [the actuator's unit per second]."""
     command_timeout_s: float = 0.1
-    """Age after which a command is replaced: by zero volts, or, in position mode, by the last one, so that the servos
-    hold their position [s]."""
+    """Age from which a command is replaced, by zero volts or, in position mode, by the last one (servos hold) [s]."""
     max_speed_rad_s: float = 60.0
     """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
     stuck_effort: float = 0.2
-    """Fraction of a joint's torque: if a joint that is driven with more than this in both directions does not move, the
-    robot is stopped."""
+    """A joint driven both ways with more than this fraction of its torque must move, or the robot is stopped [1]."""
     servo_watchdog_s: float = 0.1
-    """Longest time without an instruction on the bus; after it the guardian takes the torque off, and servos whose own
-    watchdog stops them stop [s, rounded to 20 ms]."""
+    """Longest silence on the bus; after it the guardian takes the torque off, and the servos' watchdogs trip [s]."""
 
     def __post_init__(self) -> None:
         """Check that all limits are in their ranges."""

@@ -55,8 +55,7 @@ class PPOConfig:
     eval_envs: int = 128
     """Number of copies in an evaluation; each plays one episode without exploration noise."""
     eval_steps: int = 250
-    """Number of rows of an evaluation; no episode may be longer. The first training episodes are cut after different
-    numbers of rows up to this one, so that the copies are not all at the same time of their episodes."""
+    """Rows of an evaluation; no episode may be longer. The first training episodes are staggered over as many rows."""
 
     def __post_init__(self) -> None:
         """Check that all values are in their ranges."""
