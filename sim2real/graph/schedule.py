@@ -27,9 +27,6 @@ def slot(node: BaseNode, k: np.ndarray | int, phase: int | None = None) -> np.nd
         node: The node.
         k: Number of the step, from 0; or an array of them.
         phase: The node's phase [ticks]; None: computed.
-
-    Returns:
-        int64, of the shape of ``k``.
     """
     offset = phase_ticks(node) if phase is None else phase
     # Multiply before dividing: exact halves stay exact and are rounded up.
@@ -87,9 +84,6 @@ def eligible(connection: Connection, received: np.ndarray, first_seq: int = 0) -
         connection: The connection.
         received: Shape ``(..., M)``: arrivals [ticks].
         first_seq: Sequence number of the first message along the last axis.
-
-    Returns:
-        int64, of the shape of ``received``.
     """
     received = np.asarray(received, np.int64)
     if connection.averaged:
@@ -283,10 +277,7 @@ def _run_in_order(
     vertices: dict[str, Vertex],
     received: dict[tuple[str, str], np.ndarray],
 ) -> None:
-    """Compute starts and ends of all steps (rules 3 to 5); fills ``vertices`` and ``received``.
-
-    Nodes without blocking inputs depend on no message and come first; the others follow step by step, in slot order.
-    """
+    """Fill ``vertices`` and ``received`` (rules 3 to 5): nodes without blocking inputs first, others in slot order."""
     linked = []
     for name, busy in delays.items():
         if any(c.blocking for c in nodes[name].inputs.values()):
@@ -356,10 +347,7 @@ class _BlockingRun:
         self.vertex.start[:, k], self.vertex.end[:, k] = begin, self.previous
 
     def _last_arrival(self, connection: Connection, upto: int) -> np.ndarray:
-        """Return the last arrival [ticks] among messages up to number ``upto``; 0 if the step waits for no new one.
-
-        ``NEVER`` if the sender does not send that many.
-        """
+        """Return the last arrival [ticks] of messages before ``upto``; 0: no new ones; ``NEVER``: fewer are sent."""
         key = (self.node.name, connection.name)
         ends = self.vertices[connection.output_node.name].end
         if key not in self.received:

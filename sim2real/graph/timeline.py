@@ -26,7 +26,7 @@ class Vertex:
     """The steps of one node; times in ticks [us] from the episode's start.
 
     Attributes:
-        start: Shape ``(E, N)``, int64. Entries after an episode's last step are padding, in increasing order.
+        start: Shape ``(E, N)``, int64. Entries after an episode's last step are padding and do not decrease.
         end: Shape ``(E, N)``, int64.
         count: Shape ``(E,)``: how many steps each episode has.
     """

@@ -45,7 +45,7 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
     dist = connection.delay_dist
     if not isinstance(dist, TrainableDist):
         return np.zeros(reader.start.shape, bool)
-    # The newest message that is read at the largest delay (for a mean: that holds at the start) if all are on time.
+    # The newest message that the window can offer at the largest delay (for a mean: the one that holds at the start).
     oldest = newest_message(edge, reader) - (connection.total_window - connection.window)
     if not (edge.seq_in.shape[1] and reader.start.shape[1]):
         return np.zeros(reader.start.shape, bool)
