@@ -218,7 +218,15 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
 
 
 def at_delay(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex, delay: int) -> Edge:
-    """Return an edge whose delay is trainable as it is at another delay [ticks]; what is lost stays lost."""
+    """Return an edge whose delay is trainable as it is at another delay; what is lost stays lost.
+
+    Args:
+        connection: Whose messages they are.
+        edge: The edge at any delay.
+        reader: When the reader's steps run.
+        sender: When the sender's steps end.
+        delay: The delay [ticks].
+    """
     sent = sender.end[:, : edge.received.shape[1]]
     received = np.where(edge.received >= NEVER, NEVER, np.maximum.accumulate(sent + delay, axis=1))
     return Edge(received, consumer(connection, received, reader, sender), edge.sender)
