@@ -64,7 +64,8 @@ def fitted(request):
             # A little damping: where initial states are free, nothing fixes the shift between the delays.
             return z - jnp.linalg.solve(J.T @ J + 10.0 * jnp.eye(z.size), J.T @ r), None
 
-        z = jax.lax.scan(step, z_true, length=4)[0]
+        # From the truth; known initial states leave little to iterate on.
+        z = jax.lax.scan(step, z_true, length=2 if known else 4)[0]
         return z, *problem.linearised(z, problem.sensitivities(z, data=data), data)
 
     z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40))(data)
@@ -144,10 +145,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
         total += abs(error) <= 1.96 * uncertainty.sum_of(spread, delays)
         off.append(error)
     shares = {n: covered[names.index(n)] for n in GROUPS} | {"round trip": total}
-    # Released at known places, segments differ much in what they tell, and the bootstrap over them widens standard
-    # errors to 1.17 times what estimates really vary by: 391 of 400 are to be expected, give or take 3.
-    most = 396 if problem.config.initial_state == "rest" else 392
-    assert all(368 <= n <= most for n in shares.values()), {n: int(v) for n, v in shares.items()}
+    assert all(368 <= n <= 392 for n in shares.values()), {n: int(v) for n, v in shares.items()}
+    # Each delay by itself may be anywhere that a shift of time can reach: its interval holds the truth more often.
+    assert np.all(covered[delays] >= 368), covered[delays]
     assert np.max(np.abs(off)) < 1e-3
 
 

@@ -43,9 +43,9 @@ def test_a_linear_model_with_white_noise_has_the_textbooks_covariance():
     flat = X.reshape(-1, 3)
     expected = rss / (len(flat) - 3) * np.linalg.inv(flat.T @ flat)
     assert found.inflation == pytest.approx(1.0, abs=0.1)
-    assert np.all(found.bootstrap >= 1.0)
-    assert np.all(found.bootstrap < 1.4)
-    widened = expected * found.inflation * np.outer(found.bootstrap, found.bootstrap)
+    assert np.all(found.widening >= 1.0)
+    assert np.all(found.widening < 1.4)
+    widened = expected * found.inflation * np.outer(found.widening, found.widening)
     np.testing.assert_allclose(found.covariance, widened, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(found.scale_covariance, widened, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(found.standard_error, np.sqrt(np.diag(widened)), rtol=1e-4)
@@ -65,7 +65,7 @@ def test_few_measurements_get_the_quantile_of_student():
     found, b, _ = regression(X, y)
     line = stats.linregress(x, y.ravel())
     assert found.inflation == 1.0  # signs alternate
-    np.testing.assert_array_equal(found.bootstrap, 1.0)  # a block is too few
+    np.testing.assert_array_equal(found.widening, 1.0)  # a block is too few
     np.testing.assert_allclose(found.standard_error, [line.intercept_stderr, line.stderr], rtol=1e-5)
     np.testing.assert_allclose((found.high - b) / found.standard_error, stats.t.ppf(0.975, 7), rtol=1e-5)
 
@@ -115,8 +115,37 @@ def test_what_differs_from_block_to_block_widens():
 
     actual, claimed, first = spread_of_estimates(make)
     assert actual == pytest.approx(np.sqrt(1 / 30 + 1 / 1500), rel=0.2)
-    assert first.bootstrap[0] > 2.0
+    assert first.widening[0] > 2.0
     assert claimed == pytest.approx(actual, rel=0.2)
+
+
+@pytest.fixture
+def uneven():
+    """Regressors ``(S, C, F, P)`` of ten segments, of which some say much more than others."""
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(10, 60, 1, 2)) * np.exp(rng.normal(0.0, 0.6, (10, 1, 1, 1)))
+
+
+def test_intervals_of_a_right_model_are_not_wider_for_few_blocks_that_differ(uneven):
+    rng = np.random.default_rng(1)
+    found = [regression(uneven, rng.normal(size=uneven.shape[:-1])) for _ in range(300)]
+    widening, off = np.stack([u.widening for u, _, _ in found]), np.stack([b for _, b, _ in found])
+    reach = np.stack([(u.high - u.low) / 2 for u, _, _ in found])
+    assert np.mean(widening > 1.0) < 0.2
+    assert np.median(reach, axis=0) == pytest.approx(1.96 * off.std(axis=0), rel=0.1)
+    assert np.mean(np.abs(off) <= reach) == pytest.approx(0.95, abs=0.025)
+
+
+def test_intervals_of_a_wrong_model_widen_with_few_blocks_too(uneven):
+    """Gains differ from segment to segment: the linearised intervals hold the truth in half of all recordings."""
+    rng = np.random.default_rng(1)
+    gains = 0.3 * rng.normal(size=(300, 10, 1, 1, 2))
+    made = [rng.normal(size=uneven.shape[:-1]) + np.sum(g * uneven, axis=-1) for g in gains]
+    found = [regression(uneven, y) for y in made]
+    held = [(u.low <= 0.0) & (u.high >= 0.0) for u, _, _ in found]
+    narrow = [np.abs(b) <= 1.96 * u.standard_error / u.widening for u, b, _ in found]
+    assert np.mean(narrow) < 0.7
+    assert np.mean(held) > 0.88
 
 
 def test_long_segments_are_many_blocks():
@@ -124,7 +153,7 @@ def test_long_segments_are_many_blocks():
     rng = np.random.default_rng(0)
     y = (rng.normal(size=(30, 50, 1)) + rng.normal(size=(30, 1, 1))).reshape(1, 1500, 1)
     found, _, _ = regression(np.ones((*y.shape, 1)), y, segment_s=30.0)
-    assert found.bootstrap[0] > 2.0
+    assert found.widening[0] > 2.0
 
 
 def test_what_nothing_determines_gets_the_width_of_its_bounds():
@@ -211,7 +240,7 @@ def test_the_sum_of_delays_is_known_and_each_is_not(delayed):
     r = delayed.at.residuals
     free = 3 + 2 * 20  # and the initial states
     information = flat.T @ flat * (r.size - free) / np.sum(r**2) / found.inflation + np.diag([0.0, 12.0 / 0.05**2])
-    alone = np.sqrt(np.linalg.inv(information)[1, 1]) * found.bootstrap[2]
+    alone = np.sqrt(np.linalg.inv(information)[1, 1]) * found.widening[2]
     assert sum_of(found, [1, 2]) == pytest.approx(alone, rel=0.01)
     assert found.low[1] == pytest.approx(0.0, abs=2e-3)
     assert found.high[1] == pytest.approx(0.045, abs=5e-3)
