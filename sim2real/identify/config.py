@@ -46,6 +46,9 @@ class FitConfig:
     """Length of the segments on which a last refinement is made [s]; 0 leaves it out."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
     """Derivatives: forward through the graph, or finite differences; 'auto' takes those where a node has none."""
+    difference: float = 3e-3
+    """Step of finite differences; 1 covers about a quarter of what the bounds admit. Small ones are exact, larger ones
+    look past the kinks that stick and slip make."""
     seed: int = 0
     """Seed of the search."""
 
@@ -60,6 +63,8 @@ class FitConfig:
             )
         if self.generations == 0 and self.refine == 0:
             raise UsageError("generations and refine are both 0: nothing would be identified")
+        if not 1e-4 <= self.difference <= 1.0:
+            raise UsageError(f"difference must lie in [0.0001, 1], got {self.difference}")
         if not (self.reach > 0.0 and self.std > 0.0):
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
         if not 0.0 <= self.skip_s <= 10.0:

@@ -266,9 +266,9 @@ class Problem:
         """Measured numbers in the fitted segments."""
         return int((np.asarray(self._ts)[self.train] >= self._from_s).sum()) * len(self.fields)
 
-    def differentiable(self, f: Callable[[Any], Any], step: float = 3e-3) -> Callable[[Any], Any]:
-        """Return a function of one array with a derivative: its own, or finite differences with a step."""
-        return f if self.forward else finite_differences(f, step)
+    def differentiable(self, f: Callable[[Any], Any], step: float | None = None) -> Callable[[Any], Any]:
+        """Return a function of one array with a derivative: its own, or finite differences; default: as configured."""
+        return f if self.forward else finite_differences(f, step or self.config.difference)
 
     def _has_derivative(self) -> bool:
         """Return whether every node can be differentiated: a callback to Python, say, cannot."""

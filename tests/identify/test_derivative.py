@@ -1,11 +1,16 @@
 """Derivatives that are not traced: finite differences, and a Jacobian that is kept."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2real.errors import UsageError
+from sim2real.identify.config import FitConfig
 from sim2real.identify.derivative import by_jacobian, finite_differences
+from sim2real.identify.problem import Problem
 
 POINT = jnp.array([0.4, -0.7, 1.1])
 
@@ -85,3 +90,15 @@ def test_the_kept_jacobian_is_the_linearisation():
 def test_the_kept_jacobian_of_finite_differences():
     found = jax.jacfwd(by_jacobian(finite_differences(outside)))(POINT)
     np.testing.assert_allclose(found, jax.jacfwd(smooth)(POINT), rtol=2e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("step", "slope"), [(3e-3, 1.0), (0.5, 0.2)])
+def test_a_wide_difference_looks_past_a_kink(step, slope):
+    problem = SimpleNamespace(forward=False, config=FitConfig(difference=step))
+    differentiable = Problem.differentiable(problem, jnp.abs)
+    assert jax.jacfwd(differentiable)(jnp.array([0.1]))[0, 0] == pytest.approx(slope, rel=1e-3)
+
+
+def test_a_difference_of_nothing_is_refused():
+    with pytest.raises(UsageError, match="difference must lie in"):
+        FitConfig(difference=0.0)
