@@ -29,7 +29,11 @@ class Bench:
 BENCHES = {
     "arm": Bench("arm", "the arm's whole run, or its training alone", (*_STAGES, "pipelines/arm")),
     "async": Bench("asynchronous", "the simulated clock's speed, and the wall clock's lateness", _GRAPH),
-    "compose": Bench("compose", "worlds from parts against dm_control and bare MJX", ("sim2real/composer",)),
+    "compose": Bench(
+        "compose",
+        "worlds from parts against dm_control and bare MJX",
+        ("sim2real/composer", "scripts/benches/compose_step.py"),
+    ),
     "demo": Bench(
         "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")
     ),

@@ -6,21 +6,17 @@ The world is 20 robots with six links each, free to fall over one another. Witho
 from __future__ import annotations
 
 import argparse
-import importlib
-import importlib.util
 import sys
-import time
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from benches.compose_step import LINKS, kit, kits, robot, step
 from benches.figures import compare, medians, row
 
 PARTS = ("build", "reset", "step", "steps", "engines", "speed")
-ENTITIES, LINKS = 20, 6
+ENTITIES = 20
 SCENES = {"contact_free": "<= 1e-10", "contacts": "<= 1e-6"}
 """Where MJX is compared with C, and how near it should come."""
 QUICK = {
@@ -32,36 +28,6 @@ QUICK = {
     "resets": 1,
     "scenes": ["contact_free"],
 }
-
-
-def kit(package: str) -> Any:
-    """Return the composer and the models of ``sim2real`` or ``dm_control``."""
-    models = "sim2real.composer.mjcf" if package == "sim2real" else "dm_control.mjcf"
-    return SimpleNamespace(
-        composer=importlib.import_module(f"{package}.composer"),
-        mjcf=importlib.import_module(models),
-        observable=importlib.import_module(f"{package}.composer.observation.observable"),
-    )
-
-
-def kits() -> dict[str, Any]:
-    """Return ours and, where it is installed, dm_control's."""
-    packages = ("sim2real", "dm_control")
-    return {p: kit(p) for p in packages if importlib.util.find_spec(p)}
-
-
-def robot(k: Any, links: int = LINKS, collide: bool = True) -> Any:
-    """Return a chain of links with a position servo at every joint."""
-    root = k.mjcf.RootElement(model="robot")
-    body = root.worldbody
-    for i in range(links):
-        body = body.add("body", name=f"link{i}", pos=[0, 0, 0.2 * (i > 0)])
-        axis = [0, 1, 0] if i % 2 else [1, 0, 0]
-        body.add("joint", name=f"j{i}", type="hinge", axis=axis, damping=0.05, frictionloss=0.02, armature=0.01)
-        touch = {} if collide else {"contype": 0, "conaffinity": 0}
-        body.add("geom", name=f"g{i}", type="capsule", fromto=[0, 0, 0, 0, 0, 0.2], size=[0.02], mass=0.2, **touch)
-        root.actuator.add("position", name=f"j{i}", joint=f"j{i}", kp=2)
-    return k.composer.ModelWrapperEntity(root)
 
 
 def world(k: Any, entities: int = ENTITIES) -> Any:
@@ -123,81 +89,6 @@ def reset(repeats: int, row_of: int) -> list[dict[str, Any]]:
             theirs = ms["dm_control", every]
             text = f"dm_control: {theirs:.3g} ms, {told}" + ("" if every else ": MuJoCo alone takes nearly all of it")
             rows.append(row(f"compose/{name}/over_dm_control", round(theirs / mine, 1), "1", text, ">= 100"))
-    return rows
-
-
-def push(k: Any, camera: bool, shadows: bool = True) -> Any:
-    """Return a task with what tasks have: an arm on a floor, observables of which one is late, hooks, a reward."""
-    arm = robot(k)
-    joints, tip = arm.mjcf_model.find_all("joint"), arm.mjcf_model.find("body", f"link{LINKS - 1}")
-    actuators = arm.mjcf_model.find_all("actuator")
-    gyro = arm.mjcf_model.sensor.add("gyro", site=tip.add("site", name="tip"))
-
-    class Push(k.composer.Task):
-        """Move the tip of the arm with little effort."""
-
-        def __init__(self) -> None:
-            self._arena, self._effort = k.composer.Arena(), 0.0
-            model = self._arena.mjcf_model
-            model.option.noslip_iterations = 0
-            model.worldbody.add("geom", type="plane", size=[2, 2, 0.1])
-            model.worldbody.add("light", pos=[0, 0, 4])
-            eye = model.worldbody.add("camera", pos=[0, -2, 1], xyaxes=[1, 0, 0, 0, 0.4, 1])
-            if not shadows:
-                model.visual.quality.shadowsize = 0
-            self._arena.attach(arm)
-            feature, add = k.observable.MJCFFeature, arm.observables.add_observable
-            add("angles", feature("qpos", joints, delay=3, buffer_size=2))
-            add("speeds", feature("qvel", joints))
-            add("gyro", feature("sensordata", gyro, update_interval=2, buffer_size=4, aggregator="mean"))
-            add("tip", feature("xpos", tip))
-            if camera:
-                add("eye", k.observable.MJCFCamera(eye, height=48, width=64))
-            self.set_timesteps(0.02, 0.004)
-
-        @property
-        def root_entity(self) -> Any:
-            return self._arena
-
-        def initialize_episode(self, physics: Any, random_state: Any) -> None:
-            physics.bind(joints).qpos = random_state.uniform(-0.1, 0.1, LINKS)
-            self._effort = 0.0
-
-        def after_substep(self, physics: Any, random_state: Any) -> None:
-            self._effort += np.abs(physics.bind(joints).qvel * physics.bind(actuators).force).sum()
-
-        def get_reward(self, physics: Any) -> Any:
-            return physics.bind(tip).xpos[2] - 0.01 * self._effort
-
-    return Push()
-
-
-def step(repeats: int, steps_in_a_row: int) -> list[dict[str, Any]]:
-    """Return how long control steps of a task take, in processor time: with a camera as well, where there is OpenGL."""
-    rows = []
-    for name, count, camera, shadows, goal in (
-        ("step", steps_in_a_row, False, True, ">= 1.3"),
-        ("camera", max(1, steps_in_a_row // 40), True, True, ">= 1.2"),
-        ("camera_without_shadows", max(1, steps_in_a_row // 10), True, False, ">= 1.2"),
-    ):
-        programs: dict[str, Callable[[], Any]] = {}
-        try:
-            for package, k in kits().items():
-                env = k.composer.Environment(push(k, camera, shadows), random_state=0)
-                env.reset()
-                programs[package] = lambda env=env, count=count: [env.step(np.full(LINKS, 0.3)) for _ in range(count)]
-            ms = {p: 1e3 * s / count for p, s in medians(programs, repeats, time.process_time).items()}
-        except (mujoco.FatalError, ImportError, RuntimeError) as error:
-            print(f"no images here: {error}", file=sys.stderr)
-            break  # a second attempt would end the process
-        told = "a control step of five physics steps, an arm with four observables, processor time"
-        told += ", and an image of 48 x 64" if camera else ""
-        rows.append(row(f"compose/{name}_ms", round(ms["sim2real"], 3), "ms", told))
-        if "dm_control" in ms:
-            over = round(ms["dm_control"] / ms["sim2real"], 2)
-            rows.append(
-                row(f"compose/{name}/over_dm_control", over, "1", f"dm_control: {ms['dm_control']:.3g} ms", goal)
-            )
     return rows
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ import numpy as np
 from sim2real.composer import layout
 from sim2real.composer.binding import Binding, EmptyBinding, Staleness
 from sim2real.composer.element import as_elements
+from sim2real.composer.engine import Camera, TextOverlay
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.named import Named
-from sim2real.composer.rendering import Renderers
+from sim2real.composer.rendering import Graphics
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
@@ -80,6 +81,7 @@ class Physics:
     Attributes:
         np: The module that computes with this engine's arrays: numpy.
         variables: What tasks keep from hook to hook during an episode: name -> array. Emptied by ``reset``.
+        graphics: What draws images of it.
     """
 
     np: Any = np
@@ -100,7 +102,7 @@ class Physics:
         self.data = DataView(data)
         self.named = Named(model, model, self.data.ptr)
         self._bindings: dict[Any, Any] = {}
-        self._renderers = Renderers(model)
+        self.graphics = Graphics(model)
         self.staleness = Staleness()
         self._warnings = self.data.ptr.warning.number
         self._warned = self._warnings.tobytes()
@@ -333,14 +335,20 @@ class Physics:
         height: int = 240,
         width: int = 320,
         camera_id: int | str = -1,
+        overlays: Sequence[TextOverlay] = (),
         depth: bool = False,
         segmentation: bool = False,
         scene_option: Any = None,
         render_flag_overrides: Mapping[Any, bool] | None = None,
+        scene_callback: Callable[[Physics, Any], None] | None = None,
     ) -> np.ndarray:
-        """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``."""
-        given = (depth, segmentation, scene_option, render_flag_overrides)
-        return self._renderers.render(self.data.ptr, (height, width), camera_id, *given)
+        """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
+
+        See ``engine.Camera`` and its ``render``.
+        """
+        scene = None if scene_callback else self.graphics.scene()  # what a callback changes is not for the next image
+        camera = Camera(self, height, width, camera_id, scene_callback=scene_callback, scene=scene)
+        return camera.render(overlays, depth, segmentation, scene_option, render_flag_overrides)
 
     @property
     def contexts(self) -> None:
@@ -349,7 +357,7 @@ class Physics:
 
     def free(self) -> None:
         """Drop the model and the state."""
-        self._renderers.close()
+        self.graphics.close()
         for binding in self._bindings.values():
             binding.free()
         self._bindings.clear()

@@ -1,9 +1,11 @@
-"""Images of a model and its state."""
+"""OpenGL for the images of a model: contexts, what was uploaded to them, and pixels."""
 
 from __future__ import annotations
 
+import atexit
+import functools
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,15 +13,60 @@ import numpy as np
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
-_UPLOADED = ("hfield_data", "tex_data", "mesh_vert")
-"""What a renderer copies to the graphics device when it is made."""
+_UPLOADED = {
+    "hfield_data": ("nhfield", "mjr_uploadHField"),
+    "tex_data": ("ntex", "mjr_uploadTexture"),
+    "mesh_vert": ("nmesh", "mjr_uploadMesh"),
+}
+"""What a context has a copy of: the model's array -> how many objects it holds, and what uploads one of them."""
+_ABANDONED: list[Any] = []
+"""Contexts of MuJoCo in threads that are no more. Their destructors would free the objects of whichever context is
+current; OpenGL frees theirs itself."""
 
 
-class Renderers:
-    """Renders images with one ``mujoco.Renderer`` for each size, kept from image to image: making one takes far longer.
+class _Context:
+    """What one thread draws a model with, into a buffer of the model's ``offwidth`` and ``offheight``.
 
-    One is made anew when the model's height fields, textures or meshes have changed since, and for every thread, as
-    the contexts of the graphics device belong to threads.
+    dm_control has one for all sizes of images as well: its shadow map alone takes 64 MB.
+    """
+
+    def __init__(self, model: Any) -> None:
+        size = model.vis.global_
+        self._gl = mj.GLContext(size.offwidth, size.offheight)
+        self._gl.make_current()
+        self.mujoco = mj.MjrContext(model, int(mj.mjtFontScale.mjFONTSCALE_150))
+        mj.mjr_setBuffer(int(mj.mjtFramebuffer.mjFB_OFFSCREEN), self.mujoco)
+        self.mujoco.readDepthMap = mj.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._uploaded = {name: getattr(model, name).copy() for name in _UPLOADED}
+        atexit.register(self.close)  # after the display was opened, so that it runs before that is closed
+
+    def update(self, model: Any) -> None:
+        """Make this the thread's context and bring it up to date with the model."""
+        self._gl.make_current()
+        size = model.vis.global_.offwidth, model.vis.global_.offheight
+        if size != (self.mujoco.offWidth, self.mujoco.offHeight):
+            mj.mjr_resizeOffscreen(*size, self.mujoco)
+        for name, (count, upload) in _UPLOADED.items():
+            now = getattr(model, name)
+            if not np.array_equal(now, self._uploaded[name]):
+                for i in range(getattr(model, count)):
+                    getattr(mj, upload)(model, self.mujoco, i)
+                self._uploaded[name][:] = now
+
+    def close(self) -> None:
+        """Let go of the graphics device."""
+        atexit.unregister(self.close)
+        try:
+            self._gl.make_current()
+        except Exception:  # each backend of MuJoCo has errors of its own: another thread did not let go of it
+            _ABANDONED.append(self.mujoco)
+        else:
+            self.mujoco.free()
+        self._gl.free()
+
+
+class Graphics:
+    """Draws scenes of a model, with a context and a scene for every thread: those of OpenGL belong to threads.
 
     Args:
         model: The ``mujoco.MjModel``.
@@ -27,73 +74,110 @@ class Renderers:
 
     def __init__(self, model: Any) -> None:
         self._model = model
-        self._kept: dict[tuple[int, int, int], tuple[Any, list[np.ndarray]]] = {}
+        self._contexts: dict[int, _Context] = {}
+        self._scenes: dict[int, Any] = {}
 
-    def _renderer(self, height: int, width: int) -> Any:
-        key = (threading.get_ident(), height, width)
-        renderer, uploaded = self._kept.get(key, (None, []))
-        fields = [getattr(self._model, name) for name in _UPLOADED]
-        if renderer is not None and not all(map(np.array_equal, fields, uploaded)):
-            renderer.close()
-            renderer = None
-        if renderer is None:
-            renderer = mj.Renderer(self._model, height, width)
-            self._kept[key] = renderer, [field.copy() for field in fields]
-        return renderer
+    def scene(self) -> Any:
+        """Return the thread's ``MjvScene``: making one takes as long as drawing a small image without shadows."""
+        thread = threading.get_ident()
+        if thread not in self._scenes:
+            self._scenes[thread] = new_scene(self._model)
+        return self._scenes[thread]
 
-    def render(
+    def draw(
         self,
-        data: Any,
+        scene: Any,
         size: tuple[int, int],
-        camera: int | str,
+        overlays: Sequence[Any] = (),
+        flags: Mapping[Any, bool] | None = None,
         depth: bool = False,
         segmentation: bool = False,
-        scene_option: Any = None,
-        flags: Mapping[Any, bool] | None = None,
     ) -> np.ndarray:
-        """Return an image.
+        """Return an image of a scene.
 
         Args:
-            data: The ``mujoco.MjData``.
+            scene: An ``MjvScene`` that is up to date.
             size: Height and width [pixels].
-            camera: Number or name; -1 is the free camera.
+            overlays: Texts to draw over it: ``draw(context, rect)``.
+            flags: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by number -> value.
             depth: Measure distances [m] instead of colours.
             segmentation: Number the objects instead.
-            scene_option: What is drawn: an ``MjvOption``.
-            flags: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by number -> value.
 
         Raises:
-            UsageError: When depth and segmentation are both asked for, or there is no such flag.
+            UsageError: When there is no such flag.
         """
-        if depth and segmentation:
-            raise UsageError("Only one of depth or segmentation can be rendered at a time.")
-        renderer = self._renderer(*size)
-        renderer.disable_depth_rendering()
-        renderer.disable_segmentation_rendering()
+        wanted = {_flag(name): value for name, value in (flags or {}).items()}
+        if depth or segmentation:  # distances too are drawn without light: no shadows, and no smoothing of edges
+            wanted |= {_flag("segment"): True, _flag("idcolor"): True}
+        thread = threading.get_ident()
+        if thread not in self._contexts:
+            self._contexts[thread] = _Context(self._model)
+        context = self._contexts[thread]
+        context.update(self._model)
+        rect = mj.MjrRect(0, 0, size[1], size[0])
+        pixels = np.empty(size, np.float32) if depth else np.empty((*size, 3), np.uint8)
+        before = scene.flags.copy()
+        for flag, value in wanted.items():
+            scene.flags[flag] = value
+        mj.mjr_render(rect, scene, context.mujoco)
+        scene.flags[:] = before
+        for overlay in overlays:
+            overlay.draw(context.mujoco, rect)
+        mj.mjr_readPixels(None if depth else pixels, pixels if depth else None, rect, context.mujoco)
+        pixels = np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest one
         if depth:
-            renderer.enable_depth_rendering()
-        if segmentation:
-            renderer.enable_segmentation_rendering()
-        renderer.update_scene(data, camera, getattr(scene_option, "ptr", scene_option))
-        shown = renderer.scene.flags
-        before = shown.copy()
-        for flag, value in (flags or {}).items():
-            shown[_flag(flag)] = value
-        image = renderer.render()
-        shown[:] = before
-        return image
+            return _distances(pixels, scene, self._model)
+        return _objects(pixels, scene) if segmentation else pixels
 
     def close(self) -> None:
         """Let go of the graphics device."""
-        for renderer, _ in self._kept.values():
-            renderer.close()
-        self._kept.clear()
+        while self._contexts:
+            self._contexts.popitem()[1].close()
+        self._scenes.clear()
+
+    def __del__(self) -> None:
+        self.close()
+
+
+def new_scene(model: Any, max_geom: int | None = None) -> Any:
+    """Return an ``MjvScene`` of a model with room for a number of shapes; default: five for each object."""
+    shown = ("body", "geom", "site", "jnt", "tendon", "u", "skin", "flex", "cam", "light")
+    return mj.MjvScene(model, max_geom or max(1000, 5 * sum(getattr(model, f"n{kind}") for kind in shown)))
+
+
+def _distances(pixels: np.ndarray, scene: Any, model: Any) -> np.ndarray:
+    """Return distances [m] from depths, 1 for the nearest and 0 for the farthest.
+
+    The coefficients are rounded as those of OpenGL's projection are: near the far end that matters most.
+    """
+    near, far = (np.float32(x * model.stat.extent) for x in (model.vis.map.znear, model.vis.map.zfar))
+    depths = pixels.astype(np.float64)
+    if scene.camera[0].orthographic:
+        return (far - depths * (far - near)).astype(np.float32)
+    scale = np.float32(0.5) * ((far + near) / (far - near)) - np.float32(0.5)
+    offset = np.float32(0.5) * (np.float32(2) * far * near / (far - near))
+    return (offset / (depths + scale)).astype(np.float32)
+
+
+def _objects(pixels: np.ndarray, scene: Any) -> np.ndarray:
+    """Return numbers and types (``mjtObj``) of objects, int32 ``(height, width, 2)``, from colours; -1 for none."""
+    number = pixels.astype(np.uint32) @ np.array([1, 2**8, 2**16], np.uint32)
+    table = np.full((scene.ngeom + 1, 2), -1, np.int32)
+    for geom in scene.geoms[: scene.ngeom]:
+        if geom.segid != -1:
+            table[geom.segid + 1] = geom.objid, geom.objtype
+    return table[number]
+
+
+@functools.cache
+def _flags() -> dict[str, int]:
+    members = mj.mjtRndFlag.__members__
+    return {k.removeprefix("mjRND_").lower(): int(v) for k, v in members.items() if k != "mjNRNDFLAG"}
 
 
 def _flag(name: Any) -> int:
     if not isinstance(name, str):
         return int(name)
-    known = {k.removeprefix("mjRND_").lower(): v for k, v in mj.mjtRndFlag.__members__.items() if k != "mjNRNDFLAG"}
-    if name not in known:
-        raise UsageError(f"there is no render flag {name!r}. Available: {', '.join(known)}")
-    return int(known[name])
+    if name not in _flags():
+        raise UsageError(f"there is no render flag {name!r}. Available: {', '.join(_flags())}")
+    return _flags()[name]

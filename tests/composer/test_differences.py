@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim2real.composer import engine
 from sim2real.errors import UsageError
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "differences.md"
@@ -43,7 +44,7 @@ def environment(kit, control=0.05, physics=0.005, task=None, observables=None, *
 
 
 def test_every_row_of_the_page_has_a_test():
-    rows = re.findall(r"^\| ([a-z]+_[a-z_]+|keyframes|hooks|overlays) \|", PAGE.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| ([a-z]+_[a-z_]+|keyframes|hooks) \|", PAGE.read_text(), re.MULTILINE)
     rows.remove("dm_control")
     tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
     assert sorted(rows) == sorted(tests - {"every_row_of_the_page_has_a_test"})
@@ -318,9 +319,17 @@ def test_rendering_contexts(ours):
     assert below_an_arena(ours, model(ours)).contexts is None
 
 
-def test_overlays(ours):
-    with pytest.raises(TypeError, match="overlays"):
-        below_an_arena(ours, model(ours)).render(overlays=())
+def test_other_physics(ours):
+    assert not hasattr(engine, "Physics")
+    xml = HINGE.format("", "", "", "")
+    assert ours.mjcf.Physics.from_xml_string(xml).model.nq == 1
+
+
+def test_poses_of_cameras(ours):
+    camera = engine.MovableCamera(below_an_arena(ours, model(ours)))
+    pose = camera.get_pose()
+    camera.set_pose(pose.lookat + 1.0, *pose[1:])
+    np.testing.assert_array_equal(camera.get_pose().lookat, pose.lookat + 1.0)
 
 
 @pytest.mark.usefixtures("opengl")

@@ -1,6 +1,7 @@
 """dm_control's own library on dm_control and on ours: the same models, rewards and observations, to the last digit."""
 
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -198,3 +199,19 @@ def test_an_arm_reaches_for_a_pose_as_dm_controls_does(oracle, ours, own, monkey
         np.testing.assert_allclose(physics.bind(hand.tool_center_point).xpos, pose[0], atol=1e-8)
         found.append(np.array(physics.bind(arm.joints).qpos))
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+
+
+def test_a_camera_follows_players(ours, monkeypatch):
+    monkeypatch.setattr("dm_control.mujoco.engine.Physics.contexts", SimpleNamespace(mujoco=None))
+    poses = []
+    for package in PACKAGES:
+        camera = module(package, "locomotion.soccer.camera").MultiplayerTrackingCamera(3.0, 1.5, 0.5)
+        kit = importlib.import_module("sim2real.composer.mjcf" if package == "ported" else "dm_control.mjcf")
+        physics = kit.Physics.from_mjcf_model(kit.RootElement())
+        camera.after_compile(physics)
+        assert physics.model.vis.global_.offwidth == camera.camera.width == 1920
+        camera.initialize_episode([np.zeros(3), np.ones(3)])
+        camera.after_step([np.zeros(3), np.array([1.0, 0.0, 0.0])])
+        poses.append(camera.camera.get_pose())
+    for theirs, mine in zip(*poses, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
