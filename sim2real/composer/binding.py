@@ -63,6 +63,7 @@ class SyncedArray(np.ndarray):
         if binding is None:
             super().__setitem__(key, value)
             return
+        value = np.array(value)  # it may be a part of this array: `array[1:] *= 2` changes that before it comes here
         getattr(binding, self._name)  # which brings the newest values here
         super().__setitem__(key, value)
         binding.write(self._name, np.asarray(self))

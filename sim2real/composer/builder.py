@@ -44,7 +44,9 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
         for key, value in tuple(attrs.items()):
             if key in ("name", "dclass"):
                 continue
-            if key in named or isinstance(value, Element):
+            if key == "childclass":
+                translate.assign(native, kind, key, getattr(value, "dclass", value))
+            elif key in named or isinstance(value, Element):
                 model.refer(element, translate.native_name(kind, key), value)
             elif translate.is_plain(native, kind, key, value):
                 translate.assign(native, kind, key, value)
@@ -94,10 +96,12 @@ def _lay_down(model: Model, element: Element) -> None:
 def _inherited(model: Model, element: Element) -> dict[str, Any]:
     """Return what the classes of an element say of its own tag: the nearest one's word counts."""
     found: dict[str, Any] = {}
+    known = schema.attributes(element.kind, element.tag)
     one = model.default_class(class_of(model, element))
     while one is not model:
         said = model.given(getattr(one, element.tag))
-        found = (said.values if said.tag == element.tag else {}) | found
+        if said.tag == element.tag:  # the last one that was spoken of: a class has one actuator for all tags
+            found = {k: v for k, v in said.values.items() if k in known} | found
         one = one.parent
     return found
 

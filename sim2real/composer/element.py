@@ -235,7 +235,7 @@ class Element:
             return self.root.referenced(self, name)
         if name.startswith("file") and said.values.get(name):
             return files.asset_of(self.root, kind, said.values[name])
-        if name == "dclass":
+        if name in ("dclass", "childclass"):
             return self.root.default_class(said.values[name])
         return self._shown(name, said)
 

@@ -81,7 +81,7 @@ class NamedArray(NDArrayOperatorsMixin):
             row, *columns = key
             row = self._rows(row)
             columns = [_column(c) for c in columns]
-            if isinstance(row, np.ndarray) and columns and isinstance(columns[0], list):
+            if isinstance(row, np.ndarray) and row.ndim == 1 and columns and isinstance(columns[0], list):
                 return np.ix_(row, columns[0])
             return (row, *columns)
         return self._rows(key)
@@ -89,6 +89,8 @@ class NamedArray(NDArrayOperatorsMixin):
     def _rows(self, key: Any) -> Any:
         if isinstance(key, str | Element):
             return layout.index(self._model, self._field, (self._number(key),), True)
+        if isinstance(key, np.ndarray) and key.dtype.kind == "U":  # as np.ix_ makes them from names
+            return np.reshape(self._rows(key.ravel().tolist()), key.shape)
         if isinstance(key, Iterable) and not isinstance(key, np.ndarray):
             keys = list(key)
             if keys and isinstance(keys[0], str | Element):
@@ -115,6 +117,8 @@ class NamedArray(NDArrayOperatorsMixin):
 def _column(key: Any) -> Any:
     if isinstance(key, str):
         return _COLUMNS[key]
+    if isinstance(key, np.ndarray) and key.dtype.kind == "U":
+        return np.reshape(_column(key.ravel().tolist()), key.shape)
     if isinstance(key, list):
         return [_COLUMNS[k] if isinstance(k, str) else k for k in key]
     return key

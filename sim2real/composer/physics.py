@@ -126,6 +126,14 @@ class Physics:
         """Compile a model anew and start from its initial state."""
         self._start(model.compile())
 
+    def reload_from_xml_string(self, xml_string: str, assets: dict[str, bytes] | None = None) -> None:
+        """Compile MJCF and start from its initial state."""
+        self._start(mj.MjModel.from_xml_string(xml_string, assets or {}))
+
+    def reload_from_xml_path(self, path: str) -> None:
+        """Compile an MJCF file and start from its initial state."""
+        self._start(mj.MjModel.from_xml_path(str(path)))
+
     # -- state
 
     def time(self) -> float:

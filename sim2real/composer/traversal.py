@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sim2real.composer import compose
+from sim2real.composer import compose, schema
 from sim2real.composer.element import Element
 from sim2real.composer.model import Model
 
@@ -47,7 +47,7 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
     one: Any = root.default_class(root.builder.class_of(root, element))
     while one is not root:
         said = root.given(getattr(one, element.tag)).values
-        for name in said:
+        for name in said.keys() & schema.attributes(element.kind, element.tag):  # a class has one actuator for all tags
             if (attributes is None or name in attributes) and getattr(element, name) is None:
                 setattr(element, name, said[name])
         one = one.parent

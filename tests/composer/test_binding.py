@@ -33,6 +33,11 @@ def test_parts_of_several_elements_are_written_through(arm):
     assert physics.data.qpos.tolist() == [0, 0.3]
     geoms["pos", ["x", "z"]] = 0.5
     np.testing.assert_array_equal(physics.model.geom_pos[:, [0, 2]], np.full((4, 2), 0.5))
+    geoms.pos[:, 0] *= 3
+    geoms.pos[1:, 2] += [0.1, 0.2, 0.3]
+    np.testing.assert_array_equal(physics.model.geom_pos[:, 0], np.full(4, 1.5))
+    np.testing.assert_allclose(geoms.pos[:, 2], [0.5, 0.6, 0.7, 0.8])
+    np.testing.assert_allclose(np.sort(physics.model.geom_pos[:, 2]), [0.5, 0.6, 0.7, 0.8])
     sums = joints.qpos + 1
     sums[0] = 9
     assert physics.data.qpos[0] == 0
@@ -74,6 +79,9 @@ def test_named_arrays(arm):
     data = physics.named.data
     assert data.xpos["lower", "z"] == pytest.approx(0.35)
     assert data.xpos[["upper", "lower"], ["x", "z"]].shape == (2, 2)
+    corner = np.ix_(["lower", "upper"], ["x", "z"])
+    np.testing.assert_array_equal(data.xpos[corner], data.xpos[["lower", "upper"], ["x", "z"]])
+    assert data.xpos[np.ix_(["lower"], [0, 2])].tolist() == data.xpos[["lower"], [0, 2]].tolist()
     assert data.qpos[model.find_all("joint")].shape == (2,)
     data.qpos["shoulder"] = 0.2
     assert np.sum(data.qpos**2) == pytest.approx(0.04)

@@ -141,6 +141,31 @@ def test_defaults_are_committed(servo):
     assert (ball.mass, ball.rgba) == (2.0, None)
     mjcf.commit_defaults(ball)
     assert ball.rgba.tolist() == [1, 0, 0, 1]
+    root = mjcf.RootElement()
+    root.default.motor.forcerange = [-2, 3]
+    root.default.position.kp = 0.1
+    root.default.velocity.kv = 0.2
+    joint = root.worldbody.add("body").add("joint", name="hinge")
+    for tag in ("motor", "position", "velocity"):
+        mjcf.commit_defaults(root.actuator.add(tag, joint=joint, name=tag))
+    motor, position, velocity = root.find_all("actuator")
+    assert all(a.forcerange.tolist() == [-2, 3] for a in (motor, position, velocity))
+    assert (position.kp, velocity.kv) == (0.1, 0.2)  # which motors do not have
+
+
+@pytest.mark.parametrize("by_name", [True, False])
+def test_classes_for_what_a_body_holds_are_given_by_name_or_themselves(by_name):
+    root = mjcf.RootElement()
+    thin = root.default.add("default", dclass="thin")
+    thin.geom.size = [0.1]
+    body = root.worldbody.add("body", childclass="thin" if by_name else thin)
+    geom = body.add("geom")
+    assert body.childclass.dclass == "thin"
+    assert root.worldbody.add("body").childclass is None
+    physics = mjcf.Physics.from_mjcf_model(root)
+    assert physics.bind(geom).size[0] == 0.1
+    body.childclass = None
+    assert body.childclass is None
 
 
 def test_references_beside_their_model_resolve(servo):

@@ -2,7 +2,7 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.observation.observable import Generic, MJCFFeature
+from sim2real.composer.observation.observable import Generic, MJCFCamera, MJCFFeature
 from sim2real.composer.observation.observable.base import AGGREGATORS
 
 
@@ -79,6 +79,8 @@ def test_features_are_indexed_once_and_want_elements():
         feature[0][0]
     with pytest.raises(ValueError, match=r"expected an `mjcf\.Element`"):
         MJCFFeature("xpos", [geom, "g"])
+    with pytest.raises(ValueError, match=r"expected an `mjcf\.Element`, got type <class 'list'>"):
+        MJCFCamera([geom])
 
 
 def test_the_mixin_demands_its_observables():

@@ -101,7 +101,8 @@ class MJCFCamera(Observable):
         segmentation: bool = False,
         scene_option: Any = None,
     ) -> None:
-        _check_elements(mjcf_element)
+        if not isinstance(mjcf_element, Element):
+            raise UsageError(f"expected an `mjcf.Element`, got type {type(mjcf_element)}: {mjcf_element}")
         if mjcf_element.kind != "camera":
             raise UsageError(f"expected a <camera> element: got {mjcf_element}")
         if depth and segmentation:
