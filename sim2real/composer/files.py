@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,3 +145,20 @@ def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | Non
     for file, contents in collect(mjcf_model).items():
         (folder / file).write_bytes(contents)
     (folder / name).write_text(mjcf_model.to_xml_string(), encoding="utf-8")
+
+
+def export_with_assets_as_zip(mjcf_model: Model, out_dir: Any, model_name: str | None = None) -> str:
+    """Write a model, composed, as MJCF with all its files into an archive; return its path.
+
+    Args:
+        mjcf_model: The model.
+        out_dir: The archive's folder, which is made if it is not there.
+        model_name: What the archive, the folder in it and the MJCF file are called; default: as the model.
+    """
+    name = model_name or mjcf_model.model
+    Path(out_dir).mkdir(parents=True, exist_ok=True)
+    path = str(Path(out_dir) / f"{name}.zip")
+    with zipfile.ZipFile(path, "w") as archive:
+        for file, contents in (collect(mjcf_model) | {f"{name}.xml": mjcf_model.to_xml_string()}).items():
+            archive.writestr(f"{name}/{file}", contents)
+    return path

@@ -1,5 +1,7 @@
 """What was said of elements, and what PyMJCF's users look for: lists by tag, classes of defaults, files."""
 
+import zipfile
+
 import mujoco
 import numpy as np
 import pytest
@@ -214,6 +216,10 @@ def test_files_are_collected_and_written(tmp_path):
     assert root.compile().nmesh == 2  # the model's own files are called as before
     with pytest.raises(UsageError, match=r"must end with '\.xml'"):
         mjcf.export_with_assets(root, tmp_path, "root.mjcf")
+    with zipfile.ZipFile(mjcf.export_with_assets_as_zip(root, tmp_path / "new")) as archive:
+        archive.extractall(tmp_path)
+    found = {file.name: file.read_bytes() for file in (tmp_path / "root").iterdir()}
+    assert found == {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir()}
     (tmp_path / "part.xml").unlink()
     with pytest.raises(UsageError, match=r"includes 'part\.xml', which is not there"):
         mjcf.from_path(tmp_path / "arm.xml")

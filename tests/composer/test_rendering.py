@@ -105,6 +105,18 @@ def test_a_context_is_let_go_with_its_model(fake):
     assert fake.made == 0
 
 
+def test_a_context_of_another_thread_is_left_to_opengl(physics, fake, monkeypatch):
+    physics.render(10, 10)
+
+    def refuse(self):
+        raise RuntimeError("current in another thread")
+
+    monkeypatch.setattr(fake, "make_current", refuse)
+    monkeypatch.setattr("sim2real.composer.rendering._ABANDONED", [])
+    physics.free()
+    assert fake.made == 1  # MuJoCo's would free the objects of whichever context is current
+
+
 def test_options_hold_for_one_image(physics, fake):
     def flags():
         return set([flags for name, flags in fake.asked if name == "render"][-1])
@@ -197,6 +209,9 @@ def test_cameras_see_a_model_that_was_compiled_anew():
     physics.reload_from_mjcf_model(model)
     camera.update()
     assert camera.scene.ngeom == shown + 1
+    physics.reload_from_xml_string(SCENE)
+    camera.update()
+    assert camera.scene.ngeom == shown
 
 
 def views(engine, physics):

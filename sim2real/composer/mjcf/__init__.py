@@ -4,6 +4,7 @@ from sim2real.composer.binding import Binding as Binding
 from sim2real.composer.element import Element as Element
 from sim2real.composer.files import Asset as Asset
 from sim2real.composer.files import export_with_assets as export_with_assets
+from sim2real.composer.files import export_with_assets_as_zip as export_with_assets_as_zip
 from sim2real.composer.mjcf import element as element
 from sim2real.composer.model import Model as RootElement
 from sim2real.composer.physics import Physics as Physics
