@@ -173,6 +173,24 @@ def test_folders_of_assets(oracle, ours):
                 kit.mjcf.Physics.from_mjcf_model(root)
 
 
+def test_names_with_slashes(oracle, ours):
+    xml = '<mujoco><worldbody><body name="a/b"/></worldbody></mujoco>'
+    assert oracle.mjcf.from_xml_string(xml, escape_separators=True).find_all("body")[0].name == "a\\b"
+    with pytest.raises(TypeError, match="escape_separators"):
+        ours.mjcf.from_xml_string(xml, escape_separators=True)
+
+
+def test_mocap_bodies(oracle, ours):
+    def bound(kit):
+        root = kit.mjcf.RootElement()
+        bodies = [root.worldbody.add("body", name=name, mocap=name == "m") for name in ("m", "b")]
+        return kit.mjcf.Physics.from_mjcf_model(root).bind(bodies)
+
+    with pytest.raises(ValueError, match="multiple element types"):
+        bound(oracle)
+    assert "mocap_pos" not in dir(bound(ours))
+
+
 @pytest.mark.parametrize("name", ["insert", "include_copy", "is_same_as", "to_xml", "namescope"])
 def test_tree_surgery(oracle, ours, name):
     assert [hasattr(model(kit), name) for kit in (oracle, ours)] == [True, False]
