@@ -39,18 +39,27 @@ class _Wrapper:
         setattr(self.ptr, name, value)
 
 
+def _kind(kind: str | int) -> str:
+    if isinstance(kind, str):
+        return kind
+    kinds = {int(number): name for name, number in layout.OBJECT_TYPES.items()}
+    if int(kind) not in kinds:
+        raise UsageError(f"no elements have the mjtObj {kind}. Available: {', '.join(layout.OBJECT_TYPES)}")
+    return kinds[int(kind)]
+
+
 class ModelView(_Wrapper):
     """``physics.model``: the ``MjModel``, and names to numbers and back."""
 
     __slots__ = ()
 
-    def name2id(self, name: str, kind: str) -> int:
-        """Return the number of the element of a kind with a name; UsageError when there is none."""
-        return layout.resolve(self.ptr, kind, (name,))[0]
+    def name2id(self, name: str, kind: str | int) -> int:
+        """Return the number of the element of a kind, or ``mjtObj``, with a name; UsageError when there is none."""
+        return layout.resolve(self.ptr, _kind(kind), (name,))[0]
 
-    def id2name(self, number: int, kind: str) -> str:
-        """Return the name of an element, '' when it has none."""
-        return mj.mj_id2name(self.ptr, layout.OBJECT_TYPES[kind], number) or ""
+    def id2name(self, number: int, kind: str | int) -> str:
+        """Return the name of an element of a kind, or ``mjtObj``; '' when it has none."""
+        return mj.mj_id2name(self.ptr, layout.OBJECT_TYPES[_kind(kind)], number) or ""
 
     @contextlib.contextmanager
     def disable(self, *flags: str) -> Iterator[None]:
@@ -199,6 +208,10 @@ class Physics:
         mj.mj_copyData(data, model, self.data.ptr)
         made._load(model, data)
         return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = type(self), self.model.ptr, self.data.ptr, self.legacy_step, self.variables
+        return _restored, given
 
     # -- dynamics
 
@@ -369,3 +382,10 @@ class Physics:
         for binding in self._bindings.values():
             binding.free()
         self._bindings.clear()
+
+
+def _restored(kind: type[Physics], model: Any, data: Any, legacy_step: bool, variables: dict[str, Any]) -> Physics:
+    made = object.__new__(kind)
+    made.legacy_step, made.variables, made._suppress = legacy_step, variables, False
+    made._load(model, data)
+    return made

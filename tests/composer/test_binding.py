@@ -1,3 +1,7 @@
+import copy
+import pickle
+
+import mujoco
 import numpy as np
 import pytest
 from composer_parts import ARM
@@ -96,11 +100,28 @@ def test_the_functional_view_is_the_same_physics(arm):
     assert (physics.get(joint, "qpos"), physics.get(joint, "qvel")) == (0.3, 2.0)
 
 
+def test_names_and_numbers(arm):
+    _, physics = arm
+    for kind in ("body", mujoco.mjtObj.mjOBJ_BODY, 1):
+        assert physics.model.name2id("upper", kind) == 1
+        assert physics.model.id2name(1, kind) == "upper"
+    with pytest.raises(UsageError, match=r"mjtObj 99\. Available: body"):
+        physics.model.name2id("upper", 99)
+
+
 def test_copies_and_states_are_independent(arm):
     _, physics = arm
     other = physics.copy()
     other.set_state([0.1, 0.2, 0.3, 0.4])
     assert other.get_state().tolist() == [0.1, 0.2, 0.3, 0.4]
+    for same in (copy.deepcopy(other), pickle.loads(pickle.dumps(other))):
+        assert same.get_state().tolist() == [0.1, 0.2, 0.3, 0.4]
+        for one in (same, other):
+            one.set_state([0.1, 0.2, 0.3, 0.4])
+            one.forward()
+            one.step()
+        np.testing.assert_array_equal(same.get_state(), other.get_state())
+        other.set_state([0.1, 0.2, 0.3, 0.4])
     assert physics.data.qpos.tolist() == [0, 0]
     with pytest.raises(UsageError, match=r"Expected \(4,\)"):
         physics.set_state([0.0])
