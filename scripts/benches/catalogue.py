@@ -32,7 +32,13 @@ BENCHES = {
     "compose": Bench(
         "compose",
         "worlds from parts against dm_control and bare MJX",
-        ("sim2real/composer", "scripts/benches/compose_step.py"),
+        (
+            "sim2real/composer",
+            "sim2real/graph",
+            "sim2real/runtime",
+            "scripts/benches/compose_step.py",
+            "scripts/benches/compose_warp.py",
+        ),
     ),
     "demo": Bench(
         "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")

@@ -1,4 +1,4 @@
-"""Worlds from parts against dm_control's composer, MJX against C, and a task on MJX against bare ``mjx.step``.
+"""Worlds from parts against dm_control's composer, MJX against C, and tasks on MJX against bare ``mjx.step``.
 
 The world is 20 robots with six links each, free to fall over one another. Without dm_control its rows are left out.
 """
@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from benches.compose_step import LINKS, kit, kits, robot, step
+from benches.compose_warp import warp
 from benches.figures import compare, medians, row
 
-PARTS = ("build", "reset", "step", "steps", "engines", "speed")
+PARTS = ("build", "reset", "step", "steps", "engines", "speed", "warp")
 ENTITIES = 20
 SCENES = {"contact_free": "<= 1e-10", "contacts": "<= 1e-6"}
 """Where MJX is compared with C, and how near it should come."""
@@ -27,6 +28,8 @@ QUICK = {
     "control_steps": 2,
     "resets": 1,
     "scenes": ["contact_free"],
+    "warp_copies": [2],
+    "warp_steps": 2,
 }
 
 
@@ -265,6 +268,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--links", type=int, default=LINKS, help="links of the arm on MJX")
     parser.add_argument("--resets", type=int, default=10, help="in a row: one alone would be timed with cold caches")
     parser.add_argument("--copies", type=int, help="copies of the task on MJX; default: 256 on the CPU, 4096 on a GPU")
+    parser.add_argument(
+        "--warp-copies",
+        type=int,
+        nargs="+",
+        help="of the quadruped on Warp; default: 8 on the CPU, on a GPU three",
+    )
+    parser.add_argument("--warp-steps", type=int, default=100, help="control steps of the quadruped in a rollout")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
@@ -276,5 +286,6 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         "steps": lambda: steps(options.steps),
         "engines": lambda: engines(options.steps, options.links, options.scenes),
         "speed": lambda: speed(options.copies, options.repeats, options.links),
+        "warp": lambda: warp(options.warp_copies, options.repeats, options.warp_steps),
     }
     return {"rows": [r for name in PARTS if name in options.parts for r in parts[name]()]}

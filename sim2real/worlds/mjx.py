@@ -11,7 +11,7 @@ import mujoco
 from flax import struct
 
 from sim2real.composer.import_mjx import mjx
-from sim2real.composer.mjx import gate
+from sim2real.composer.mjx import gate, stepping, warp
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseWorld
@@ -56,11 +56,14 @@ class MjxWorld(BaseWorld):
         field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
         color: Colour in drawings.
         order: Place in drawings.
+        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, in single precision and without derivatives.
+        nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
+        njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess.
 
     Raises:
         UsageError: When the tick is no whole number of time steps, or the model asks for what MJX does otherwise:
             delays of its own (ignored or misplaced there; they belong to the graph), the no-slip solver, an integrator
-            that it does not have, springs without dampers.
+            that it does not have, springs without dampers; or when Warp cannot be had.
     """
 
     def __init__(
@@ -72,6 +75,10 @@ class MjxWorld(BaseWorld):
         field: str = "action",
         color: str | None = None,
         order: int | None = None,
+        *,
+        impl: str = "jax",
+        nconmax: int | None = None,
+        njmax: int | None = None,
     ) -> None:
         super().__init__(name, rate, color=color, order=order)
         self.model = model
@@ -85,9 +92,11 @@ class MjxWorld(BaseWorld):
             )
         try:
             gate.check_model(model)
+            self._warp = warp.make_engine(model, impl, nconmax, njmax)
         except UsageError as error:
             raise UsageError(f"world {name!r}: {error.args[0]}", hint=error.hint) from None
-        self._mjx_model = mjx.put_model(model)
+        self._engine: Any = self._warp or stepping
+        self._mjx_model: Any = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:
         """Return the model and its reference position at rest."""
@@ -97,8 +106,8 @@ class MjxWorld(BaseWorld):
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return MJX data at the parameters' start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        data = mjx.make_data(self.model).replace(qpos=params.qpos, qvel=params.qvel)
-        return mjx.forward(params.model, data)
+        start: Any = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
+        return self._engine.forward(params.model, start.replace(qpos=params.qpos, qvel=params.qvel))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
         """Return positions and velocities at the start."""
@@ -107,12 +116,12 @@ class MjxWorld(BaseWorld):
 
     def step(self, step_state: StepState) -> tuple[StepState, JointState]:
         """Integrate over one tick under the newest control."""
-        model = step_state.params.model
+        model, advance = step_state.params.model, self._engine.advance
         control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
         data = step_state.state.replace(ctrl=jnp.asarray(control, jnp.float32))
         if self.substeps == 1:
-            data = mjx.step(model, data)
+            data = advance(model, data, legacy=False)
         else:
-            data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=self.substeps)
+            data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
         new = step_state.replace(state=data)  # pyright: ignore[reportAttributeAccessIssue]
         return new, JointState(data.qpos, data.qvel)

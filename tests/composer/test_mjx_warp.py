@@ -144,6 +144,88 @@ def test_observations_and_rewards_are_those_of_the_jax_implementation(played, ac
         np.testing.assert_array_equal(mine.done, theirs.done)
 
 
+class Sensing(Throw):
+    """Sensors of every stage, of limits and of contacts among them."""
+
+    def __init__(self, integrator):
+        super().__init__()
+        self.root_entity.mjcf_model.option.integrator = integrator
+        ball, arm = self.ball.mjcf_model, self.arm.mjcf_model
+        for joint in self.joints:
+            joint.limited, joint.range = True, [-0.2, 0.45]
+        inside = ball.worldbody.add("site", name="inside", size=[0.11])
+        for kind in ("touch", "accelerometer", "velocimeter"):
+            ball.sensor.add(kind, site=inside)
+        for kind in ("force", "torque"):
+            arm.sensor.add(kind, site=arm.find("site", "wrist"))
+        for kind in ("jointlimitpos", "jointlimitvel", "jointlimitfrc"):
+            arm.sensor.add(kind, joint=self.joints[0])
+        arm.sensor.add("subtreelinvel", body=arm.worldbody.body[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_sensors_of_every_stage_are_those_of_c(installed, actions, integrator):
+    _, states = rollout(composer.MjxEnvironment(Sensing(integrator), impl="warp"), actions)
+    found, touching = worst(states, composer.Environment(Sensing(integrator)), actions)
+    assert touching > 5
+    assert max(found.values()) < 1e-4, found
+
+
+class Varied(Throw):
+    """Every copy has a ball, an arm, a gravity and an air of its own; the model was compiled without air."""
+
+    def __init__(self):
+        super().__init__()
+        geom = self.ball.mjcf_model.find_all("geom")[0]
+        factor = noises.Multiplicative(distributions.Uniform(0.5, 2.0))
+        self.variator.bind_attributes(geom, size=factor)
+        for body in self.arm.mjcf_model.find_all("body"):
+            self.variator.bind_attributes(body, mass=factor)
+
+    def initialize_episode(self, physics, random_state):
+        super().initialize_episode(physics, random_state)
+        physics.model.opt.gravity = physics.np.array([0.0, 0.0, -5.0]) * random_state.uniform(1.0, 2.0)
+        physics.model.opt.density = 100.0 * random_state.uniform(1.0, 2.0)
+
+
+@pytest.mark.slow
+def test_masses_sizes_and_options_differ_from_copy_to_copy_as_on_jax(installed, actions):
+    keys = jax.random.split(jax.random.key(1), 3)
+
+    def play(impl):
+        environment = composer.MjxEnvironment(Varied(), impl=impl)
+        return jax.vmap(lambda key: rollout(environment, actions, key)[1])(keys)
+
+    mine, theirs = play("warp"), play("jax")
+    names = {"body_mass", "body_invweight0", "dof_invweight0", "geom_size", "geom_rbound", "opt.gravity", "opt.density"}
+    assert names < set(mine.leaves) & set(theirs.leaves)
+    for name in sorted(set(mine.leaves) & set(theirs.leaves)):
+        np.testing.assert_allclose(mine.leaves[name], theirs.leaves[name], rtol=2e-4, atol=1e-6, err_msg=name)
+    boxes, radii = (np.asarray(mine.leaves[name])[:, 0, -1] for name in ("geom_aabb", "geom_size"))
+    np.testing.assert_allclose(boxes[:, 1], np.tile(radii[:, :1], (1, 3)))
+    np.testing.assert_allclose(mine.data.qpos, theirs.data.qpos, atol=1e-4)
+    assert np.ptp(np.asarray(mine.data.qpos)[:, -1, 4]) > 0.01  # balls that lie are as high as they are large
+
+
+@pytest.mark.slow
+def test_environments_of_brax_and_gymnasium_run_on_it(installed):
+    environment = composer.MjxEnvironment(Throw(), time_limit=3 * SUBSTEPS * 0.004, impl="warp", nconmax=4)
+    wrappers = pytest.importorskip("brax.envs.wrappers.training")
+    wrapped = wrappers.wrap(composer.BraxEnv(environment), episode_length=100)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    for _ in range(4):
+        state = jax.jit(wrapped.step)(state, jnp.zeros((2, 2)))
+    assert np.isfinite(state.obs).all()
+    np.testing.assert_allclose(state.pipeline_state.data.time, SUBSTEPS * 0.004, rtol=1e-5)  # of the second episode
+
+    pytest.importorskip("gymnasium")
+    vector = composer.MjxVectorEnv(environment, num_envs=2)
+    vector.reset(seed=0)
+    ends = [vector.step(np.zeros((2, 2), np.float32))[3].tolist() for _ in range(4)]
+    assert ends == [[False, False], [False, False], [True, True], [False, False]]
+
+
 class Again(Throw):
     """Draws a start until it is high enough, and computes with it: a predicate that differs from copy to copy."""
 
@@ -155,7 +237,7 @@ class Again(Throw):
 
 @pytest.mark.slow
 def test_copies_start_differ_and_are_selected_one_by_one(installed, actions):
-    environment = composer.MjxEnvironment(Again(vary=True), max_reset_attempts=30, impl="warp", naconmax=64)
+    environment = composer.MjxEnvironment(Again(vary=True), max_reset_attempts=30, impl="warp", nconmax=16)
     reset, step = jax.jit(jax.vmap(environment.reset)), jax.jit(jax.vmap(environment.step))
     keys = jax.random.split(jax.random.key(3), 4)
     states = start = reset(keys)
@@ -180,14 +262,21 @@ def test_copies_start_differ_and_are_selected_one_by_one(installed, actions):
 
 
 @pytest.mark.slow
-def test_all_copies_end_when_there_is_no_room_for_their_contacts(installed):
-    environment = composer.MjxEnvironment(Throw(), impl="warp", naconmax=1)
-    state = jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), 2))
-    low = state.data.qpos.at[:, 4].set(0.09)  # the balls, each in the floor
-    state = jax.jit(jax.vmap(environment.step))(state.replace(data=state.data.replace(qpos=low)), jnp.zeros((2, 2)))
-    assert np.isfinite(state.data.qpos).all()
-    assert np.asarray(state.done).all()
-    assert not np.asarray(state.truncated).any()
+def test_copies_share_the_room_for_contacts_and_all_end_when_it_is_too_small(installed):
+    task = Throw()
+    box = task.ball.mjcf_model.find_all("geom")[0]
+    box.type, box.size = "box", [0.1, 0.1, 0.1]
+    environment = composer.MjxEnvironment(task, impl="warp", nconmax=2)  # a box touches the floor in four places
+    start = jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), 2))
+    step = jax.jit(jax.vmap(environment.step))
+    for heights, ends in (([0.09, 0.5], False), ([0.09, 0.09], True)):
+        qpos = start.data.qpos.at[:, 4].set(jnp.array(heights))
+        state = step(start.replace(data=start.data.replace(qpos=qpos)), jnp.zeros((2, 2)))
+        assert np.isfinite(state.data.qpos).all()
+        assert np.asarray(state.done).tolist() == [ends, ends]
+        assert not np.asarray(state.truncated).any()
+        if not ends:
+            assert state.data.qvel[0, 4] > state.data.qvel[1, 4]  # the floor holds it
 
 
 @pytest.mark.slow
@@ -263,12 +352,20 @@ def test_models_that_warp_cannot_run_are_refused_by_name(installed):
     task = Throw()
     task.root_entity.mjcf_model.option.noslip_iterations = 3
     refused("noslip_iterations is 3", task)
-    refused("MJX-Warp cannot run this model: .*naconmax", naconmax=-1)
+    task = Throw()
+    task.root_entity.mjcf_model.option.solver = "PGS"
+    refused("MJX-Warp cannot run this model: .*PGS", task)
+
+
+@pytest.mark.parametrize("name", ["nconmax", "njmax"])
+def test_no_room_at_all_is_refused(name):
+    refused(f"{name} is a number of at least 1, got 0", **{name: 0})
 
 
 def test_a_device_that_warp_does_not_know_is_refused(installed, monkeypatch):
     monkeypatch.setattr(warp.jax, "devices", lambda kind=None: [SimpleNamespace(platform="tpu")] if not kind else [])
-    refused("Warp runs on CUDA devices and on the CPU")
+    with pytest.raises(UsageError, match="Warp runs on CUDA devices and on the CPU"):
+        warp.find_device()
 
 
 def test_without_the_package_the_hint_says_what_to_install(monkeypatch):
@@ -279,5 +376,5 @@ def test_without_the_package_the_hint_says_what_to_install(monkeypatch):
 def test_other_implementations_and_misplaced_options_are_refused():
     with pytest.raises(UsageError, match="no implementation 'cpp'"):
         composer.MjxEnvironment(Throw(), impl="cpp")
-    with pytest.raises(UsageError, match="naconmax and njmax are Warp's"):
-        composer.MjxEnvironment(Throw(), naconmax=10)
+    with pytest.raises(UsageError, match="nconmax and njmax are Warp's"):
+        composer.MjxEnvironment(Throw(), nconmax=10)

@@ -10,7 +10,7 @@ import numpy as np
 from mujoco import mjx
 
 from sim2real.composer.arrays import multiply_quaternions, rotate
-from sim2real.composer.mjx.warp import is_warp
+from sim2real.composer.mjx.warp import is_warp, varies
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
@@ -35,13 +35,11 @@ def derive(host: Any, model: Any) -> dict[str, Any]:
         model: The ``mjx.Model``.
 
     Raises:
-        UsageError: On Warp, whose data this does not read.
+        UsageError: On Warp, where MJX's own JAX does not know the model.
     """
     if is_warp(model):
-        raise UsageError(
-            "MJX-Warp cannot compute constants that follow from masses and lengths inside a program",
-            hint='set them in initialize_episode_mjcf, or use impl="jax"',
-        )
+        found = derive(host, _twin(host, model)) | {"geom_aabb": _boxes(host, model)}
+        return {name: value for name, value in found.items() if varies(name)}
     data: Any = mjx.make_data(host, impl="jax").replace(qpos=model.qpos0)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
     data = mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
@@ -53,6 +51,20 @@ def derive(host: Any, model: Any) -> dict[str, Any]:
     if np.any(_derived_equalities(host)):
         found["eq_data"] = _equalities(host, model, data)
     return found | _cameras(host, model, data) if host.ncam else found
+
+
+def _twin(host: Any, model: Any) -> Any:
+    """Return a model of Warp as one of MJX's JAX, which computes constants from fields that both have."""
+    try:
+        twin: Any = mjx.put_model(host, impl="jax")
+    except NotImplementedError as error:
+        raise UsageError(
+            f"MJX-Warp computes what follows from masses and lengths with MJX's JAX, which cannot: {error}",
+            hint="set them in initialize_episode_mjcf",
+        ) from error
+    names = [name for name in twin.__dataclass_fields__ if varies(name)]
+    both = {n: (getattr(model, n), getattr(twin, n)) for n in names}
+    return twin.tree_replace({n: a.astype(b.dtype) for n, (a, b) in both.items() if jnp.shape(a) == jnp.shape(b)})
 
 
 def _subtree_masses(host: Any, model: Any) -> Any:
@@ -104,6 +116,23 @@ def _radii(host: Any, model: Any) -> Any:
     for geom, radius in radii.items():
         found = jnp.where(kind == int(geom), radius, found)
     return found
+
+
+def _boxes(host: Any, model: Any) -> Any:
+    """Return centres and half sizes of boxes around the geoms, shape ``(ngeom, 2, 3)``, which Warp looks at first."""
+    x, y, z = model.geom_size.T
+    kind, types = np.asarray(host.geom_type)[:, None], mj.mjtGeom
+    halves = {
+        types.mjGEOM_SPHERE: (x, x, x),
+        types.mjGEOM_CAPSULE: (x, x, x + y),
+        types.mjGEOM_ELLIPSOID: (x, y, z),
+        types.mjGEOM_CYLINDER: (x, x, y),
+        types.mjGEOM_BOX: (x, y, z),
+    }
+    found = model.geom_aabb[:, 1]
+    for geom, half in halves.items():
+        found = jnp.where(kind == int(geom), jnp.stack(half, axis=1), found)
+    return model.geom_aabb.at[:, 1].set(found)
 
 
 def _derived_equalities(host: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -14,12 +14,11 @@ from flax import struct
 from mujoco import mjx
 
 from sim2real.composer.environment import ObservationPadding
-from sim2real.composer.mjx import gate, stepping, views
+from sim2real.composer.mjx import gate, stepping, views, warp
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import make_rings
 from sim2real.composer.mjx.tracing import TracedHooks
-from sim2real.composer.mjx.warp import WarpEngine
 from sim2real.composer.physics import Physics
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
@@ -79,11 +78,10 @@ class MjxEnvironment:
         delayed_observation_padding: What fills buffers at first.
         legacy_step: After a step, also compute positions and velocities of the new state.
         impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``sim2real[warp]``. It computes in single precision
-            and has no derivatives. A step of it cannot begin elsewhere, so ``legacy_step`` costs a second forward
-            computation.
-        naconmax: On Warp: contacts that there is room for, of all copies together; default: a guess for one copy.
-        njmax: On Warp: rows of constraints that there is room for in each copy. Where it is too small the episode of
-            the copy ends, as where it diverged; where ``naconmax`` is, those of all copies.
+            and has no derivatives.
+        nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
+        njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess. Where it is too small
+            the episode of the copy ends, as where it diverged; where ``nconmax`` is, those of all copies.
         arena: The root entity of a task that has none of its own.
 
     Raises:
@@ -105,7 +103,7 @@ class MjxEnvironment:
         legacy_step: bool = True,
         *,
         impl: str = "jax",
-        naconmax: int | None = None,
+        nconmax: int | None = None,
         njmax: int | None = None,
         arena: Any = None,
     ) -> None:
@@ -121,14 +119,15 @@ class MjxEnvironment:
         observables = task.observables
         gate.check_observables(observables)
         gate.check_model(self.model)
-        gate.simplify_cone(self.model)
+        self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
+        if self._warp is None:
+            gate.simplify_cone(self.model)
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
         strip = strip_singleton_obs_buffer_dim
         self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
-        self._warp = self._make_warp(impl, naconmax, njmax)
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self._start = _initial_data(self.model) if self._warp is None else self._warp.start
         views.freeze(self.model)
@@ -144,15 +143,6 @@ class MjxEnvironment:
         view: Any = weakref.proxy(physics)
         self._hooks.run("after_compile", view, random_state)
         self._action_spec = self.task.action_spec(view)
-
-    def _make_warp(self, impl: str, naconmax: int | None, njmax: int | None) -> WarpEngine | None:
-        if impl == "warp":
-            return WarpEngine(self.model, naconmax, njmax)
-        if impl != "jax":
-            raise UsageError(f"MJX has no implementation {impl!r}", hint="available: 'jax', 'warp'")
-        if (naconmax, njmax) != (None, None):
-            raise UsageError("naconmax and njmax are Warp's: MJX's JAX has room for every contact", hint='impl="warp"')
-        return None
 
     def _physics(self, state: State | None = None, model: Any = None) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
@@ -252,7 +242,7 @@ class MjxEnvironment:
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
         diverged = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all() & jnp.isfinite(data.qacc).all())
-        diverged = diverged if self._warp is None else diverged | self._warp.overflowed(data)
+        diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
         reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
         ended = diverged | jnp.asarray(ends, bool)
         late = jnp.zeros((), bool) if self.step_limit is None else steps >= self.step_limit

@@ -23,6 +23,8 @@ from sim2real.errors import UsageError
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
 """What MJX leaves out of a program because it was 0 when the model was compiled; set, it has to be in."""
+_WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
+"""The same on Warp."""
 
 
 class MjxPhysics:
@@ -156,20 +158,17 @@ class MjxPhysics:
 
     def switch_on(self) -> None:
         """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
-        if warp.is_warp(self.mjx_model):
-            return
-        for path in {_SWITCHES[name] for name in self.changed if name in _SWITCHES}:
+        on_warp = warp.is_warp(self.mjx_model)
+        switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
+        for path in {switches[name] for name in self.changed if name in switches}:
             if not _get(self.mjx_model, path):
                 self.mjx_model = self.mjx_model.tree_replace({path: True})
-        if self.changed.intersection(_FLUID) and self.mjx_model.opt.integrator == mjx.IntegratorType.IMPLICITFAST:
+        implicit = self.mjx_model.opt.integrator == mjx.IntegratorType.IMPLICITFAST
+        if self.changed.intersection(_FLUID) and implicit and not on_warp:
             raise UsageError("MJX has no fluid forces with the integrator implicitfast", hint="use Euler or RK4")
 
     def recompute_constants(self) -> None:
-        """Compute what MuJoCo derives from masses and lengths anew, after they were changed.
-
-        Raises:
-            UsageError: On Warp.
-        """
+        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
         for name, value in constants.derive(self.host, self.mjx_model).items():
             self.replace("model", name, value)
         self.mark_as_dirty()

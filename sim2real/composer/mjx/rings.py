@@ -118,11 +118,13 @@ class Ring:
         return (read - arrival) // int(self._interval) < self.size
 
     def _insert(self, ring: Any, now: Any, value: Any, random_state: JaxRandomState) -> Any:
-        slot = ring["count"] % self.capacity
+        # Selected against an index: a scatter for each copy takes several kernels on a GPU, and copies the samples.
+        slot = jnp.arange(self.capacity) == ring["count"] % self.capacity
+        rows = jnp.reshape(slot, (self.capacity, *(1,) * value.ndim))
         return {
             **ring,
-            "arrival": ring["arrival"].at[slot].set(now + _draw(self._delay, random_state)),
-            "value": ring["value"].at[slot].set(value),
+            "arrival": jnp.where(slot, now + _draw(self._delay, random_state), ring["arrival"]),
+            "value": jnp.where(rows, value, ring["value"]),
             "count": ring["count"] + 1,
             "next": now + _draw(self._interval, random_state),
         }

@@ -9,24 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
-
-_ACCELERATION = (
-    "act_dot",
-    "actuator_force",
-    "qacc",
-    "qacc_smooth",
-    "qacc_warmstart",
-    "qfrc_actuator",
-    "qfrc_constraint",
-    "qfrc_inverse",
-    "qfrc_smooth",
-    "_impl.cacc",
-    "_impl.cfrc_ext",
-    "_impl.cfrc_int",
-)
-"""What a step computes after the velocities: ``mj_step1`` leaves it as it is."""
 
 
 class WarpEngine:
@@ -37,7 +20,7 @@ class WarpEngine:
 
     Args:
         host: The compiled ``mujoco.MjModel``.
-        naconmax: Contacts, of all copies together, that there is room for; None: MuJoCo Warp's guess for one copy.
+        nconmax: Contacts that there is room for, times the number of copies, which share it; None: MuJoCo Warp's guess.
         njmax: Rows of constraints that there is room for in each copy; None: MuJoCo Warp's guess.
 
     Raises:
@@ -48,54 +31,72 @@ class WarpEngine:
         start: The ``mjx.Data`` of the model's initial state, nothing computed.
     """
 
-    def __init__(self, host: Any, naconmax: int | None = None, njmax: int | None = None) -> None:
+    def __init__(self, host: Any, nconmax: int | None = None, njmax: int | None = None) -> None:
+        for name, size in (("nconmax", nconmax), ("njmax", njmax)):
+            if size is not None and size < 1:  # 0 contacts would be no collisions at all, without a word
+                raise UsageError(f"{name} is a number of at least 1, got {size}", hint="leave it out for a guess")
         device = find_device()
         try:
-            self.model = mjx.put_model(host, impl="warp", device=device)
-            data: Any = mjx.make_data(host, impl="warp", device=device, naconmax=naconmax, njmax=njmax)
+            model: Any = mjx.put_model(host, impl="warp", device=device)
+            data: Any = mjx.make_data(host, impl="warp", device=device, naconmax=nconmax, njmax=njmax)
         except (NotImplementedError, ValueError) as error:
             raise UsageError(f"MJX-Warp cannot run this model: {error}", hint='use impl="jax"') from error
+        from sim2real.composer.mjx import warp_stages  # it imports Warp
+
+        self._stages = warp_stages
+        # Kernels print when something had no room, line by line; not so when a solver stops at its limit.
+        self.model = model.tree_replace({"opt._impl.warn_overflow": _short()})
         self._shared = {f"_impl.{k}": np.asarray(getattr(data._impl, k)) for k in _shared(data)}
-        self._seen_late = _rows(host)
         self.start = self._pack(data)
 
     def advance(self, model: Any, data: Any, legacy: bool) -> Any:
-        """Return the data a time step later.
-
-        MuJoCo Warp has no stages in JAX to begin a step elsewhere: with ``legacy``, positions and velocities of the new
-        state come from a whole ``mjx.forward`` behind ``mjx.step``, of which accelerations and forces are dropped.
-        """
-        after: Any = mjx.step(model, self._unpack(data))
-        if not legacy:
-            return self._pack(after)
-        fresh: Any = mjx.forward(model, after)
-        kept = {name: _get(after, name) for name in _ACCELERATION}
-        kept["sensordata"] = jnp.where(self._seen_late, after.sensordata, fresh.sensordata)
-        return self._pack(fresh.tree_replace(kept))
+        """Return the data a time step later; with ``legacy``, with positions and velocities of the new state."""
+        step = self._stages.legacy_step if legacy else self._stages.step
+        return self._pack(step(model, self._unpack(data)))
 
     def forward(self, model: Any, data: Any, actuation: bool = True) -> Any:
         """Compute everything that follows from the state; without actuation, as at the start of an episode."""
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
             model = model.tree_replace({"opt.disableflags": flags})
-        return self._pack(mjx.forward(model, self._unpack(data)))
-
-    def overflowed(self, data: Any) -> Any:
-        """Return whether contacts or constraints of a copy were left out for want of room, since its reset."""
-        from mujoco.mjx.warp import mjwp_types
-
-        flags = mjwp_types.OverflowType
-        # A solver that stops at its limit has left nothing out, and stops there in C and in JAX as well.
-        short = int(flags.ALL & ~(flags.ITERATIONS | flags.LS_ITERATIONS))
-        return (data._impl.overflow & short) != 0
+        return self._pack(self._stages.forward(model, self._unpack(data)))
 
     def _pack(self, data: Any) -> Any:
         return data.tree_replace(dict.fromkeys(self._shared))
 
     def _unpack(self, data: Any) -> Any:
-        # Room for a million contacts is better made in the program than kept in it as a constant.
-        new = {k: jnp.asarray(v) if v.any() else jnp.zeros(v.shape, v.dtype) for k, v in self._shared.items()}
-        return data.tree_replace(new)
+        # Contacts are where Warp has them, in arrays that JAX has no part in.
+        new = {k: v[:0] if k.startswith("_impl.contact__") else v for k, v in self._shared.items()}
+        return data.tree_replace({k: jnp.asarray(v) for k, v in new.items()})
+
+
+def make_engine(host: Any, impl: str, nconmax: int | None, njmax: int | None) -> WarpEngine | None:
+    """Return what steps a model with Warp; None with ``impl="jax"``.
+
+    Raises:
+        UsageError: When there is no such implementation, or it cannot be had.
+    """
+    if impl == "warp":
+        return WarpEngine(host, nconmax, njmax)
+    if impl != "jax":
+        raise UsageError(f"MJX has no implementation {impl!r}", hint="available: 'jax', 'warp'")
+    if (nconmax, njmax) != (None, None):
+        raise UsageError("nconmax and njmax are Warp's: MJX's JAX has room for every contact", hint='impl="warp"')
+    return None
+
+
+def overflowed(data: Any) -> Any:
+    """Return whether contacts or constraints of a copy were left out for want of room, since its reset."""
+    return (data._impl.overflow & _short()) != 0
+
+
+def _short() -> int:
+    """Return the flags that say that something had no room."""
+    from mujoco.mjx.warp import mjwp_types
+
+    flags = mjwp_types.OverflowType
+    # A solver that stops at its limit has left nothing out, and stops there in C and in JAX as well.
+    return int(flags.ALL & ~(flags.ITERATIONS | flags.LS_ITERATIONS))
 
 
 def find_device() -> Any:
@@ -118,17 +119,22 @@ def find_device() -> Any:
     return device
 
 
-def check_field(name: str) -> None:
+def varies(path: str) -> bool:
+    """Return whether a field of the model, such as ``body_mass`` or ``opt.gravity``, may differ from copy to copy."""
+    from mujoco.mjx.warp import types
+
+    return bool(types._BATCH_DIM["Model"].get(path.replace(".", "__")))
+
+
+def check_field(path: str) -> None:
     """Refuse a field of the model that cannot differ from copy to copy.
 
     Raises:
         UsageError: With the field.
     """
-    from mujoco.mjx.warp import types
-
-    if not types._BATCH_DIM["Model"].get(name):
+    if not varies(path):
         raise UsageError(
-            f"MJX-Warp cannot change {name!r}: it is the same in all copies",
+            f"MJX-Warp cannot change {path!r}: it is the same in all copies",
             hint='set it in the model before it is compiled, or use impl="jax"',
         )
 
@@ -150,13 +156,3 @@ def _shared(data: Any) -> list[str]:
     from mujoco.mjx.warp import types
 
     return sorted(k for k in types.DATA_NON_VMAP if isinstance(getattr(data._impl, k), jax.Array))
-
-
-def _rows(host: Any) -> np.ndarray:
-    """Return which numbers of ``sensordata`` follow from accelerations, shape ``(nsensordata,)``, bool."""
-    late = np.asarray(host.sensor_needstage) == int(mj.mjtStage.mjSTAGE_ACC)
-    return np.repeat(late, np.asarray(host.sensor_dim))
-
-
-def _get(data: Any, path: str) -> Any:
-    return getattr(data._impl, path.removeprefix("_impl.")) if path.startswith("_impl.") else getattr(data, path)

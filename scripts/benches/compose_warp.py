@@ -1,0 +1,213 @@
+"""A composed robot on MuJoCo Warp, as an environment and in a graph, both with delays, against bare ``mjx.step``.
+
+A quadruped of 18 degrees of freedom stands and sways; all its parts collide with the floor and with one another.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from benches.figures import medians, row
+
+LEGS = {"fl": (1, 1), "fr": (1, -1), "hl": (-1, 1), "hr": (-1, -1)}
+TIMESTEP, SUBSTEPS = 0.004, 5
+CONTACTS, ROWS = 24, 96
+"""Room for contacts, times the number of copies, which share it, and for rows of constraints in each copy."""
+EPISODES = 32
+
+
+def quadruped() -> Any:
+    """Return a body on four legs with three position servos each."""
+    from sim2real import composer
+    from sim2real.composer import mjcf
+
+    root = mjcf.RootElement(model="quadruped")
+    root.worldbody.add("geom", name="torso", type="box", size=[0.2, 0.1, 0.05], mass=6)
+    root.worldbody.add("site", name="torso")
+    for name, (front, left) in LEGS.items():
+        hip = root.worldbody.add("body", name=f"{name}_hip", pos=[0.2 * front, 0.1 * left, 0])
+        thigh = hip.add("body", name=f"{name}_thigh", pos=[0, 0.05 * left, 0])
+        shin = thigh.add("body", name=f"{name}_shin", pos=[0, 0, -0.2])
+        for part, body, axis, end in (
+            ("hip", hip, [1, 0, 0], [0, 0.05 * left, 0]),
+            ("thigh", thigh, [0, 1, 0], [0, 0, -0.2]),
+            ("shin", shin, [0, 1, 0], [0, 0, -0.2]),
+        ):
+            joint = body.add("joint", name=f"{name}_{part}", type="hinge", axis=axis, damping=1, armature=0.01)
+            body.add("geom", name=f"{name}_{part}", type="capsule", fromto=[0, 0, 0, *end], size=[0.02], mass=0.5)
+            root.actuator.add("position", name=f"{name}_{part}", joint=joint, kp=100)
+    return composer.ModelWrapperEntity(root)
+
+
+def walk() -> Any:
+    """Return a task with what tasks have: observables of which two are late, a start by chance, a reward, an end."""
+    from sim2real import composer
+    from sim2real.composer.observation.observable import MJCFFeature
+
+    class Walk(composer.Task):
+        """Keep the body up."""
+
+        def __init__(self) -> None:
+            robot = quadruped()
+            arena = composer.Arena()
+            arena.mjcf_model.worldbody.add("geom", type="plane", size=[50, 50, 0.1])
+            option = arena.mjcf_model.option
+            option.cone, option.iterations, option.ls_iterations = "pyramidal", 10, 20
+            self._root_entity, self.robot = arena, robot
+            arena.add_free_entity(robot).pos = [0, 0, 0.42]
+            model = robot.mjcf_model
+            self.joints, self.torso = model.find_all("joint", exclude_attachments=True), model.find("site", "torso")
+            gyro = model.sensor.add("gyro", site=self.torso)
+            late = {"delay": 3, "buffer_size": 2}
+            add = robot.observables.add_observable
+            add("angles", MJCFFeature("qpos", self.joints, **late))
+            add("speeds", MJCFFeature("qvel", self.joints))
+            add("gyro", MJCFFeature("sensordata", gyro, **late))
+            add("axes", MJCFFeature("xmat", self.torso))
+            self.set_timesteps(SUBSTEPS * TIMESTEP, TIMESTEP)
+
+        def initialize_episode(self, physics: Any, random_state: Any) -> None:
+            physics.bind(self.joints).qpos = random_state.uniform(-0.1, 0.1, len(self.joints))
+
+        def get_reward(self, physics: Any) -> Any:
+            return physics.bind(self.torso).xpos[2] + physics.bind(self.torso).xmat[8]
+
+        def should_terminate_episode(self, physics: Any) -> Any:
+            return physics.bind(self.torso).xpos[2] < 0.1
+
+    return Walk()
+
+
+def wave(t: Any, angles: Any) -> Any:
+    """Return set points of the servos at a time [s] and at joint angles ``(12,)`` [rad]."""
+    import jax.numpy as jnp
+
+    return 0.15 * jnp.sin(9.0 * t + jnp.arange(12.0)) - 0.1 * angles
+
+
+def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
+    """Return the task as the world of a graph, with an agent whose messages are late by chance."""
+    import jax.numpy as jnp
+    from flax import struct
+
+    from sim2real import composer
+    from sim2real.graph import Base, BaseNode
+    from sim2real.graph.schedule import draw
+    from sim2real.runtime.compiled import CompiledGraph
+
+    @struct.dataclass
+    class Angles(Base):
+        action: Any
+
+    class Agent(BaseNode):
+        """Waves the legs, and leans on what they did."""
+
+        def init_output(self, rng: Any = None, graph_state: Any = None) -> Any:
+            return Angles(jnp.zeros(12))
+
+        def step(self, step_state: Any) -> Any:
+            seen = step_state.inputs["world"][-1].data.values["quadruped/angles"]
+            return step_state, Angles(wave(step_state.ts, seen[-1]))
+
+    world = composer.ComposedWorld("world", task, **options)
+    agent = Agent("actuator", rate=world.rate, delay_dist=0.003)
+    agent.connect(world, skip=True, delay_dist=0.004)
+    world.connect(agent, skip=True, delay_dist=0.005)
+    nodes = {"actuator": agent, "world": world}
+    return CompiledGraph(nodes, "actuator", draw(nodes, seconds, EPISODES, 0))
+
+
+def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]:
+    """Return what is compared: name -> a program of one copy and the starts of all, and the control steps it takes."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    from sim2real import composer
+
+    options = {"impl": "warp", "nconmax": CONTACTS, "njmax": ROWS}
+    environment = composer.MjxEnvironment(walk(), time_limit=1e3, **options)
+    graph = make_graph(walk(), options, length * SUBSTEPS * TIMESTEP)
+    ticks, joints = graph.rows * graph.wiring.ticks, slice(7, None)
+    times = jnp.arange(ticks) * SUBSTEPS * TIMESTEP
+    model = environment.mjx_model
+    blank = mjx.make_data(environment.model, impl="warp", naconmax=copies * CONTACTS, njmax=ROWS)
+
+    def bare(start: Any) -> Any:
+        def step(data: Any, t: Any) -> Any:
+            data = data.replace(ctrl=wave(t, data.qpos[joints]))
+            return jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=SUBSTEPS)[0], None
+
+        return left(jax.lax.scan(step, blank.replace(qpos=start[0], qvel=start[1]), times)[0])
+
+    def env(start: Any) -> Any:
+        def step(state: Any, t: Any) -> Any:
+            state = environment.step(state, wave(t, state.data.qpos[joints]))
+            return state, (state.reward, sum(x.sum() for x in state.observation.values()), state.done)
+
+        state, outcome = jax.lax.scan(step, start, times)
+        return left(state.data), outcome
+
+    def in_graph(key: Any) -> Any:
+        eps = jax.random.randint(key, (), 0, graph.episodes)
+        return left(graph.rollout(graph.init(key, eps=eps))[0].state["world"].data)
+
+    keys = jax.random.split(jax.random.key(0), copies)
+    starts = jax.jit(jax.vmap(environment.reset))(keys)
+    states = {"bare": (bare, (starts.data.qpos, starts.data.qvel)), "env": (env, starts), "graph": (in_graph, keys)}
+    return states, ticks
+
+
+def left(data: Any) -> Any:
+    """Return what is looked at of a state: positions, whether something had no room, rows of constraints."""
+    from sim2real.composer.mjx.warp import overflowed
+
+    return data.qpos, overflowed(data), data._impl.nefc
+
+
+def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[dict[str, Any]]:
+    """Return what an environment and a graph, with their delays, cost over as many bare steps of Warp."""
+    import jax
+
+    if importlib.util.find_spec("warp") is None:
+        print('MuJoCo Warp is not installed, its rows are left out: pip install "sim2real[warp]"', file=sys.stderr)
+        return []
+    sizes = sizes or ((8,) if jax.default_backend() == "cpu" else (4096, 8192, 32768))
+    return [r for copies in sizes for r in compared(copies, repeats, length)]
+
+
+def compared(copies: int, repeats: int, length: int) -> list[dict[str, Any]]:
+    """Return the rows of one number of copies."""
+    import jax
+    import numpy as np
+
+    begin = time.perf_counter()
+    states, ticks = programs(copies, length)
+    first_s, calls, compile_s, rows = time.perf_counter() - begin, {}, {}, {}
+    for name, (program, starts) in states.items():
+        begin = time.perf_counter()
+        compiled = jax.jit(jax.vmap(program)).lower(starts).compile()
+        compile_s[name] = time.perf_counter() - begin
+        calls[name] = lambda compiled=compiled, starts=starts: jax.block_until_ready(compiled(starts))
+        _, overflow, rows[name] = jax.tree_util.tree_leaves(calls[name]())[:3]
+        compile_s[name] = time.perf_counter() - begin
+        if np.any(overflow):
+            raise RuntimeError(f"{name}: contacts or constraints of {np.sum(overflow)} copies were left out")
+    seconds = medians(calls, repeats)
+    rate = {n: copies * ticks * SUBSTEPS / s for n, s in seconds.items()}
+    constraints = ", ".join(f"{np.mean(r):.1f}" for r in rows.values())
+    print(copies, seconds, compile_s, f"rows of constraints: {constraints}", file=sys.stderr)
+    told = f"bare mjx.step of Warp under the same control, {copies} copies"
+    name = f"compose/{jax.default_backend()}/warp/{copies}"
+    found = [row(f"{name}/bare_steps_per_s", round(rate["bare"]), "1/s", "physics steps, mjx.step alone")]
+    for key in ("env", "graph"):
+        over = round(seconds[key] / seconds["bare"], 3)
+        found.append(row(f"{name}/{key}_over_bare", over, "1", told, "<= 1.1"))
+        found.append(row(f"{name}/{key}_steps_per_s", round(rate[key]), "1/s", f"{rate['bare']:.3g} bare"))
+        seen = f"and a first rollout; {compile_s['bare']:.1f} bare"
+        found.append(row(f"{name}/{key}_compile_s", round(compile_s[key], 1), "s", seen))
+    return [*found, row(f"{name}/first_reset_s", round(first_s, 1), "s", "environment, graph, first reset")]
