@@ -1,6 +1,7 @@
 """Every bench runs with --quick, and its report says what it is of; figures are not looked at."""
 
 import ast
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -87,6 +88,19 @@ def test_compose(run, traced):
     found = names(run("compose"))
     assert {"compose/build_20_entities_ms", "compose/reset_ms", "compose/mjx_over_c_float64/contact_free"} <= found
     assert "compose/cpu/mjx_env_over_bare" in found
+
+
+@pytest.mark.slow
+def test_compose_on_warp(run):
+    pytest.importorskip("warp", reason='Warp is not installed: pip install "sim2real[warp]"')
+    name = f"compose/{jax.default_backend()}/warp/2"
+    assert {f"{name}/env_over_bare", f"{name}/graph_over_bare"} <= names(run("compose", "--parts", "warp"))
+
+
+def test_compose_without_warp_leaves_its_rows_out(monkeypatch, capsys):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert bench.main(["compose", "--quick", "--parts", "warp"]) == 0
+    assert "MuJoCo Warp is not installed, its rows are left out" in capsys.readouterr().err
 
 
 def test_log(run):
