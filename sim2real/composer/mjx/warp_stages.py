@@ -2,7 +2,8 @@
 
 MJX offers whole steps of Warp only, which compute positions and velocities of the state before the step. Its functions
 are generated, with a thousand lines each that hand array after array to Warp and end in one call,
-``mujoco_warp.step(m, d)``. Here they are taken as they are, with another function at their end.
+``mujoco_warp.step(m, d)``. Here they are taken as they are, with another function at their end: those of the release
+that ``pyproject.toml`` pins.
 """
 
 from __future__ import annotations
