@@ -130,6 +130,8 @@ class Binding:
         place.array[place.index] = value
         for other in layout.DISABLED_BY.get(self._fields[name].name, ()):
             getattr(self._physics.model.ptr, other)[list(self._ids)] = 0
+        if name == "gravcomp" and not self._physics.model.ptr.ngravcomp:
+            self._physics.count_compensated()
 
     def free(self) -> None:
         """Let go of MuJoCo's arrays."""

@@ -346,10 +346,13 @@ class Physics:
 
     def recompute_constants(self) -> None:
         """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
-        state = self.data.ptr.qpos.copy()
-        mj.mj_setConst(self.model.ptr, self.data.ptr)  # which moves the data to the reference position
-        self.data.ptr.qpos[:] = state
+        model = self.model.ptr
+        mj.mj_setConst(model, mj.MjData(model))  # not this state's: it would be left as computed at the reference
         self.mark_as_dirty()
+
+    def count_compensated(self) -> None:
+        """Have MuJoCo see that bodies are compensated for gravity, in a model where none was when it was compiled."""
+        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # nothing else sets the number of such bodies
 
     def render(
         self,

@@ -129,3 +129,23 @@ def test_copies_and_states_are_independent(arm):
     assert physics.data.qpos.tolist() == [0.5, -0.3]
     with pytest.raises(UsageError, match="must be between 0 and 0"):
         physics.reset(1)
+
+
+FREE = '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+
+
+def test_gravity_is_compensated_where_no_body_was_when_the_model_was_compiled():
+    model = mjcf.from_xml_string(FREE)
+    physics = mjcf.Physics.from_mjcf_model(model)
+    physics.bind(model.find("body", "ball")).gravcomp = 1.0
+    physics.forward()
+    assert abs(physics.data.qacc[2]) < 1e-12
+
+
+def test_constants_are_computed_anew_without_moving_the_state():
+    model = mjcf.from_xml_string(FREE)
+    physics = mjcf.Physics.from_mjcf_model(model)
+    physics.data.qpos[2] = 0.5
+    physics.forward()
+    physics.recompute_constants()
+    assert physics.data.xpos[1, 2] == 0.5  # what the next step starts from

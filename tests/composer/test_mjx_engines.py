@@ -1,6 +1,7 @@
 """What hooks write, on MJX as on C: options, masses, controls, places, and what is computed anew because of it."""
 
 import copy
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -10,7 +11,8 @@ from mujoco import mjx
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.mjx import constants
+from sim2real.composer.mjx import constants, stepping
+from sim2real.composer.mjx.environment import is_unstable
 from sim2real.composer.observation.observable import Generic, MJCFFeature
 from sim2real.composer.variation import PhysicsVariator, deterministic
 
@@ -159,3 +161,26 @@ def test_derived_constants_are_those_of_mj_set_const(double):
     for name, value in found.items():
         expected = getattr(varied, name)
         np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
+    """``mjx.step`` leaves accelerometers at 0 where nothing is constrained, and RK4's sensors in its last stage."""
+    model = mujoco.MjModel.from_xml_string(CHAIN)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    data = mujoco.MjData(model)
+    data.qvel[:] = 1.0
+    start = mjx.put_data(model, data)
+    found = jax.jit(lambda m, d: stepping.advance(m, d, False))(mjx.put_model(model), start)
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(found.sensordata, data.sensordata, rtol=1e-9)
+    np.testing.assert_allclose(found.qvel, data.qvel, rtol=1e-12)
+
+
+def test_an_episode_ends_where_mujoco_warns():
+    def unstable(value):
+        return bool(
+            is_unstable(SimpleNamespace(**dict.fromkeys(("qpos", "qvel"), np.zeros(2)), qacc=np.array([value])))
+        )
+
+    assert [unstable(v) for v in (1e9, -1e11, np.inf, np.nan)] == [False, True, True, True]

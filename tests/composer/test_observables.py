@@ -1,3 +1,5 @@
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sim2real import composer
@@ -124,3 +126,8 @@ def test_what_an_observable_misses_is_named_itself():
     Blind.speed = 0
     with pytest.raises(AttributeError, match="has no attribute 'wings'"):
         _ = Blind(bird).total
+
+
+def test_of_a_number_there_is_nothing_to_aggregate():
+    for name, aggregator in AGGREGATORS.items():
+        assert (aggregator(np.float64(2.0)), aggregator(jnp.float32(2.0))) == (2.0, 2.0), name

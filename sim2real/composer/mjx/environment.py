@@ -21,6 +21,7 @@ from sim2real.composer.mjx.rings import make_rings
 from sim2real.composer.mjx.tracing import TracedHooks
 from sim2real.composer.physics import Physics
 from sim2real.composer.task import Task
+from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
 
@@ -241,7 +242,7 @@ class MjxEnvironment:
             self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
-        diverged = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all() & jnp.isfinite(data.qacc).all())
+        diverged = is_unstable(data)
         diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
         reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
         ended = diverged | jnp.asarray(ends, bool)
@@ -307,6 +308,12 @@ def _initial_data(model: Any) -> Any:
     """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all that follows from it."""
     physics = Physics(model)  # which computes everything, without the actuators
     return mjx.put_data(model, physics.data.ptr, impl="jax")
+
+
+def is_unstable(data: Any) -> Any:
+    """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
+    state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
+    return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
 
 
 def _zeros(spec: Any) -> Any:

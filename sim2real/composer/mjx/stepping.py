@@ -8,23 +8,24 @@ from mujoco import mjx
 
 
 def advance(model: Any, data: Any, legacy: bool) -> Any:
-    """Return the data a time step later; with ``legacy``, with positions and velocities of the new state."""
-    return legacy_step(model, data) if legacy else mjx.step(model, data)
+    """Return the data a time step later; with ``legacy``, with positions and velocities of the new state.
 
-
-def legacy_step(model: Any, data: Any) -> Any:
-    """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
-
-    The data must be consistent: what ``forward`` or an earlier step returned. No dearer than ``mjx.step``: the same
-    stages, begun elsewhere.
+    With ``legacy`` the data must be consistent, what ``forward`` or an earlier step returned, and that is no dearer:
+    the same stages, begun elsewhere (``mj_step2; mj_step1``).
     """
-    integrator = model.opt.integrator
-    if integrator == mjx.IntegratorType.RK4:
-        return _positions(model, mjx.step(model, data))
+    if not legacy:
+        return _integrate(model, forward(model, data))
+    if model.opt.integrator == mjx.IntegratorType.RK4:
+        return _positions(model, _integrate(model, forward(model, data)))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    data = _accelerate(model, data)
-    data = mjx.euler(model, data) if integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
-    return _positions(model, data)
+    return _positions(model, _integrate(model, _accelerate(model, data)))
+
+
+def _integrate(model: Any, data: Any) -> Any:
+    if model.opt.integrator == mjx.IntegratorType.RK4:
+        # MuJoCo leaves sensors as they were before the step, mjx.rungekutta4 as in its last stage
+        return mjx.rungekutta4(model, data).replace(sensordata=data.sensordata)
+    return mjx.euler(model, data) if model.opt.integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
 
 
 def forward(model: Any, data: Any, actuation: bool = True) -> Any:

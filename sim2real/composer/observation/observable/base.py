@@ -25,7 +25,9 @@ class Aggregator:
         self.name, self.preserves_bounds = name, preserves_bounds
 
     def __call__(self, values: Any) -> Any:
-        """Return the reduced values."""
+        """Return the reduced values; a number, of which there is nothing to reduce, as it is."""
+        if np.ndim(values) == 0:  # as numpy does, and jax.numpy does not
+            return values
         return getattr(namespace(values), self.name)(values, axis=0)
 
     def __repr__(self) -> str:
