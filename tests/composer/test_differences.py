@@ -5,8 +5,11 @@ import re
 import warnings
 from pathlib import Path
 
+import jax
+import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
 from sim2real.composer import engine
 from sim2real.errors import UsageError
@@ -262,7 +265,70 @@ def test_derived_constants(oracle, ours):
     assert found == pytest.approx([1.0, 2.0], abs=1e-4)
 
 
+def test_gravity_compensation(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        arm = model(kit, joint='type="slide"')
+        physics = below_an_arena(kit, arm)
+        physics.bind(arm.find("body", "b")).gravcomp = 1.0
+        physics.forward()
+        found.append(float(physics.data.qacc[0]))
+    assert found == pytest.approx([-9.81, 0.0], abs=1e-2)
+
+
+def test_mocap_bodies(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement(model="root")
+        body = root.worldbody.add("body", name="m", mocap=True)
+        physics = kit.mjcf.Physics.from_mjcf_model(root)
+        physics.bind(body).mocap_pos = [0, 0, 1]
+        found.append(float(physics.bind(body).xpos[2]))
+    assert found == [0.0, 1.0]
+
+
 # -- observables
+
+
+def test_first_samples(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        samples = []
+        value = kit.observable.Generic(lambda physics, samples=samples: samples.append(1) or 0.0)
+        value.enabled = True
+        env = environment(kit, observables={"x": value})
+        before = len(samples)
+        env.reset()
+        found.append((before, len(samples)))
+    assert found == [(2, 6), (0, 1)]
+
+
+def test_initial_values(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        arena, arm = kit.composer.Arena(), model(kit, joint='type="slide"')
+        entity = kit.composer.ModelWrapperEntity(arm)
+        arena.attach(entity)
+        late = kit.observable.MJCFFeature("qpos", arm.find("joint", "j"), delay=100)
+        late.enabled = True
+        entity.observables.add_observable("x", late)
+        padding = kit.composer.ObservationPadding.INITIAL_VALUE
+        env = kit.composer.Environment(kit.composer.NullTask(arena), delayed_observation_padding=padding)
+        env.reset()
+        found.append(bool(np.any(env.step([]).observation["arm/x"])))
+    assert found == [True, False]
+
+
+def test_aggregated_numbers(oracle, ours):
+    for kit in (oracle, ours):
+        mean = kit.observable.Generic(lambda physics: np.float64(2.0), aggregator="mean")
+        mean.enabled = True
+        env = environment(kit, observables={"x": mean}, strip_singleton_obs_buffer_dim=True)
+        if kit is ours:
+            assert env.reset().observation["arm/x"] == 2.0
+        else:
+            with pytest.raises(ValueError, match="axis 0"):
+                env.reset()
 
 
 def test_functions_as_observables(oracle, ours):
@@ -328,6 +394,59 @@ def test_intervals_of_zero(ours):
     never = ours.observable.Generic(lambda physics: 1.0, update_interval=lambda: 0)
     with pytest.raises(UsageError, match="the update interval must be at least 1 step, got 0"):
         environment(ours, observables={"x": never}).reset()
+
+
+# -- MJX itself
+
+
+UNTOUCHED = '<default><geom contype="0" conaffinity="0"/></default>'
+
+
+def accelerations(xml, velocity, qpos=None):
+    """Return those of MuJoCo's C and of bare MJX in double precision."""
+    native = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(native)
+    data.qvel[:] = velocity
+    if qpos is not None:
+        data.qpos[:] = qpos
+    with jax.enable_x64(True):
+        start = mjx.put_data(native, data)
+        found = np.asarray(jax.jit(mjx.forward)(mjx.put_model(native), start).qacc)
+    mujoco.mj_forward(native, data)
+    return data.qacc, found
+
+
+def test_connects_and_welds():
+    link = '<body name="{}" pos="{} 0 0"><joint axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body>'
+    xml = f"<mujoco>{UNTOUCHED}<worldbody>{link.format('a', 0)}{link.format('b', 1)}</worldbody><equality>{{}}"
+    native, found = accelerations(
+        xml.format('<connect body1="a" body2="b" anchor=".5 0 0"/></equality></mujoco>'), [2.0, 5.0], [0.3, -0.2]
+    )
+    assert np.abs(native - found).max() > 1e-3
+
+
+def test_geoms_that_touch():
+    """MJX adds 1e-6 to the squared length of a capsule."""
+    ball = '<geom type="{}" size="{}"/>'
+    xml = f"""<mujoco><worldbody><body><freejoint/>{ball.format("sphere", ".05")}</body>
+      <body><freejoint/>{{}}</body></worldbody></mujoco>"""
+    pose = [0.0, 0, 0, 1, 0, 0, 0, 0.06, 0.01, 0.03, 1, 0.1, 0.2, 0.3]
+    native, found = accelerations(xml.format(ball.format("capsule", ".03 .08")), np.zeros(12), pose)
+    assert 1e-9 < np.abs(native - found).max() / np.abs(native).max() < 1e-2
+
+
+def test_implicit_steps():
+    native = mujoco.MjModel.from_xml_string(
+        """<mujoco><option integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0"/>
+        <geom size=".1" pos=".2 0 0"/></body></worldbody><actuator>
+        <position joint="j" kp="5" kv="1" forcelimited="true" forcerange="-.4 .4"/></actuator></mujoco>"""
+    )
+    data = mujoco.MjData(native)
+    data.ctrl[:], data.qvel[:] = 1.0, 0.5
+    with jax.enable_x64(True):
+        found = jax.jit(mjx.step)(mjx.put_model(native), mjx.put_data(native, data)).qvel[0]
+    mujoco.mj_step(native, data)
+    assert 1e-4 < abs(found - data.qvel[0]) < 1e-2
 
 
 # -- images

@@ -1,0 +1,238 @@
+"""Plays random tasks on dm_control, on C and on MJX in double precision, and says where their streams differ.
+
+``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C;
+with ``--engine mjx`` on C and on MJX, from the same random numbers; with ``--engine bare`` on MJX and with ``mjx.step``
+alone, where hooks only set the controls. ``--contacts same`` has contacts that MJX finds as C does, ``--contacts all``
+any; ``--jobs`` is how many processes there are.
+"""
+
+import argparse
+import functools
+import multiprocessing
+import sys
+import time
+import traceback
+
+import numpy as np
+from dm_env import specs
+from random_tasks import kit, make
+
+STEPS = 12
+DRAWS = ("uniform", "normal", "lognormal", "exponential", "randint", "choice", "binomial")
+
+
+class Numbers(np.random.RandomState):
+    """From the start of an episode on, draws what a JAX key gives, so that all engines see the same numbers."""
+
+    def __init__(self, key):
+        super().__init__(0)
+        self.key = key
+
+    def start(self):
+        import jax
+
+        from sim2real.composer.mjx.random import JaxRandomState
+
+        state = JaxRandomState(jax.random.key(self.key))
+        for name in DRAWS:
+            setattr(self, name, functools.partial(self._draw, getattr(state, name)))
+
+    @staticmethod
+    def _draw(function, *args, **kwargs):
+        return np.array(function(*args, **kwargs))[()]
+
+
+def _as_ours(kit, task):
+    """Let dm_control sample as often as we do, and pad with the first sample: rows of "Differences from dm_control"."""
+    physics = kit.mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
+    for observable in task.observables.values():
+        value = np.asarray(observable._callable(physics)())
+        known = {"array_spec": specs.Array(value.shape, value.dtype)}
+        observable.__class__ = type("Known", (type(observable),), known)
+        if observable.corruptor is None:
+            observable.corruptor = lambda value, random_state: np.array(value)
+
+
+def _actions(seed, size):
+    return np.random.RandomState(seed).uniform(-1, 1, (STEPS, size))
+
+
+def play(kit, seed, contacts=None, varied=False, key=0, episodes=1, numbers=0):
+    """Return the streams of a task on the C engine: observations, rewards, discounts; whether it is unstable."""
+    task, options = make(kit, seed, contacts, varied, numbers)
+    if kit.name == "dm_control":
+        _as_ours(kit, task)
+    env = kit.composer.Environment(task, random_state=Numbers(key), **options)
+    found: list = [[], [], [], False]
+    for _ in range(episodes):
+        step = env.reset()
+        found[0].append(dict(step.observation))
+        for action in _actions(seed, env.action_spec().shape[0]):
+            try:
+                step = env.step(action)
+            except RuntimeError as error:
+                if type(error).__name__ != "PhysicsError":
+                    raise
+                found[3] = True
+                return found
+            for stream, value in zip(found, (dict(step.observation), step.reward, step.discount), strict=False):
+                stream.append(value)
+            if step.last():
+                break
+    return found
+
+
+def play_on_mjx(seed, contacts=None, varied=False, keys=(0,)):
+    """Return the streams of a task on MJX, one for each key."""
+    import jax
+
+    ours = kit("sim2real")
+    task, options = make(ours, seed, contacts, varied)
+    env = ours.composer.MjxEnvironment(task, **options)
+    program, actions = jax.jit(_episode(env)), _actions(seed, env.model.nu)
+    return [_streams(jax.device_get(program(jax.random.key(key), actions))) for key in keys]
+
+
+def play_variants_on_mjx(seed, variants, contacts=None):
+    """Return the streams of tasks that differ in the numbers of their models, as copies in one program."""
+    import jax
+    from mujoco import mjx
+
+    ours = kit("sim2real")
+    tasks = [make(ours, seed, contacts, True, numbers) for numbers in variants]
+    env = ours.composer.MjxEnvironment(tasks[0][0], **tasks[0][1])
+    for task, _ in tasks:
+        task.initialize_episode_mjcf(None)
+    models = [task.root_entity.mjcf_model.root_model.compile() for task, _ in tasks]
+    leaves = [jax.tree_util.tree_leaves(mjx.put_model(m)) for m in models]
+    stacked = jax.tree_util.tree_structure(env.mjx_model).unflatten(map(np.stack, zip(*leaves, strict=True)))
+    starts = np.stack([m.qpos0 for m in models]), np.zeros((len(models), models[0].nv))
+    keys = jax.vmap(jax.random.key)(np.array(variants))
+    actions = _actions(seed, env.model.nu)
+    program = jax.jit(jax.vmap(_episode(env), (0, None, 0, 0)))
+    found = jax.device_get(program(keys, actions, stacked, starts))
+    return [_streams(jax.tree_util.tree_map(lambda x, i=i: x[i], found)) for i in range(len(variants))]
+
+
+def _episode(env):
+    """Return a function that plays an episode: key and actions -> first observation, and all that follows."""
+    import jax
+
+    def play(key, actions, model=None, start=None):
+        first = env.reset(key, model, start)
+        states = jax.lax.scan(lambda s, a: (env.step(s, a, model),) * 2, first, actions)[1]
+        return first.observation, (states.observation, states.reward, states.discount, states.done)
+
+    return play
+
+
+def _streams(found):
+    first, (rest, rewards, discounts, done) = found
+    last = int(np.argmax(done)) + 1 if done.any() else STEPS
+    observations = [first, *({k: v[i] for k, v in rest.items()} for i in range(last))]
+    return [observations, list(rewards[:last]), list(discounts[:last]), not discounts[:last].all()]
+
+
+def differ(a, b):
+    """Return the greatest deviation of two plays, relative above 1, and where it is; infinite where shapes differ."""
+    worst = (0.0, "")
+    common = min(len(a[0]), len(b[0]))
+    if a[3] or b[3]:  # MuJoCo warns at the end of a step or at the start of the next one, MJX's copies end with it
+        if abs(len(a[0]) - len(b[0])) > 1:
+            return np.inf, f"unstable after {len(a[0]) - 1} steps and {len(b[0]) - 1}"
+        a, b = ([p[0][: common - 1], p[1][: common - 2], p[2][: common - 2]] for p in (a, b))
+    elif len(a[0]) != len(b[0]):
+        return np.inf, f"{len(a[0]) - 1} steps and {len(b[0]) - 1}"
+    for what, one, other in zip(("observation", "reward", "discount"), a[:3], b[:3], strict=True):
+        for i, (x, y) in enumerate(zip(one, other, strict=True)):
+            for name in x if isinstance(x, dict) else [""]:
+                p, q = (np.asarray(v[name] if isinstance(v, dict) else v, float) for v in (x, y))
+                if p.shape != q.shape:
+                    return np.inf, f"{what} {name} {i}: shapes {p.shape} and {q.shape}"
+                if not p.size:
+                    continue
+                gap = float((np.abs(p - q) / np.maximum(1.0, np.abs(q))).max())
+                if not gap <= worst[0]:
+                    worst = (
+                        (np.inf if np.isnan(gap) else gap),
+                        f"{what} {name} {i}: {p.ravel()[:6]} and {q.ravel()[:6]}",
+                    )
+    return worst
+
+
+def against_bare(seed, contacts):
+    """Return how far a task whose hooks only set the controls is from ``mjx.step`` alone on MJX."""
+    import jax
+    from mujoco import mjx
+
+    ours = kit("sim2real")
+    task, options = make(ours, seed, contacts, busy=False)
+    env = ours.composer.MjxEnvironment(task, **options)
+    start = jax.jit(env.reset)(jax.random.key(0))
+
+    def bare(data, action):
+        data, _ = jax.lax.scan(
+            lambda d, _: (mjx.step(env.mjx_model, d), None), data.replace(ctrl=action), length=env.substeps
+        )
+        return data, (data.qpos, data.qvel, data.act)
+
+    def mine(state, action):
+        state = env.step(state, action)
+        return state, (state.data.qpos, state.data.qvel, state.data.act)
+
+    actions = _actions(seed, env.model.nu)
+    both = [
+        jax.jit(lambda s, a, f=f: jax.lax.scan(f, s, a)[1])(s, actions) for f, s in ((bare, start.data), (mine, start))
+    ]
+    return differ(*([list(np.concatenate(streams, axis=1)), [], [], False] for streams in both))
+
+
+def compare(seed, contacts=None, engine="dm_control"):
+    """Return the greatest deviation between what an engine and ours on C make of a task, and where it is."""
+    ours = kit("sim2real")
+    if engine == "bare":
+        return against_bare(seed, contacts)
+    if engine == "mjx":
+        mine = play_on_mjx(seed, contacts, True, (0, 1))
+        return max(differ(play(ours, seed, contacts, True, key), m) for key, m in enumerate(mine))
+    return differ(*(play(kit(name), seed, contacts, episodes=2) for name in ("dm_control", "sim2real")))
+
+
+def _compare(given):
+    import jax
+
+    start = time.process_time()
+    try:
+        with jax.enable_x64(True):
+            found = compare(*given)
+    except Exception:
+        found = np.inf, traceback.format_exc()
+    return given[0], *found, time.process_time() - start
+
+
+def main():
+    """Play the tasks of some seeds; print what differs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("first", type=int)
+    parser.add_argument("count", type=int)
+    parser.add_argument("--engine", choices=["dm_control", "mjx", "bare"], default="dm_control")
+    parser.add_argument("--contacts", choices=["same", "all"])
+    parser.add_argument("--jobs", type=int, default=1)
+    args = parser.parse_args()
+    tolerance = 1e-6 if args.engine == "mjx" and args.contacts else 1e-9
+    tasks = [(seed, args.contacts, args.engine) for seed in range(args.first, args.first + args.count)]
+    good, played = [], 0
+    with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
+        for seed, worst, where, seconds in pool.imap_unordered(_compare, tasks):
+            agrees, played = worst < tolerance, played + 1
+            good += [worst] if agrees else []
+            print(
+                f"{seed}: {worst:.1e}, {seconds:.0f} s of processor time{'' if agrees else ' DIFFERS ' + where}",
+                flush=True,
+            )
+    print(f"{len(good)} of {played} tasks agree, to {max(good, default=0.0):.1e}")
+    return len(good) < played
+
+
+if __name__ == "__main__":
+    sys.exit(main())
