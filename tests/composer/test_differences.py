@@ -276,7 +276,7 @@ def test_gravity_compensation(oracle, ours):
     assert found == pytest.approx([-9.81, 0.0], abs=1e-2)
 
 
-def test_mocap_bodies(oracle, ours):
+def test_mocap_poses(oracle, ours):
     found = []
     for kit in (oracle, ours):
         root = kit.mjcf.RootElement(model="root")
