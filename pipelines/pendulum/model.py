@@ -179,7 +179,7 @@ class Agent(BaseNode):
             observations=jnp.concatenate([_features(step_state)[None], state.observations[:-1]]),
             actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], state.actions[:-1]]),
         )
-        return step_state.replace(state=state), Command(action=action)  # pyright: ignore[reportAttributeAccessIssue]
+        return step_state.replace(state=state), Command(action=action)
 
     def step(self, step_state: StepState) -> tuple[StepState, Command]:
         """Ask the policy."""

@@ -36,7 +36,7 @@ def from_groups(values: Mapping[str, Any], start: Any) -> PendulumParams:
     """
     p = nominal_params()
     K = values["gain"] * p.R * p.J
-    return p.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    return p.replace(
         K=K,
         mass=values["gravity"] * p.J / (GRAVITY * p.length),
         b=values["damping"] * p.J - K**2 / p.R,

@@ -55,7 +55,7 @@ class BraxEnv(Env):
     def _state(self, state: Any, info: dict[str, Any]) -> BraxState:
         dtype = state.reward.dtype
         info |= {"truncation": state.truncated.astype(dtype), "failed": state.failed.astype(dtype)}
-        return BraxState(state, _observed(state), state.reward, state.done.astype(dtype), {}, info)  # pyright: ignore[reportArgumentType]
+        return BraxState(state, _observed(state), state.reward, state.done.astype(dtype), {}, info)
 
     @property
     def observation_size(self) -> int:

@@ -145,7 +145,7 @@ class ComposedWorld(BaseWorld):
         # What is over stays over: others look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
-        new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
+        new = step_state.replace(state=state)
         return new, self.output(state)
 
     def ends(self, state: State) -> tuple[Any, Any]:

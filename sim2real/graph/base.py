@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import jax
 from flax import struct
@@ -12,11 +13,16 @@ T = TypeVar("T", bound="Base")
 
 
 class Base:
-    """Arithmetic and indexing over the leaves of a flax dataclass.
+    """Arithmetic, indexing and ``replace`` for a flax dataclass.
 
     ``a + b``, ``a * 2.0`` and the like act leaf by leaf; the other operand is a tree of the same structure or a scalar.
     ``a[i]`` indexes the leading axis of every leaf.
     """
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other values in some fields."""
+        # flax gives each of its dataclasses this very method, where no type checker sees it.
+        return dataclasses.replace(cast(Any, self), **changes)
 
     def _map(self: T, op: Any, other: Any) -> T:
         same = jax.tree_util.tree_structure(self) == jax.tree_util.tree_structure(other)

@@ -199,7 +199,7 @@ class TrainableDist(Base, DelayDistribution):
     def with_delay(self, delay: Any) -> TrainableDist:
         """Return the distribution at another delay [s], clipped to its bounds."""
         alpha = jnp.clip((jnp.asarray(delay, jnp.float32) - self.min) / (self.max - self.min), 0.0, 1.0)
-        return self.replace(alpha=alpha)  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(alpha=alpha)
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return the smallest delay [s] in the given shape: timelines are drawn with it."""
@@ -244,7 +244,7 @@ class TrainableDist(Base, DelayDistribution):
         """
         late = age_s - self.delay  # time since arrival at this delay; negative: not there yet
         received = jnp.where(inputs.seq >= 0, inputs.ts_sent + self.delay, inputs.ts_recv)
-        inputs = inputs.replace(ts_recv=received)  # pyright: ignore[reportAttributeAccessIssue]
+        inputs = inputs.replace(ts_recv=received)
         if self.interp == "zoh_mean":
             return _mean_over_period(inputs, late, window, period_s)
         width = inputs.seq.shape[0]

@@ -139,7 +139,7 @@ class Problem:
         first = jax.tree_util.tree_map(lambda rows: rows[eps], self._first)
         cast = lambda new, old: jnp.asarray(new, old.dtype)  # noqa: E731
         held = {n: jax.tree_util.tree_map(cast, first[n], gs.buffer[n]) for n in first}
-        gs = gs.replace(buffer={**gs.buffer, **held})  # pyright: ignore[reportAttributeAccessIssue]
+        gs = gs.replace(buffer={**gs.buffer, **held})
         _, records = self.graph.rollout(gs, record=(self.model.sensor,))
         record = records[self.model.sensor]
         return record.output, record.seq

@@ -106,7 +106,7 @@ class GoalAgent(BaseNode):
         row = jnp.concatenate([reading.position, reading.velocity, goal]).astype(jnp.float32)
         new = AgentState(goal=goal, past=jnp.concatenate([row[None], state.past])[: self._history])
         decision = Decision(goal, jnp.asarray(step_state.params.aim, jnp.float32))
-        return step_state.replace(state=new), decision  # pyright: ignore[reportAttributeAccessIssue]
+        return step_state.replace(state=new), decision
 
     def step(self, step_state: StepState) -> tuple[StepState, Decision]:
         """Make a step with the policy's action."""

@@ -124,7 +124,7 @@ class ServoSensor(BaseNode):
         """Read the servos."""
         reading = self._rig.measure()
         ts = max(self.at(reading.transaction.t_sent_ns), float(step_state.ts))
-        return step_state.replace(ts=ts), self._message(reading)  # pyright: ignore[reportAttributeAccessIssue]
+        return step_state.replace(ts=ts), self._message(reading)
 
 
 class ServoActuator(BaseNode):

@@ -49,7 +49,7 @@ class ServoWorld(ComposedWorld):
             state, goal = step_state.state, step_state.inputs["actuator"][-1].data.goal
             reference = jnp.where(state.steps == 0, goal, state.variables[REFERENCE])
             state = state.replace(variables={**state.variables, REFERENCE: reference})
-            step_state = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
+            step_state = step_state.replace(state=state)
         return super().step(step_state)
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:

@@ -28,6 +28,6 @@ def make_room(nodes: Mapping[str, BaseNode], timeline: Timeline) -> dict[tuple[s
         while isinstance(dist := connection.delay_dist, TrainableDist) and np.any(
             overfull(connection, edge, reader, sender)
         ):
-            connection.delay_dist = dist.replace(burst=dist.burst + 1)  # pyright: ignore[reportAttributeAccessIssue]
+            connection.delay_dist = dist.replace(burst=dist.burst + 1)
             grown[key] = grown.get(key, 0) + 1
     return grown

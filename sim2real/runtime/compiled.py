@@ -114,7 +114,7 @@ class CompiledGraph:
         buffer |= {name: outputs[name] for name in self.given}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
         # A numpy number, not a traced one: code later in the same program can see that this is the first row.
-        return _replace(gs, eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
+        return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
         """Run to the supervisor's first step.
@@ -232,7 +232,7 @@ class CompiledGraph:
         inside = inside or not _traced(gs.step)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
-        return _replace(gs, seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
+        return gs.replace(seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
     def advance(self, gs: GraphState, step_state: StepState, output: Any, inside: bool = False) -> GraphState:
         """Take the supervisor's step and run the rest of the row; the counterpart of ``observe``.
@@ -249,7 +249,7 @@ class CompiledGraph:
         turn, k = self._walk.only_turn(), self._awaited(gs, "advance")
         inside = inside or not _traced(gs.step)
         ran = None if inside and self.program.always(turn) else k >= 0
-        gs = self.program.commit(_replace(gs, seq={}), self.supervisor, step_state, output, ran)
+        gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
         gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
         return self.program.run_world(gs, {}, inside)
 
@@ -309,7 +309,3 @@ class CompiledGraph:
 def _traced(x: Any) -> bool:
     """Return whether a value is traced, or an array with several values."""
     return isinstance(x, Tracer) or np.ndim(x) > 0
-
-
-def _replace(gs: GraphState, /, **fields: Any) -> GraphState:
-    return gs.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]

@@ -170,7 +170,7 @@ def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str
         supervisor: The node whose steps ``GraphState.step`` counts.
     """
     carried = {name: d.carried for name, d in data.items()}
-    return graph_state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    return graph_state.replace(
         step=np.int32(carried[supervisor][3]),
         rng={n: c[0] for n, c in carried.items()},
         params={n: c[1] for n, c in carried.items()},

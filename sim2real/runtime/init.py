@@ -74,13 +74,13 @@ def init_graph_state(
     for n in names:
         if n not in state.params:
             made = _fixed(nodes[n], nodes[n].init_params(keys[n][1], state))
-            state = _replace(state, params={**state.params, n: made})
+            state = state.replace(params={**state.params, n: made})
     for n in names:
         made = _fixed(nodes[n], nodes[n].init_state(keys[n][2], state))
-        state = _replace(state, state={**state.state, n: made})
+        state = state.replace(state={**state.state, n: made})
     outputs = {n: jax.tree_util.tree_map(_strong, nodes[n].init_output(keys[n][3], state)) for n in names}
-    state = _replace(state, aux={**state.aux, OUTPUTS: outputs})
-    return _replace(state, delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state))})
+    state = state.replace(aux={**state.aux, OUTPUTS: outputs})
+    return state.replace(delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state))})
 
 
 def default_output(graph_state: GraphState, node: str) -> Any:
@@ -119,7 +119,3 @@ def _strong(leaf: Any) -> Any:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return leaf
     return jnp.asarray(leaf, dtype=jnp.result_type(leaf))
-
-
-def _replace(state: GraphState, /, **fields: Any) -> GraphState:
-    return state.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]

@@ -101,7 +101,7 @@ class RowProgram:
             outputs.setdefault(name, []).extend(
                 jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], made) for i in range(self.wiring.ticks)
             )
-        gs = gs.replace(step=gs.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
     def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
@@ -158,7 +158,7 @@ class RowProgram:
             fresh = matched(name, "the output of step", output, "that of init_output", kept[-1])
             pushed = (*kept[1:], fresh)
             changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, kept)}
-        return gs.replace(**changed)  # pyright: ignore[reportAttributeAccessIssue]
+        return gs.replace(**changed)
 
     def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any]) -> StepState:
         inputs = {}

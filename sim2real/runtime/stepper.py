@@ -171,5 +171,5 @@ def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Any]) -> S
             bare = InputState(wide.seq, wide.ts_sent, wide.ts_recv, wide.data)
             c = node.inputs[name]
             served = dist.apply(bare, age, c.window, 1.0 / node.rate, step_state.ts, c.skip)
-            inputs[name] = served.replace(delay_dist=dist)  # pyright: ignore[reportAttributeAccessIssue]
-    return step_state.replace(inputs=inputs)  # pyright: ignore[reportAttributeAccessIssue]
+            inputs[name] = served.replace(delay_dist=dist)
+    return step_state.replace(inputs=inputs)

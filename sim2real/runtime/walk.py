@@ -109,7 +109,7 @@ class Walk:
     def _stand(self, gs: GraphState, turn: Any) -> tuple[GraphState, StepState]:
         """Return the state with the supervisor's next step noted in ``seq``, and what the supervisor sees."""
         step_state = self.seen(gs, turn)
-        return gs.replace(seq={self.supervisor: step_state.seq}), step_state  # pyright: ignore[reportAttributeAccessIssue]
+        return gs.replace(seq={self.supervisor: step_state.seq}), step_state
 
     def _hop(self, gs: GraphState, i: int) -> GraphState:
         """Run from turn ``i`` to the next turn, in this row or the next one."""

@@ -123,5 +123,5 @@ class MjxWorld(BaseWorld):
             data = advance(model, data, legacy=False)
         else:
             data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
-        new = step_state.replace(state=data)  # pyright: ignore[reportAttributeAccessIssue]
+        new = step_state.replace(state=data)
         return new, JointState(data.qpos, data.qvel)

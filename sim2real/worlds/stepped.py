@@ -57,7 +57,7 @@ class SteppedWorld(BaseWorld):
         """Integrate over one tick."""
         params = step_state.params
         state = self.integrate(params, step_state.state, self.command(step_state))
-        new = step_state.replace(state=state)  # pyright: ignore[reportAttributeAccessIssue]
+        new = step_state.replace(state=state)
         return new, self.output(params, state)
 
     def over_substeps(self, substep: Callable[[Any, float], Any], state: Any) -> Any:

@@ -30,9 +30,9 @@ def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -
     keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}
     gs = GraphState()
     for n, node in nodes.items():
-        gs = _replace(gs, params={**gs.params, n: node.init_params(keys[n][0], gs)})
+        gs = gs.replace(params={**gs.params, n: node.init_params(keys[n][0], gs)})
     for n, node in nodes.items():
-        gs = _replace(gs, state={**gs.state, n: node.init_state(keys[n][1], gs)})
+        gs = gs.replace(state={**gs.state, n: node.init_state(keys[n][1], gs)})
     inputs = {}
     for input_name, c in nodes[name].inputs.items():
         sender = c.output_node.name
@@ -142,10 +142,6 @@ class RuntimeConformance(ABC):
                 got = [int(x) for x in played.outputs.get(name, ())]
                 assert got == [mix(h, 7) for h in hashes][: len(got)], f"seed {seed}: node {name!r} saw other messages"
                 assert len(got) >= 0.6 * len(hashes) - 3, f"seed {seed}: node {name!r} made {len(got)} steps"
-
-
-def _replace(gs: GraphState, /, **fields: Any) -> GraphState:
-    return gs.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _without_keys(tree: Any) -> Any:

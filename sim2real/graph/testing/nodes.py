@@ -66,7 +66,7 @@ class HashInPython(BaseNode):
             for _, w in sorted(step_state.inputs.items())
         ]
         acc, out = hash_step(int(step_state.state), int(step_state.seq), windows)
-        return _replace(step_state, state=np.uint32(acc)), Value(x=np.uint32(out))
+        return step_state.replace(state=np.uint32(acc)), Value(x=np.uint32(out))
 
 
 class HashInJax(HashInPython):
@@ -85,7 +85,7 @@ class HashInJax(HashInPython):
             window = step_state.inputs[name]
             for i in range(window.seq.shape[0]):
                 acc = mixed(mixed(acc, window.seq[i]), window.data.x[i])
-        return _replace(step_state, state=acc), Value(x=mixed(acc, jnp.uint32(7)))
+        return step_state.replace(state=acc), Value(x=mixed(acc, jnp.uint32(7)))
 
 
 class HashWorldInPython(HashInPython, BaseWorld):
@@ -114,7 +114,7 @@ class Contraction(BaseNode):
         seen = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
         target = sum(seen) / max(len(seen), 1)
         state = 0.5 * step_state.state + 0.4 * target + jnp.sin(1.3 * step_state.seq)
-        return _replace(step_state, state=state), Value(x=jnp.tanh(state))
+        return step_state.replace(state=state), Value(x=jnp.tanh(state))
 
 
 class ContractingWorld(Contraction, BaseWorld):
@@ -235,7 +235,3 @@ def _delays(rng: np.random.Generator, rate: float, at_least: float) -> dict[str,
         samples[rng.random(200) < 0.05] += float(rng.uniform(1.0, 4.0)) / rate
     samples = np.maximum(samples.round(4), at_least)
     return {"delay_dist": EmpiricalDist(samples, block=int(rng.integers(1, 4))), "delay": round(scale, 4)}
-
-
-def _replace(step_state: StepState, /, **fields: Any) -> StepState:
-    return step_state.replace(**fields)  # pyright: ignore[reportAttributeAccessIssue]
