@@ -7,10 +7,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
-from brax.envs.base import State as BraxState
 
 from sim2real.composer.mjx.environment import MjxEnvironment
+from sim2real.errors import Sim2RealError
+
+try:
+    from brax.envs.base import Env
+    from brax.envs.base import State as BraxState
+except ImportError as error:
+    raise Sim2RealError("BraxEnv needs brax, which is not installed", hint="pip install 'sim2real[interop]'") from error
 
 _FIRST_STATE, _FIRST_OBSERVATION = "first_pipeline_state", "first_obs"
 """Where brax's ``AutoResetWrapper`` keeps what an episode that is over goes on from."""

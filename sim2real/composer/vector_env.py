@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import jax
 import numpy as np
 from dm_env import specs
-from gymnasium.vector import AutoresetMode, VectorEnv
 
 from sim2real.composer.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
+
+try:
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv
+except ImportError as error:
+    raise Sim2RealError(
+        "MjxVectorEnv needs gymnasium, which is not installed", hint="pip install 'sim2real[interop]'"
+    ) from error
 
 
 class MjxVectorEnv(VectorEnv):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.delays import EmpiricalDist, StaticDist
 
 _CONSTANT_S = 1e-7
@@ -26,6 +26,7 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
 
     Raises:
         UsageError: When there are too few samples, or one is negative or not finite.
+        Sim2RealError: When scikit-learn is not installed, which is no part of a plain installation.
     """
     x = _checked(samples)
     if x.std() < _CONSTANT_S:
@@ -34,7 +35,13 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
         raise UsageError(f"{x.size} delays are too few for a mixture of up to {components} components")
     import distrax  # imported late: distrax takes 1.6 s, scikit-learn another 1 s
     import jax.numpy as jnp
-    from sklearn.mixture import GaussianMixture
+
+    try:
+        from sklearn.mixture import GaussianMixture
+    except ImportError as error:
+        raise Sim2RealError(
+            "fit_mixture needs scikit-learn, which is not installed", hint="pip install 'sim2real[mixture]'"
+        ) from error
 
     scaled = ((x - x.mean()) / x.std())[:, None]
     fits = [GaussianMixture(k, random_state=seed, reg_covar=1e-6).fit(scaled) for k in range(1, components + 1)]

@@ -194,7 +194,9 @@ def _read_lerobot(path: Path) -> ForeignFile:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise UsageError(f"{path} is a Parquet file, which needs pyarrow", hint="pip install pyarrow") from None
+        raise UsageError(
+            f"{path} is a Parquet file, which needs pyarrow", hint="pip install 'sim2real[parquet]'"
+        ) from None
     try:
         file = pyarrow.parquet.ParquetFile(path)
     except (pyarrow.ArrowException, *_DAMAGED) as error:

@@ -1,5 +1,7 @@
 """A composed task as a node of a graph, as a brax environment and as a gymnasium vector environment."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from flax import struct
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
@@ -207,7 +209,7 @@ def test_brax_may_save_the_fresh_starts(environment):
 
 @pytest.fixture(scope="module")
 def vector(environment):
-    pytest.importorskip("gymnasium", reason="the vector environment: pip install gymnasium")
+    pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
     return composer.MjxVectorEnv(environment, 4)
 
 
@@ -238,3 +240,17 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     assert not truncated.any()
     assert infos["discount"].tolist() == [1.0, 0.0, 1.0, 1.0]
     assert reward[:2].tolist() == [1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "needed"),
+    [("BraxEnv", "brax_env", "brax.envs.base"), ("MjxVectorEnv", "vector_env", "gymnasium")],
+)
+def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):
+    monkeypatch.delitem(vars(composer), name, raising=False)
+    monkeypatch.delitem(sys.modules, f"sim2real.composer.{module}", raising=False)
+    monkeypatch.setitem(sys.modules, needed, None)
+    library = needed.partition(".")[0]
+    with pytest.raises(Sim2RealError, match=f"{name} needs {library}, which is not installed") as caught:
+        getattr(composer, name)
+    assert caught.value.hint == "pip install 'sim2real[interop]'"

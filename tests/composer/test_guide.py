@@ -10,7 +10,7 @@ GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "compose.md"
 
 @pytest.mark.slow
 def test_every_block_of_the_guide_runs():
-    pytest.importorskip("gymnasium", reason="the vector environment: pip install gymnasium")
+    pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
     blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.DOTALL | re.MULTILINE)
     assert len(blocks) == 9
     names = {"__name__": "guide"}

@@ -214,7 +214,7 @@ def test_actions_of_a_task_s_own_and_after_compile():
     after = jax.eval_shape(environment.step, jax.eval_shape(environment.reset, jax.random.key(0)), jnp.zeros(3))
     assert after.data.ctrl.shape == (1,)
     assert composer.BraxEnv(environment).action_size == 3
-    pytest.importorskip("gymnasium", reason="the vector environment: pip install gymnasium")
+    pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
     space = composer.MjxVectorEnv(environment, 2).single_action_space
     assert (space.low.tolist(), space.high.tolist()) == ([-1, -2, -np.inf], [1, 1, 1])
 

@@ -1,7 +1,9 @@
+import sys
+
 import numpy as np
 import pytest
 
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.fitting import fit_mixture, resample
 
 
@@ -59,3 +61,10 @@ def test_what_is_no_record_of_delays_is_refused(bad):
 def test_too_few_delays_are_refused():
     with pytest.raises(UsageError, match="too few"):
         fit_mixture(np.array([0.1, 0.2, 0.3]))
+
+
+def test_without_scikit_learn_the_error_names_the_extra(two_modes, monkeypatch):
+    monkeypatch.setitem(sys.modules, "sklearn.mixture", None)
+    with pytest.raises(Sim2RealError, match="fit_mixture needs scikit-learn") as caught:
+        fit_mixture(two_modes)
+    assert caught.value.hint == "pip install 'sim2real[mixture]'"
