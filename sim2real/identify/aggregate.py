@@ -34,10 +34,10 @@ class Aggregate:
 def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
     """Combine estimates ``(K,)`` with their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
 
-    A recording's own error does not know what differs between recordings: temperature, wear, the model's own error on
-    other motions. The interval is that of a further recording's estimate: the prediction interval of Higgins, Thompson
-    and Spiegelhalter (2009), and on top of it the typical error of one recording. So it holds nearly every estimate
-    that was made, and tells how much to randomise.
+    The standard error of one recording does not include what differs between recordings: temperature, wear, the
+    model's error on other motions. The interval is for the estimate from one more recording: the prediction interval of
+    Higgins, Thompson and Spiegelhalter (2009), widened by the typical standard error of one recording. It tells how
+    much to randomise in training.
 
     Raises:
         UsageError: When there are fewer than two recordings.

@@ -12,7 +12,7 @@ _LONGEST_S = 1.0
 
 
 def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
-    """Return flags that move the bound at which a parameter lies, or hold it there where nothing lies beyond.
+    """Return flags that widen the bound at which a parameter lies, or fix it there where the bound is physical.
 
     Args:
         p: The parameter, with its bounds.
@@ -34,7 +34,13 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
 
 
 def way_out_of(trip: RoundTrip, parameters: dict[str, Parameter], max_delay_s: float) -> str:
-    """Return flags for a round trip at a bound; the parts are looked up by name."""
+    """Return flags for a round-trip delay that lies at a bound.
+
+    Args:
+        trip: The sum of the delays.
+        parameters: Name -> parameter, with its bounds.
+        max_delay_s: For which delays the model is made [s].
+    """
     flags = [way_out(parameters[n], trip.at_bound == "upper", max_delay_s) for n in trip.parts]
     return " ".join(dict.fromkeys(flag for flag in flags if flag))
 

@@ -17,38 +17,35 @@ class FitConfig:
     max_delay_s: float = 0.06
     """Upper bound of each identified delay [s]."""
     initial_state: Literal["free", "measured", "rest"] = "free"
-    """Initial state of a segment: 'free' is estimated around the start and solved for; 'measured' is that estimate as
-    it is; 'rest' is the measured position without velocity."""
+    """State at a segment's start: 'free' fits it, 'measured' reads it off the samples, 'rest' has no velocity."""
     skip_s: float = 0.0
-    """First part of a segment that is simulated but not compared: states of the model that nobody measures settle
-    there [s]."""
+    """First part of a segment that is simulated but not compared, so that states that are not measured settle [s]."""
     loss: Loss = "huber"
     """What a residual costs; 'huber' and 'cauchy' are robust."""
     reach: float = 5.0
-    """Where a robust loss leaves the square [deviations of the measurement]."""
+    """Residual above which a robust loss grows more slowly than the square [deviations of the measurement]."""
     strategy: str = "CMA_ES"
     """Search algorithm: any name in evosax.algorithms."""
     population: int = 32
     """Candidates a generation."""
     generations: int = 80
-    """Generations of a run at most; 0 leaves the search out and refines from the nominal values."""
+    """Most generations of a run; 0 leaves the search out and refines from the nominal values."""
     restarts: int = 0
-    """Further runs of the search: BIPOP, in turn with a doubled population and from a random place."""
+    """Further runs of the search (BIPOP): in turn with a doubled population, and from a random place."""
     std: float = 0.7
-    """Spread of the first generation; 1 covers about half of what the bounds admit."""
+    """Spread of the first generation; 1 covers about half of the bounds' width."""
     batch: int = 0
-    """Segments that a generation sees, the same for all its candidates; 0 means all."""
+    """Random segments on which each generation's candidates are compared; 0 means all."""
     refine: int = 3
-    """From how many of the search's best Levenberg-Marquardt refines; 0 leaves it out."""
+    """How many of the search's best candidates Levenberg-Marquardt refines; 0 leaves it out."""
     refine_steps: int = 25
-    """Steps of Levenberg-Marquardt at most, each of up to three times that it is linearised anew."""
+    """Most steps of Levenberg-Marquardt in a round, of which there are up to three."""
     long_s: float = 0.0
-    """Length of the segments on which a last refinement is made [s]; 0 leaves it out."""
+    """Length of the segments of a last refinement [s]; 0 leaves it out."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
-    """Derivatives: forward through the graph, or finite differences; 'auto' takes those where a node has none."""
+    """Derivatives: forward mode or finite differences; 'auto' takes the latter where a node has no derivative."""
     difference: float = 3e-3
-    """Step of finite differences; 1 covers about a quarter of what the bounds admit. Small ones are exact, larger ones
-    look past the kinks that stick and slip make."""
+    """Step of finite differences; 1 is about a quarter of the bounds' width. Larger ones smooth kinks of friction."""
     seed: int = 0
     """Seed of the search."""
 

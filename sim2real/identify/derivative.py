@@ -1,4 +1,4 @@
-"""Derivatives of functions that cannot be differentiated, or whose linearisation would remember too much."""
+"""Derivatives of functions that JAX cannot differentiate, or only with too much memory."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[[Any], Any]:
     """Return ``f`` with a forward-mode derivative by central differences along every entry.
 
-    The value and all ``2 P`` neighbours come from one batched evaluation: a rollout of MuJoCo takes 20 s to trace and
-    compile, and so it is in a program once, not three times.
+    The value and all ``2 P`` neighbours come from one batched evaluation, so that a program holds the function once:
+    a rollout of MuJoCo takes 20 s to trace and compile.
 
     Args:
         f: Array ``(P,)`` -> array; it may call back to Python.
@@ -36,9 +36,9 @@ def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[
 
 
 def by_jacobian(f: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return ``f``, array ``(P,)`` -> ``(N,)``, whose derivative is its Jacobian, computed forward and kept.
+    """Return ``f``, array ``(P,)`` -> ``(N,)``, with a derivative that computes its whole Jacobian in forward mode.
 
-    ``jax.linearize``, with which optimistix differentiates, would keep every intermediate of a rollout instead.
+    ``jax.linearize``, which optimistix uses, would keep every intermediate value of a rollout in memory instead.
     """
     wrapped = jax.custom_jvp(f)
 

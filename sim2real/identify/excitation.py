@@ -10,9 +10,9 @@ BINS = 10
 _GAP = 2.5
 """A pause longer than this many periods is a gap."""
 _THIN = 0.1
-"""A bin with less than this share of what an even spread would give it counts as empty."""
+"""A bin counts as empty below this share of the samples that it would have if they were spread evenly."""
 _STILL = 0.05
-"""Slower than this share of the highest speed, or than three deviations of its measurement, is standing still."""
+"""A joint stands still below this share of its highest speed, or below three deviations of a measured speed."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Spread:
     Attributes:
         low: Its smallest value.
         high: Its largest value.
-        shares: Shape ``(10,)``: share of the samples in each tenth of what lies between.
+        shares: Shape ``(10,)``: share of the samples in each tenth of the range.
     """
 
     low: float
@@ -50,7 +50,7 @@ class Spread:
 
     @property
     def covered(self) -> float:
-        """Share of the tenths that are worth mentioning: with at least 1 % of the samples."""
+        """Share of the tenths that hold at least 1 % of the samples."""
         return sum(s >= _THIN / BINS for s in self.shares) / len(self.shares)
 
     @property
@@ -64,8 +64,8 @@ class Motion:
     """How a joint moves.
 
     Attributes:
-        moving: Share of the time in which it does.
-        forward: Share of that in which it moves upwards.
+        moving: Share of the time in which it moves.
+        forward: Share of that time in which its position increases.
         reversals: How often it turns around.
     """
 
@@ -76,7 +76,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Band:
-    """Where a signal's power lies: 95 % of it between ``low_hz`` and ``high_hz``, half each beyond."""
+    """Where a signal's power lies: 95 % between ``low_hz`` and ``high_hz``, 2.5 % on either side."""
 
     low_hz: float
     high_hz: float
@@ -130,7 +130,7 @@ def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
 
 
 def band(t_s: np.ndarray, values: np.ndarray, share: float = 0.95) -> Band | None:
-    """Return the band that holds a share of the power of a signal held between its samples, without its mean.
+    """Return the band that holds a share of a signal's power, its mean left out; between samples its value holds.
 
     Args:
         t_s: Shape ``(N,)``: when each value begins to hold [s].

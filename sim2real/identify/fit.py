@@ -20,10 +20,10 @@ from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
-"""A search begins within the middle 90 % of what the bounds admit."""
+"""A search begins within the middle 90 % of the bounds."""
 Told = Callable[[str, float, float, np.ndarray], None]
-"""Called with what is done (``search`` or ``refine``), the share of it since the last call, and loss and place of the
-best so far."""
+"""Called with the phase (``search`` or ``refine``), the share of it done since the last call, and the best loss and
+point so far."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class Fit:
     """An estimate.
 
     Attributes:
-        problem: The residuals that decided last: windows, or longer stretches.
+        problem: The residuals that were minimised last: on windows, or on longer segments.
         z: Shape ``(P,)``: the estimate.
         loss: Its loss there.
         search: What the search found; None where it was left out.
         refined: How each refinement ended, in order.
-        windows: The segments that were searched on, with those that were held out.
+        windows: Segments that were searched on, and held-out segments of the same length.
     """
 
     problem: Problem
@@ -91,7 +91,7 @@ def fit(
     refined = []
     z, loss = starts[0], found.loss if found else float("nan")
     if config.refine:
-        # And from where the search began: a short search may end in another valley, with a delay for an inertia, say.
+        # Also from where the search began: a short search may end in another minimum, with a delay for an inertia, say.
         begin = [] if found is None else [problem.table.start()]
         refined.append(_refine(problem, np.stack([*starts[: config.refine], *begin]), told))
         z, loss = refined[-1].z, refined[-1].loss
@@ -103,7 +103,17 @@ def fit(
 
 
 def refit(problem: Problem, table: ParameterTable, near: np.ndarray, told: Told | None = None) -> np.ndarray:
-    """Return the estimate ``(P,)`` of a table with fewer free parameters, from the values at ``near`` and the start."""
+    """Estimate fewer free parameters, by refinement alone.
+
+    Args:
+        problem: The residuals, with all parameters.
+        table: The parameters, of which fewer are free.
+        near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's own.
+        told: Progress.
+
+    Returns:
+        The estimate ``(Q,)`` of the table's free parameters.
+    """
     other = problem.with_table(table)
     values = as_numbers(problem.table, near)
     starts = np.stack([other.table.encode(values), other.table.start()])
@@ -111,9 +121,15 @@ def refit(problem: Problem, table: ParameterTable, near: np.ndarray, told: Told 
 
 
 def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
-    """Search from a start ``(P,)``, as the problem's configuration says."""
+    """Search as the problem's configuration says.
+
+    Args:
+        problem: The residuals.
+        start: Shape ``(P,)``: middle of the first generation.
+        told: Progress.
+    """
     total = problem.config.generations * (1 + problem.config.restarts)
-    # At a bound the bijection is flat, and a search that begins there does not get away.
+    # At a bound the map to values is flat: a search that begins there does not get away.
     start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
 
     def advance(generations: int, best: float, z: np.ndarray) -> None:

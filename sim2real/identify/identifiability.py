@@ -1,4 +1,4 @@
-"""What recordings can tell before anything is searched: excitation, conditioning, and directions that nothing fixes."""
+"""What recordings can determine, judged before a search: conditioning, and combinations that nothing determines."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Check:
         condition: Condition number of the Jacobian, its columns in widths of the bounds.
         expected_error: Shape ``(P,)``: standard error to expect from the data at hand [the parameter's unit].
         per_minute: Shape ``(P,)``: the same from one minute of such data.
-        determined: What is determined of the parameters that are not determined alone: ``K / (R J)``.
-        undetermined: The parameters concerned, by direction.
+        determined: What is determined of each group in ``undetermined``, such as ``K / (R J)``; empty if nothing.
+        undetermined: Groups of parameters that are not determined one by one.
         duration_s: Length of all segments [s].
     """
 
@@ -50,7 +50,7 @@ class Check:
 def check(problem: Problem, z: np.ndarray) -> Check:
     """Judge what the problem's segments determine, at ``z (P,)``.
 
-    The noise is taken as the channels say: what is wrong with the model at ``z`` does not count here.
+    The noise is what the channels say; errors of the model at ``z`` do not count here.
     """
     return from_linearised(problem, linearise(problem, z))
 
@@ -60,7 +60,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Check:
     table = problem.table
     J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
     shift = time_shift(table) / table.span
-    if shift.any():  # see ``uncertainty``: what the ticks seem to say of it is no information
+    if shift.any():  # what the residuals say about it is no information: see ``uncertainty``
         unit = shift / np.linalg.norm(shift)
         J = J - np.outer(J @ unit, unit)
     information = J.T @ J
@@ -86,7 +86,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Check:
 
 
 def _groups(directions: np.ndarray) -> list[list[int]]:
-    """Return which parameters move together in directions ``(P, k)`` that nothing fixes."""
+    """Return which parameters move together along directions ``(P, k)`` that the data does not determine."""
     if not directions.shape[1]:
         return []
     spread = directions @ directions.T  # (P, P): the projection onto them, the same in any basis
@@ -104,11 +104,11 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
 
 
 def _determined(table: ParameterTable, directions: np.ndarray, group: list[int]) -> str:
-    """Return what of a group is determined, as a product of powers or a sum; empty if nothing."""
+    """Return which combination of a group is determined: a product of powers, or a sum; empty if none."""
     part = directions[group]
     u, size, _ = np.linalg.svd(part, full_matrices=True)
     rank = int((size > 0.05 * size[0]).sum())
-    kept = u[:, rank:].T  # what the directions leave alone
+    kept = u[:, rank:].T  # orthogonal to the directions: determined
     if not len(kept):
         return ""
     reduced = _row_reduce(kept)

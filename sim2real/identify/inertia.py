@@ -17,7 +17,7 @@ from sim2real.identify.parameters import Parameter
 THETA = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 """Names of the ten entries, in order."""
 _APART = 1e-4
-"""Share of the inertia by which its principal moments are set apart."""
+"""Share of the inertia by which its principal moments are kept different from each other."""
 
 
 def from_log_cholesky(theta: Any) -> tuple[Any, Any, Any]:
@@ -44,6 +44,11 @@ def from_log_cholesky(theta: Any) -> tuple[Any, Any, Any]:
 
 def to_log_cholesky(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """Return the vector ``(10,)`` of a body: the inverse of ``from_log_cholesky``.
+
+    Args:
+        mass: [kg].
+        com: Centre of mass, ``(3,)`` [m].
+        inertia: About the centre of mass, ``(3, 3)`` [kg m^2].
 
     Raises:
         UsageError: When no mass distribution has this inertia: a principal moment is as large as the sum of the others.
@@ -85,12 +90,17 @@ def inertia_parameters(body: str, mass: float, com: np.ndarray, inertia: np.ndar
 
 
 def set_inertia(model: Any, body: int, theta: Any) -> Any:
-    """Return an ``mjx.Model`` whose body has the inertia of ``theta (10,)``, along its principal axes.
+    """Return an ``mjx.Model`` in which one body has another inertia, along its principal axes.
 
-    What MuJoCo's compiler derives from inertias for constraints (``invweight0``) stays that of the model.
+    ``invweight0``, which MuJoCo's compiler derives from inertias for its constraints, stays as it is.
+
+    Args:
+        model: The ``mjx.Model``.
+        body: Number of the body.
+        theta: Shape ``(10,)``: see ``THETA``.
     """
     mass, com, inertia = from_log_cholesky(theta)
-    # Where moments are equal, as those of a cylinder, their axes have no derivative.
+    # Equal moments, as of a cylinder, leave the axes undefined, and without a derivative.
     apart = _APART * jnp.trace(inertia) / 3.0 * jnp.diag(jnp.array([-1.0, 0.0, 1.0]))
     moments, axes = jnp.linalg.eigh(inertia + apart)
     axes = axes * jnp.where(jnp.linalg.det(axes) < 0, -1.0, 1.0)  # a rotation

@@ -30,7 +30,10 @@ def get_leaf(tree: Any, path: str) -> Any:
 def set_leaf(tree: Any, path: str, value: Any) -> Any:
     """Return the tree with another value at a path; an indexed entry of an array is replaced alone.
 
-    ``mjx.Model`` is such a tree: ``world.model.dof_damping[0]``.
+    Args:
+        tree: Mappings and dataclasses, ``mjx.Model`` among them.
+        path: Such as ``world.model.dof_damping[0]``.
+        value: The new value.
 
     Raises:
         UsageError: When the path leads nowhere.

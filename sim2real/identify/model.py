@@ -21,8 +21,8 @@ class Channel:
         velocity_sigma: Deviation of a measured velocity; without one, of a velocity estimated from a few positions.
         index: Entry of the fields, where they are vectors.
         label: Name for tables; default: the position's field.
-        goal: Field of a given node's message that says where the joint is told to be, in the position's unit, under the
-            same index; None where commands are no positions.
+        goal: Field of a command that holds the joint's goal, in the position's unit and under the same index; None
+            where commands are no positions.
     """
 
     position: str
@@ -55,11 +55,11 @@ class IdentifiableModel(Protocol):
     Attributes:
         parameters: What may be identified.
         sensor: Node whose outputs are predicted.
-        given: Nodes whose recorded outputs drive the model: node -> its message, with field names as leaves.
+        given: Nodes whose recorded outputs drive the model: node -> a message with field names as its leaves.
         channels: What is measured; initial states have a position and a velocity for each.
-        ahead_s: How much later than recorded the sensor's steps are simulated [s]; ``params`` adds it to its delay. A
-            sensor that interpolates between the world's ticks needs one tick of it: otherwise a delay below a tick
-            would show what is not simulated yet. 0 where samples fall on ticks.
+        ahead_s: How much later than recorded the sensor's steps are simulated [s]; ``params`` adds it to the sensor's
+            delay, so that nothing shifts. 0 where samples fall on the world's ticks; a sensor that interpolates between
+            them needs one tick: with a shorter delay it would otherwise read what is not simulated yet.
     """
 
     parameters: ParameterTable

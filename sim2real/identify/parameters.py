@@ -29,12 +29,11 @@ class Parameter:
         transform: Scale on which the search moves: ``linear``, ``log`` (positive values) or ``logit`` (shares).
         kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
-        leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model knows.
+        leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
         prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
         per_recording: Whether each recording has a value of its own.
         free: Whether it is identified; else it stays at ``nominal``.
-        side: Of a delay: ``command`` (before the world) or ``measurement`` (behind it). Where initial states are free,
-            time can be shifted from one to the other.
+        side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
     """
 
     name: str
@@ -95,9 +94,9 @@ class Column:
 
 
 class ParameterTable:
-    """Parameters in a fixed order, and the bijection between values and an unbounded vector ``z`` of the free ones.
+    """Parameters in a fixed order, and the map from an unbounded vector ``z`` of the free ones to values.
 
-    The bounds live in the bijection (a logistic function on each parameter's scale): evosax does not clip.
+    A logistic function on each parameter's scale keeps values within their bounds, as evosax does not clip.
 
     Args:
         parameters: The parameters; names must differ.
@@ -232,12 +231,12 @@ class ParameterTable:
             if prior is None:
                 continue
             value = x[c.parameter.name] if c.recording is None else x[c.parameter.name][c.recording]
-            if type(prior).__name__ == "Normal":  # exact, where the square root below has no slope at the mode
+            if type(prior).__name__ == "Normal":  # exact; the square root below has no derivative at the mode
                 residuals.append((value - prior.loc) / prior.scale)
             else:
                 mode = jnp.float32(prior.mode())
                 off = value - mode
-                # At the mode the square root has no slope, and the drop no digits: there the curvature tells.
+                # The square root of the drop from the mode has no derivative at the mode: there the curvature is used.
                 curvature = -jax.grad(jax.grad(lambda v, d=prior: jnp.sum(d.log_prob(v))))(mode)
                 near = (curvature > 0.0) & (off**2 * curvature < 1e-4)
                 drop = jnp.maximum(prior.log_prob(mode) - prior.log_prob(value), 0.0)

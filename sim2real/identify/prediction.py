@@ -1,4 +1,4 @@
-"""How well a model predicts: N steps ahead, and free runs over whole stretches, beside what takes no model at all."""
+"""How well a model predicts, over horizons and in free runs, beside baselines that need no model."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Values = Mapping[str, Any]
 
 
 def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> dict[str, np.ndarray]:
-    """Simulate all segments with each model; what is held out from an initial state that knows only its past.
+    """Simulate all segments with each model; initial states of held-out segments are fitted to their first part alone.
 
     Args:
         problem: The segments.
         models: Values of all parameters by model.
-        settle_s: The first part of a segment, to which the initial state is fitted where it is held out [s].
+        settle_s: Length of that first part [s].
 
     Returns:
         Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each channel's field
@@ -95,8 +95,15 @@ def errors(
 ) -> list[Prediction]:
     """Return each model's error over each horizon, on fitted and on held-out segments.
 
-    Beside the models stand ``hold``, that nothing changes, and, where commands are positions, ``told``: every
-    joint is where it was told to be.
+    Two baselines stand beside the models: ``hold`` (nothing changes) and, where commands are positions, ``told`` (every
+    joint is where it was told to be).
+
+    Args:
+        problem: The segments.
+        columns: What ``samples`` returned.
+        models: Names of the models.
+        settle_s: First part of held-out segments, to which initial states were fitted: horizons begin at its end [s].
+        horizons: How far ahead [s].
     """
     ahead = columns["into"] - settle_s
     names = labels(problem)
@@ -114,14 +121,21 @@ def errors(
 
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Return what takes no model: ``hold``, and ``told`` where commands are positions."""
+    """Return the baselines: ``hold``, and ``told`` where commands are positions."""
     return ["hold", *(["told"] if any(n.endswith("_told") for n in columns) else [])]
 
 
 def free_runs(
     columns: Mapping[str, np.ndarray], names: Sequence[str], models: Sequence[str], settle_s: float
 ) -> list[FreeRun]:
-    """Return the errors of whole segments, each by itself."""
+    """Return the errors of whole segments, each by itself.
+
+    Args:
+        columns: What ``samples`` returned, of long segments.
+        names: The fields.
+        models: Names of the models; the baselines are added.
+        settle_s: First part of a segment, which does not count [s].
+    """
     rows = []
     ahead = columns["into"] - settle_s
     for segment in np.unique(columns["segment"]):

@@ -1,8 +1,7 @@
 """The residuals of recordings: what the model predicts minus what was measured, segment by segment.
 
-Each segment is simulated with the recorded commands and the recorded timing from an initial state of its own, which is
-solved for inside every evaluation (one Gauss-Newton step on the linearised rollout), so a search sees dynamics and
-delays alone.
+Each segment is simulated with the recorded commands and timing, from an initial state of its own. Every evaluation
+solves for these states (one Gauss-Newton step on the linearised rollout): a search is over dynamics and delays alone.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ from sim2real.runtime.compiled import CompiledGraph
 
 
 class Data(NamedTuple):
-    """What was measured, as a tree: so that one program serves many noises.
+    """What was measured, as an argument of compiled programs: one program serves other measurements, too.
 
     Attributes:
-        measured: Field -> ``(E, N, ...)``.
-        starts: Shape ``(E, channels, 4)``.
+        measured: Field -> ``(E, N, ...)``, as in ``Segments``.
+        starts: Shape ``(E, channels, 4)``, as in ``Segments``.
     """
 
     measured: Mapping[str, Any]
@@ -83,7 +82,7 @@ class Problem:
         self.data = _data(cuts)
         self._recording = jnp.asarray(self.recording)
         self._ts = jnp.asarray(cuts.ts, jnp.float32)
-        # Traced once, however many programs it becomes a part of: of MuJoCo's, that takes 6 s each.
+        # Traced once for all programs that it is a part of: tracing a rollout of MuJoCo takes 6 s.
         self._rollout = jax.jit(self._simulate)
         self._first = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[:, 0]), dict(cuts.given))
         # Before this a measurement shows the world from before the segment's start.
@@ -93,12 +92,12 @@ class Problem:
                 f"segments of {length_s:g} s leave nothing to compare after their first {self._from_s:g} s",
                 hint="make them longer, or max_delay_s or skip_s smaller",
             )
-        # How far an initial state may be from its estimate. Wide: a narrow one would tell the delays apart by the
-        # estimate's own bias, though shifting time between them changes nothing else.
+        # How far an initial state may be from its estimate. Wide: a narrow prior would seem to tell the delays apart,
+        # by nothing but the bias of that estimate.
         sigmas = [c.position_sigma for c in self.channels] + [c.velocity_sigma for c in self.channels]
         self.prior = 30.0 * jnp.array(sigmas)
         self.programs: dict[Any, Any] = {}
-        """What was compiled, for the next call: by ``search`` and ``refine``."""
+        """Programs that ``search`` and ``refine`` compiled, kept for their next call."""
         self._late = [p.name for p in self.table if p.side == "measurement"]
         self.forward = config.jacobian == "forward" or (config.jacobian == "auto" and self._has_derivative())
 
@@ -108,13 +107,13 @@ class Problem:
         return [(field, sigma, c.of) for c in self.channels for field, sigma in c.fields]
 
     def measured(self, column: int) -> np.ndarray:
-        """Return what a column's residuals compare with, in their places, ``(E, C)``."""
+        """Return the measurements that a column's residuals compare with, ``(E, C)``; see ``places``."""
         field, _, entry = self.fields[column]
         return np.take_along_axis(np.asarray(entry(self.data.measured[field])), np.maximum(self.places, 0), axis=1)
 
     @property
     def places(self) -> np.ndarray:
-        """Which measurement stands in each place of the predictions, ``(E, C)``; -1 where there is none.
+        """Number of the measurement that each of the ``C`` predictions is of, ``(E, C)``; -1 where there is none.
 
         A sensor that ran faster than its node's rate has several slots in a row of the compiled graph.
         """
@@ -123,10 +122,16 @@ class Problem:
         return np.stack(own, axis=-1).reshape(self.segments, -1)
 
     def simulate(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> tuple[Any, Any]:
-        """Simulate a segment from its estimated initial state plus ``shift``.
+        """Simulate a segment.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+            data: What was measured; default: the logs.
 
         Returns:
-            The sensor's predictions, leaves of shape ``(C, ...)``, and their seq, ``(C,)``.
+            The sensor's predictions, leaves of shape ``(C, ...)``, and the numbers of their steps, ``(C,)``.
         """
         own = self.table.of_recording(values, self._recording[eps])
         start = self._start(eps, sum(own[n] for n in self._late), data or self.data) + shift
@@ -135,7 +140,7 @@ class Problem:
     def _simulate(self, own: Mapping[str, Any], start: Any, eps: Any) -> tuple[Any, Any]:
         """Simulate a segment for one recording's parameters, from an initial state."""
         gs = self.graph.init(jax.random.key(0), params=self.model.params(own, start), eps=eps)
-        # Before the first recorded command it held already: nothing else is known.
+        # The first recorded command is taken to have held before, too: nothing else is known.
         first = jax.tree_util.tree_map(lambda rows: rows[eps], self._first)
         cast = lambda new, old: jnp.asarray(new, old.dtype)  # noqa: E731
         held = {n: jax.tree_util.tree_map(cast, first[n], gs.buffer[n]) for n in first}
@@ -145,7 +150,18 @@ class Problem:
         return record.output, record.seq
 
     def residuals(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> tuple[Any, Any]:
-        """Return scaled residuals ``(C, fields)`` of a segment, 0 where masked, and their times ``(C,)`` [s]."""
+        """Return how far the predictions of a segment are off.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+            data: What was measured; default: the logs.
+
+        Returns:
+            Residuals ``(C, fields)`` in deviations of the measurement, and their times ``(C,)`` [s]; 0 and -1 where
+            nothing is compared.
+        """
         data = data or self.data
         predicted, seq = self.simulate(values, eps, shift, data)
         at = jnp.maximum(seq, 0)
@@ -158,9 +174,15 @@ class Problem:
         return jnp.stack(columns, axis=1), jnp.where(counts, ts, -1.0)
 
     def sensitivity(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> Any:
-        """Return how a segment's residuals move with its initial state, ``(2 * channels, C, fields)``.
+        """Return the derivative of a segment's residuals by its initial state, ``(2 * channels, C, fields)``.
 
         Each row is for a shift of one component by its prior deviation.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+            data: What was measured; default: the logs.
         """
         size = len(self.prior)
         of_shift = self.differentiable(lambda u: self.residuals(values, eps, shift + u * self.prior, data)[0], 0.03)
@@ -189,7 +211,12 @@ class Problem:
         return error + jnp.tensordot(shift, sensitivity, axes=1), ts
 
     def predict(self, values: Mapping[str, Any], eps: Any, fit_s: Any) -> tuple[Any, Any]:
-        """Simulate a segment after fitting its initial state to the measurements of its first ``fit_s`` [s].
+        """Simulate a segment after fitting its initial state to the measurements of its first part.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            fit_s: Length of that part [s].
 
         Returns:
             Residuals ``(C, fields)``, scaled, and their times ``(C,)`` [s]; -1 where there is no measurement.
@@ -201,20 +228,20 @@ class Problem:
             sensitivity = self.sensitivity(values, eps, shift * self.prior)
             moved = shift + self._solve(error, ts, sensitivity, shift, fit_s)
             after, _ = self.residuals(values, eps, moved * self.prior)
-            # Where friction sticks, or near the top, a linear step may lead astray.
+            # Near kinks, such as friction that sticks, the linear step may make it worse.
             gain = jnp.sum(jnp.where(counts, error**2 - after**2, 0.0)) + jnp.sum(shift**2 - moved**2)
             shift, error = (jnp.where(gain > 0, new, old) for new, old in ((moved, shift), (after, error)))
         return error, ts
 
     def losses(self, candidates: Any, around: Any, pick: Any = None) -> Any:
-        """Return the loss of each candidate, ``(N,)``: half the mean square of scaled, tamed residuals, and the priors.
+        """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, and the priors.
 
-        The initial states of all candidates are solved for with the sensitivity at ``around``, the middle of the
-        generation: one linearised rollout for all of them, which is exact once the search has closed in.
+        One linearised rollout, at ``around``, serves to solve for the initial states of all candidates; the closer they
+        are to it, the more exact that is.
 
         Args:
             candidates: Shape ``(N, P)``.
-            around: Shape ``(P,)``.
+            around: Shape ``(P,)``: the middle of the generation.
             pick: Shape ``(B,)``: the segments to take, the same for all candidates; default: all that are fitted.
         """
         pick = jnp.asarray(self.train) if pick is None else pick
@@ -230,9 +257,12 @@ class Problem:
         return jax.vmap(candidate)(candidates)
 
     def sensitivities(self, z: Any, pick: Any = None, data: Data | None = None) -> Any:
-        """Return the sensitivity of segments at ``z``, ``(B, 2 * channels, C, fields)``; default: of all fitted.
+        """Return ``sensitivity`` for several segments, ``(B, 2 * channels, C, fields)``; None if states are not fitted.
 
-        None where initial states are not solved for.
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            pick: Shape ``(B,)``: the segments; default: all that are fitted.
+            data: What was measured; default: the logs.
         """
         if self.config.initial_state != "free":
             return None
@@ -241,13 +271,22 @@ class Problem:
         return jax.vmap(lambda e: self.sensitivity(values, e, zero, data))(pick)
 
     def stacked(self, z: Any, columns: Any, data: Data | None = None) -> Any:
-        """Return all projected, tamed residuals at ``z``, ``(segments, C, fields)``, for given sensitivities."""
+        """Return the robust residuals of all fitted segments, ``(segments, C, fields)``.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            columns: What ``sensitivities`` returned.
+            data: What was measured; default: the logs.
+        """
         return self._tamed(self._untamed(z, columns, data))
 
     def linearised(self, z: Any, columns: Any, data: Data | None = None) -> tuple[Any, Any, Any]:
-        """Return ``stacked``, its Jacobian ``(segments, C, fields, P)``, and the residuals before they were tamed.
+        """Return ``stacked``, its Jacobian ``(segments, C, fields, P)``, and the residuals without a robust loss.
 
-        Derivatives are forward or finite differences, as the problem is configured.
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            columns: What ``sensitivities`` returned.
+            data: What was measured; default: the logs.
         """
         f = self.differentiable(lambda y: self._untamed(y, columns, data))
         raw, J = jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
@@ -281,14 +320,14 @@ class Problem:
         return True
 
     def with_table(self, table: ParameterTable) -> Problem:
-        """Return the same residuals for other parameters: some fixed, say."""
+        """Return the same residuals for another table, such as one with some parameters fixed."""
         other = copy.copy(self)
         other.table = table.for_recordings(self.table.recordings)
         other.programs = {}
         return other
 
     def _start(self, eps: Any, delay_s: Any, data: Data) -> Any:
-        """Return the initial state ``(2 * channels,)``: what was measured around the start, read ``delay_s`` later."""
+        """Return the initial state ``(2 * channels,)`` as measured around the start; samples come ``delay_s`` late."""
         c = jnp.asarray(data.starts)[eps]  # (channels, 4): a cubic in time
         if self.config.initial_state == "rest":
             return jnp.concatenate([c[:, 0], jnp.zeros(len(self.channels))])

@@ -1,4 +1,4 @@
-"""Local refinement by Levenberg-Marquardt, from the best few that a search found."""
+"""Local refinement by Levenberg-Marquardt, from the best candidates of a search."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def refine(
     rounds: int = 3,
     on_round: Callable[[float, np.ndarray], None] | None = None,
 ) -> Refined:
-    """Improve each start, and return the best of all; a point is accepted only if its full loss is smaller.
+    """Improve each start, and return the best result; a round that does not lower the loss is dropped.
 
-    The directions in which initial states move are held during a round and computed anew for the next.
+    How residuals depend on initial states is linearised once a round.
 
     Args:
         problem: The residuals.
         starts: Shape ``(K, P)``.
-        steps: Steps a round at most.
-        rounds: Rounds a start at most; the first that gains less than 0.01 % is the last.
-        on_round: Called after each with loss and place of the best so far.
+        steps: Most steps of a round.
+        rounds: Most rounds from a start; the first that gains less than 0.01 % is the last.
+        on_round: Called after each round with the best loss and point so far.
 
     Raises:
         Sim2RealError: When no start has a finite loss.

@@ -1,4 +1,4 @@
-"""Losses that a few large residuals cannot decide."""
+"""Robust losses: a few large residuals do not decide the fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim2real.identify.config import Loss
 
 
 def tamed(residual: Any, loss: Loss, reach: float) -> Any:
-    """Return a residual whose half square is the robust loss of the given one: least squares stays least squares.
+    """Return a residual whose half square is the robust loss of the given one, so that least squares minimises it.
 
     ``huber`` is the pseudo-Huber loss: squared below ``reach``, linear far above it. ``cauchy`` grows
     with the logarithm.
@@ -18,11 +18,11 @@ def tamed(residual: Any, loss: Loss, reach: float) -> Any:
     Args:
         residual: Any shape, in deviations.
         loss: The kind.
-        reach: Where the loss leaves the square, in deviations.
+        reach: Above this the loss grows more slowly than the square, in deviations.
     """
     if loss == "squared":
         return residual
-    if loss == "huber":  # not by the square: an overflow would make the worst residual the best
+    if loss == "huber":  # by hypot: the square may overflow, and the worst residual would become the best
         return residual * jnp.sqrt(2.0 / (jnp.hypot(1.0, residual / reach) + 1.0))
     square = (residual / reach) ** 2
     small = square < 1e-6

@@ -1,4 +1,4 @@
-"""The sum of all delays: what a log tells of them even where it cannot tell them apart."""
+"""The sum of all delays, which a log determines even where it cannot tell them apart."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RoundTrip:
     Attributes:
         parts: Delays that were identified.
         held: Delays that were fixed.
-        apart: Whether a log tells the parts apart; else their sum is all there is.
+        apart: Whether the log tells the parts apart; else only their sum is known.
         estimate: The sum.
         standard_error: Of the sum.
         low: Lower end of the 95 % interval.

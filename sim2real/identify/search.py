@@ -1,4 +1,4 @@
-"""Global search by evolution strategies: no gradient, bounds in the bijection, restarts, common random numbers."""
+"""Global search by evolution strategies: without gradients, with restarts and common random numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SearchResult:
     Attributes:
         z: Shape ``(P,)``: the best candidate.
         loss: Its loss, on all segments.
-        history: Shape ``(generations,)``: the best loss up to each generation, of the segments it saw.
+        history: Shape ``(generations,)``: the best loss up to each generation, on the segments of that generation.
         evaluations: Candidates that were simulated.
         finalists: Shape ``(K, P)``: the best of each run, best first.
     """
@@ -58,16 +58,16 @@ def search(
     """Minimise; every candidate of a generation sees the same data (common random numbers).
 
     A run ends early once ten generations have improved the loss by less than 0.01 %. Restarts follow BIPOP: in turn
-    with a population twice as large as the last large one and, from a random place with a smaller step, with the first.
+    with twice the largest population so far, and with the first population from a random place, with smaller steps.
 
     Args:
         losses: See ``Losses``.
         start: Shape ``(P,)``: middle of the first generation.
         config: How to search.
-        segments: Shape ``(S,)``: what batches are drawn from; needed for batches alone.
-        on_generations: Called with the number of generations done since the last call, and loss and place of the best
-            candidate of this run so far.
-        programs: What an earlier call with the same losses compiled; this one adds what it compiles.
+        segments: Shape ``(S,)``: what batches are drawn from; None without batches.
+        on_generations: Called with the number of generations done since the last call, and the best loss and candidate
+            of this run so far.
+        programs: Compiled programs of earlier calls with the same losses; those of this one are added.
 
     Raises:
         UsageError: When there is no such strategy, or it cannot work with this population.
@@ -83,7 +83,7 @@ def search(
         if index % 2:
             large = population = 2 * large
         elif index:
-            # Hansen's small runs draw their population, too; at 5 s of compilation a size, ours keep the first one.
+            # Hansen draws the population of small runs as well; each size takes 5 s to compile, so ours keep the first.
             u = float(jax.random.uniform(k_step))
             middle = np.asarray(jax.random.normal(k_middle, start.shape)) * 1.5
             std = config.std * 10.0 ** (-2.0 * u)
@@ -95,7 +95,7 @@ def search(
         histories.append(history)
         evaluations += count
     finalists = np.stack(runs)
-    # Each around itself: a run that ended elsewhere is not judged by what holds around the first.
+    # Each is linearised at itself: finalists of several runs may lie far apart.
     alone = programs.setdefault("alone", jax.jit(lambda z: losses(z[None], z, None)[0]))
     final = np.array([float(alone(jnp.asarray(z))) for z in finalists])
     order = np.argsort(np.where(np.isfinite(final), final, _INFINITE))
@@ -156,7 +156,7 @@ class _Run:
             if told:
                 told(self.count, reached, np.asarray(self._best(state)))
             before = float(np.min(np.concatenate(history[:-1]))) if len(history) > 1 else np.inf
-            # Batches differ from generation to generation: their best losses say nothing about being stuck.
+            # With batches the losses of two generations are on different segments: they cannot show a standstill.
             if not self.batched and np.isfinite(before) and before - reached < _STUCK * abs(reached):
                 break
         losses = np.minimum.accumulate(np.concatenate(history))

@@ -23,7 +23,7 @@ class Span:
     Attributes:
         recording: Which recording.
         begin_s: Where it starts [s].
-        fitted: Whether the loss is made of it; else it is held out.
+        fitted: Whether it is part of the loss; else it is held out.
     """
 
     recording: int
@@ -70,7 +70,7 @@ def cut(
         recordings: The logs.
         spans: Which parts, recording by recording.
         length_s: Length of each [s].
-        lead_s: How long before a segment commands are kept: they still act in it [s].
+        lead_s: Commands of this long before a segment are kept, because they still act in it [s].
 
     Raises:
         Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
@@ -183,14 +183,14 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
 def beyond(
     model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float, share: float = 0.1
 ) -> list[str]:
-    """Return sentences about held-out data that goes beyond what was fitted: there, a model extrapolates.
+    """Return sentences about signals whose held-out part leaves the range that was fitted: there, a model extrapolates.
 
     Args:
         model: Says which nodes and fields matter.
         recordings: The logs.
         spans: Fitted and held-out segments.
         length_s: Their length [s].
-        share: How far beyond, as a share of the fitted range, is worth a word.
+        share: Only what goes beyond by more than this share of the fitted range is reported.
     """
     fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
     fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]

@@ -1,4 +1,4 @@
-"""How well the recordings determine the parameters: covariance, intervals, and what cannot be told at all."""
+"""How well the recordings determine the parameters: covariance, intervals, and what is not determined at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 
 VAGUE = 0.15
-"""A standard error above this share of the bounds says little more than they do (a uniform value has 0.29)."""
+"""Standard errors above this share of the bounds' width are not identifiable (a uniform distribution has 0.29)."""
 AT_BOUND = 0.005
 """An estimate within this share of the bounds' width of a bound counts as at the bound."""
 _BLOCK_S = 1.0
@@ -22,9 +22,9 @@ _BLOCK_S = 1.0
 _BLOCKS = 20
 """How many blocks there are at least, where the recordings are long enough: fewer leave too few degrees of freedom."""
 _LEAST_FREEDOM = 2.0
-"""Below, Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
+"""With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
 _BY_CHANCE = 0.1
-"""Blocks widen an interval where they vary more than they would by chance in this share of recordings."""
+"""Intervals widen only where blocks differ so much that chance alone would explain it in this share of recordings."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Linearised:
         jacobian: Shape ``(S, C, F, P)``: d residual / d scale.
         prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
         x: Shape ``(P,)``: the point.
-        raw: Shape ``(S, C, F)``: the residuals before a robust loss tamed them.
+        raw: Shape ``(S, C, F)``: the residuals without a robust loss.
     """
 
     residuals: np.ndarray
@@ -48,7 +48,7 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the recordings leave open.
+    """How uncertain an estimate is.
 
     Attributes:
         covariance: Shape ``(P, P)``, of the values, in their units.
@@ -59,10 +59,10 @@ class Uncertainty:
         verdict: One a parameter: ``accepted``, ``not identifiable`` or ``at a bound``.
         correlation: Shape ``(P, P)``.
         inflation: Factor on the variance for residuals that are correlated in time.
-        misfit: Root mean square of the scaled residuals, none of them tamed: 1 where the model explains everything but
-            the noise.
-        widening: Shape ``(P,)``: factor by which what differs from block to block widens the linearised standard error,
-            with Student's factor for the number of blocks; 1 where blocks differ no more than they would by chance.
+        misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the
+            model explains everything but the noise.
+        widening: Shape ``(P,)``: factor on the linearised standard error where blocks of the recordings disagree, with
+            Student's factor for the number of blocks; 1 where they disagree no more than by chance.
     """
 
     covariance: np.ndarray
@@ -78,9 +78,9 @@ class Uncertainty:
 
 
 def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
-    """Return ``z (P,)`` with time shifted to the middle of what the bounds of the delays admit.
+    """Return ``z (P,)`` with the delays on either side of the world shifted to the middle of what their bounds admit.
 
-    The log does not tell delays on either side of the world apart; where a search happens to leave them means nothing.
+    The log does not tell them apart, so how a search shared their sum between them means nothing.
     """
     table = problem.table
     x, _ = table.scale(z)
@@ -111,18 +111,17 @@ def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
 def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     """Return the uncertainty at a linearised point.
 
-    On each parameter's own scale the bounds act as a weak prior, so that a direction that the log says nothing about
-    gets the width of its bounds and not infinity. Residuals that are correlated in time carry less information than
-    their number: the variance is scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next.
-    Where the model is wrong even that says too little: standard errors then grow to what the estimate varies by from
-    block to block of the recordings. They grow only where blocks vary more than by chance: the larger of the two would
-    be too large in every recording, as an estimate from a few blocks is itself off by a fifth.
+    The bounds act as a weak prior, so that a direction which the log does not determine gets the width of its bounds
+    and not infinity. Residuals that are correlated in time carry less information than their number: the variance is
+    scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next. Where the model is wrong, that
+    is still too small: standard errors then grow to what the estimate varies by between blocks of the recordings, but
+    only where blocks differ more than by chance, as a standard error from a few blocks is itself off by a fifth.
 
-    A shift of time between the sensor's delay and the others changes nothing that a log shows: the initial state is
-    then that of a moment earlier or later. What the residuals seem to say about it is how well the world's ticks, or an
-    initial state that was read from noise, happen to meet the measurements. So the shift counts as unknown within the
-    bounds, and neither delay is ever accepted by itself. Where initial states are free nothing else depends on it, and
-    the rest is computed at the shift that was found; where they are given, other estimates move with it.
+    A log does not tell the delays on either side of the world apart: with one longer and the other shorter by as much,
+    and a world that starts that much earlier or later, every message stays the same. Residuals do change a little along
+    this shift, but only by rounding to the world's ticks and by noise in the initial states. So the shift counts as
+    unknown within the bounds, and neither delay is ever accepted by itself. Where initial states are free no other
+    estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
     """
     table, size = problem.table, len(at.x)
     r, J, inside = at.residuals, at.jacobian.reshape(-1, size), at.residuals.reshape(-1) != 0.0
@@ -142,7 +141,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
     error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
     wider[rest] = _widening(error / linear[rest], freedom, quantile)
-    # Prior knowledge of the bounds is not widened: what the log leaves open stays within them.
+    # No standard error grows beyond that of a uniform distribution within the bounds.
     wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
     cov *= np.outer(wider, wider)
     down, up = _shift_range(table, at.x, shift)
@@ -173,9 +172,9 @@ def sum_of(spread: Uncertainty, columns: list[int]) -> float:
 
 
 def time_shift(table: ParameterTable) -> np.ndarray:
-    """Return the direction ``(P,)`` in which only time moves, zeros if there is none: measurement up, commands down.
+    """Return the shift of time between delays as a direction ``(P,)``: +1 for measurements, -1 for commands.
 
-    How initial states are found does not matter: at the robot nothing else tells these delays apart.
+    Zeros where delays are identified on one side only. How initial states are found does not matter.
     """
     side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in table.columns]
     direction = np.array([{"measurement": 1.0, "command": -1.0}.get(s, 0.0) for s in side])
@@ -185,8 +184,8 @@ def time_shift(table: ParameterTable) -> np.ndarray:
 def _verdict(error: float, margin: float, shifts: bool) -> str:
     """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width.
 
-    What time can be shifted from or to is not identifiable, however little room its bounds leave for that. What lies at
-    a bound would go further, however narrow the bounds and vague the estimate beside them.
+    A delay that trades with another (``shifts``) is never identifiable, however narrow its bounds. An estimate at a
+    bound is reported as that, even if it is vague as well.
     """
     if shifts:
         return "not identifiable"
@@ -196,7 +195,7 @@ def _verdict(error: float, margin: float, shifts: bool) -> str:
 
 
 def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
-    """Return how far time may shift either way before a delay meets its bound; (0, 0) without a direction."""
+    """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift."""
     moved = shift != 0.0
     if not moved.any():
         return 0.0, 0.0
@@ -207,8 +206,8 @@ def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tup
 def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gradient ``(B, Q)`` and information ``(B, Q, Q)`` of blocks of the recordings, for some parameters.
 
-    Blocks are segments, or several in a row where there are many: longer blocks see slower changes. Segments are cut
-    only where they are few: what shares an initial state is not independent.
+    A block is a segment, or several in a row where there are many, to include slower changes. Segments are split only
+    where they are few: parts that share an initial state are not independent.
     """
     segments, places = at.residuals.shape[:2]
     parts = min(-(-_BLOCKS // segments), max(1, int(problem.segment_s / _BLOCK_S)))
@@ -226,10 +225,10 @@ def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.n
 def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard errors ``(Q,)`` that blocks show, and their degrees of freedom ``(Q,)``.
 
-    Each block moves the estimate; the squares of that, summed, are its variance, whatever residuals are like within a
-    block. A fit makes the residuals of blocks that decide much too small: each is scaled by the inverse root of what is
-    left of it, which makes the variance of white noise unbiased (Bell and McCaffrey, Survey Methodology 28, 2002).
-    Drawing blocks with replacement instead makes errors 1.15 times too large with ten blocks that differ.
+    The variance is the sum of squares of how far each block moves the estimate, whatever the residuals within a block
+    are like (a "sandwich" estimate). Blocks that weigh much have residuals that are too small, since the fit follows
+    them: they are scaled up so that the variance is unbiased for white noise (Bell and McCaffrey, Survey Methodology
+    28, 2002). A bootstrap over blocks was 1.15 times too large with ten blocks that differ.
 
     Args:
         gradients: Shape ``(B, Q)``.
@@ -251,7 +250,7 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
 
 
 def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.ndarray:
-    """Return by what intervals widen, ``(Q,)``.
+    """Return factors by which intervals widen, ``(Q,)``.
 
     Args:
         ratio: Shape ``(Q,)``: standard error by blocks over the linearised one.

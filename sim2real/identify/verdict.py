@@ -1,4 +1,4 @@
-"""Whether an identification is worth anything: judged on data that it has not seen, position by position."""
+"""Whether an identification can be used: judged on held-out data, position by position."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _BETTER = 0.95
 _ALIKE = 1.05
 """Up to this factor two errors count as the same."""
 _NOISE = 2.0
-"""An error of so many deviations of the measurement is as small as can be seen."""
+"""Errors below this many deviations of the measurement cannot be told from its noise."""
 _MOST = 3
-"""So many positions are told one by one, the worst first."""
+"""How many positions the reasons name one by one, the worst first."""
 NO_DELAY = "no delay"
-"""The same model fitted without delays. Where it is as good, the delays are not needed; that is no failure."""
+"""The same model fitted without delays. Where it is as good, the data needs no delays; that is no failure."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Score:
 
     @property
     def excess(self) -> float:
-        """The error over that of the best baseline; what is within the noise of the measurement counts as that."""
+        """The error over that of the best baseline; errors below the noise of the measurement count as the noise."""
         noise = _NOISE * self.position.sigma
         best = min(self.others.values(), default=math.inf)
         return max(self.own, noise) / max(best, noise) if math.isfinite(best) else 0.0
@@ -128,7 +128,7 @@ def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> l
     found = []
     for p in positions:
         errors = {m: e for m, rmse in last.items() if (e := rmse.get(p.column)) is not None}
-        # What diverged to no number is infinitely wrong.
+        # A prediction that diverged to NaN is infinitely wrong.
         errors = {m: e if math.isfinite(e) else math.inf for m, e in errors.items()}
         if "identified" in errors:
             found.append(Score(p, horizon_s, errors.pop("identified"), errors))
@@ -219,7 +219,7 @@ def _at_bounds(
 ) -> tuple[list[str], str]:
     """Return a sentence about each estimate at a bound, and the flags to identify again with.
 
-    Only of what is ``known``: what nothing determines may lie anywhere, and other bounds do not help.
+    Only parameters in ``known`` count: for one that the data does not determine, other bounds do not help.
     """
     said, flags = [], []
     for i in known:
