@@ -80,7 +80,7 @@ def _run_command(arguments: list[str], signals: Signals) -> int:
         sys.stdout.flush()
     except Sim2RealError as error:
         return ending.failed(error)
-    except BrokenPipeError:  # the reader of our output has enough, such as `head`: nothing is wrong with us
+    except BrokenPipeError:  # the reader of our output has closed it, as `head` does: no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ERROR
     except KeyboardInterrupt:

@@ -21,7 +21,7 @@ class History:
     """The evaluations during training.
 
     Attributes:
-        steps: Shape ``(K,)``: steps in simulation, of each seed.
+        steps: Shape ``(K,)``: steps in simulation so far, of each seed.
         seconds: Shape ``(K,)``: time since training began [s].
         returns: Shape ``(K, seeds)``: sum of rewards of an episode.
         success: Shape ``(K, seeds)``: share of success.

@@ -99,7 +99,7 @@ class Deployment:
             with malformed(folder / SIMULATION, _AGAIN):
                 arrays = read_arrays(folder / SIMULATION)
         numbers = range(len(found.episodes))
-        # The embedded robot may run on from one episode to the next: then one account holds the truth of all.
+        # An embedded robot that runs on from one episode to the next writes a single file of true states.
         truths = [p if (p := folder / f"truth_{i}.bin").is_file() else folder / TRUTH for i in numbers]
         recordings = tuple(Recording.load(log_of(folder, i), truths[i]) for i in numbers)
         return replace(found, simulated=tuple(_of_episode(arrays, i) for i in numbers), recordings=recordings)

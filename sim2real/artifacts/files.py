@@ -18,7 +18,7 @@ from sim2real.errors import Sim2RealError
 T = TypeVar("T")
 
 _FOREIGN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError)
-"""What reading a file that is not as it should be raises."""
+"""What reading a malformed file raises."""
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def malformed(path: Path, again: str) -> Iterator[None]:
 
 
 def check(good: bool, reason: str) -> None:
-    """Raise ValueError, to be told by ``malformed``, unless something is as it should be."""
+    """Raise ValueError unless ``good``; inside ``malformed`` it becomes an error that names the file."""
     if not good:
         raise ValueError(reason)
 
@@ -67,7 +67,7 @@ def write_json(path: Path, document: Any) -> None:
 
     Args:
         path: The file.
-        document: What to write; numbers that are infinite or none at all, which JSON lacks, become null.
+        document: What to write; infinite numbers and NaN, which JSON lacks, become null.
     """
     text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
     draft = path.with_name(f".{path.name}.tmp")
@@ -79,7 +79,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an npz file.
 
     Raises:
-        ValueError: When it is none.
+        ValueError: When it is no npz file.
         OSError: When it cannot be read.
     """
     try:
@@ -111,7 +111,7 @@ def number(value: float | None, missing: float = math.nan) -> float:
 
 
 def _plain(value: Any) -> Any:
-    """Return what numpy adds to the kinds of numbers as Python has them."""
+    """Return numpy's arrays and numbers as those of Python."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")

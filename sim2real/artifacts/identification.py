@@ -20,7 +20,7 @@ PARAMETERS, PREDICTIONS, FREE_RUNS = "parameters.json", "predictions.npz", "free
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
 MODELS = ("identified", "no delay", "nominal")
-"""What predicts: what was found, the same fitted without delays, and the data sheet's values."""
+"""The models that predict: with the values found, the same fitted without delays, and with the data sheet's values."""
 _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _AGAIN = "run `sim2real identify` again"
 
@@ -32,7 +32,7 @@ class Estimate:
     Attributes:
         name: Its name; ``NAME@RECORDING`` where each recording has its own.
         unit: Unit of all numbers.
-        kind: ``derived`` is what follows from others.
+        kind: What it is a parameter of; ``derived`` ones follow from others.
         about: One line for tables and pages.
         nominal: The data sheet's value.
         estimate: The value found.
@@ -62,7 +62,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What an identification is worth: its status, why, and the command that goes on from there."""
+    """The verdict on an identification: its status, the reasons, and the command to run next."""
 
     status: str
     reasons: tuple[str, ...]
@@ -87,8 +87,8 @@ class Determined:
     """What the data determines at the estimate.
 
     Attributes:
-        condition: Condition number of the Jacobian, in widths of the bounds.
-        undetermined: Groups of parameters of which only combinations are determined.
+        condition: Condition number of the Jacobian, its columns in widths of the bounds.
+        undetermined: Groups of parameters of which at most combinations are determined.
         messages: The same in words.
         standard_error_per_minute: Parameter -> standard error to expect of one minute of such data.
     """
@@ -101,7 +101,7 @@ class Determined:
 
 @dataclass(frozen=True)
 class Refinement:
-    """A descent from one start: its loss before and after, in so many steps."""
+    """A local refinement: the loss before and after, and how many steps it took."""
 
     before: float | None
     after: float | None
@@ -113,13 +113,13 @@ class Search:
     """How the estimate was found.
 
     Attributes:
-        strategy: Of the search; None without one.
+        strategy: The search algorithm; None where the search was left out.
         history: Best loss of each generation ``(G,)``.
         evaluations: Candidates that were simulated.
-        refined: The descents after it.
+        refined: The refinements after it.
         seconds: What all of it took [s].
-        loss: Of an interrupted search: its best so far.
-        done: Of an interrupted search: share of search and refinement that was done.
+        loss: Of an interrupted search: the best loss so far.
+        done: Of an interrupted search: the shares of search and refinement that were done.
     """
 
     strategy: str | None = None
@@ -133,7 +133,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Prediction:
-    """How far a model is off after a horizon: field -> root mean square and mean absolute error; None without any."""
+    """How far a model is off up to a horizon: field -> root mean square and mean absolute error; None without data."""
 
     model: str
     horizon_s: float
@@ -144,7 +144,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How far one position is off on held-out data after the longest horizon.
+    """How far one position is off on held-out data, up to the longest horizon.
 
     Attributes:
         name: What people call it.
@@ -163,13 +163,13 @@ class HeldOut:
     beaten_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that it says how good the identified model is."""
+        """Check that the error of the identified model is there: it may come from a file."""
         check("identified" in self.rmse, f"no error of what was identified in {self.name!r}")
 
 
 @dataclass(frozen=True)
 class FreeRun:
-    """How far one model's free run of one recording is off in one field."""
+    """How far one model is off in one field when all held-out data of a recording is simulated from one state."""
 
     model: str
     recording: int
@@ -183,7 +183,7 @@ class FreeRun:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity over recordings: each by itself ``(R,)``, and what they say together.
+    """One quantity, estimated from each of R recordings by itself, and from all together.
 
     Attributes:
         name: Its name.
@@ -195,7 +195,7 @@ class Quantity:
         between: Deviation between recordings, beyond their standard errors.
         low95: Lower end of the 95 % interval for a further recording.
         high95: Its upper end.
-        agree: Whether their errors explain by how much they differ.
+        agree: Whether their standard errors explain how much the estimates differ.
     """
 
     name: str
@@ -221,21 +221,21 @@ class Identification:
     Attributes:
         pipeline: The robot.
         logs: The recordings: those that were fitted, then those that were held out whole.
-        verdict: What it is worth.
+        verdict: Whether it can be used, and why.
         parameters: The estimates.
         search: How they were found.
         covariance: Of the estimates.
         correlation: Of the estimates.
-        residual_inflation: By how much residuals that hang together in time widen the errors.
+        residual_inflation: Factor on the variance of the estimates, as residuals are correlated in time.
         misfit: Root mean square of the residuals, in deviations of the measurement.
         check: What the data determines.
         prediction: Errors over horizons.
         held_out: Errors of each position on held-out data, the worst first.
         free_run: Errors of the free runs.
-        aggregate: What several recordings say; empty for one.
+        aggregate: Each recording identified by itself, and all combined; empty unless that was asked for.
         segments: How many segments were simulated.
         held_out_from_s: Where the first segment that was held out begins [s].
-        settle_s: How much of a held-out segment its initial state was fitted to [s].
+        settle_s: Length of the first part of a held-out segment, to which its initial state was fitted [s].
         sigma: Field -> deviation that a measurement was assumed to have.
         units: Field -> unit.
         posterior: What training draws robots from; None where the search was interrupted.
@@ -273,7 +273,7 @@ class Identification:
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter -> the value found, without what follows from others."""
+        """Parameter -> the value found, without derived ones."""
         return {p.name: p.estimate for p in self.parameters if p.kind != "derived"}
 
     @property
@@ -283,7 +283,7 @@ class Identification:
 
     @property
     def recordings(self) -> list[int]:
-        """Numbers of the recordings that there are samples of."""
+        """Numbers of the recordings in ``samples``."""
         return np.unique(self.samples["recording"]).tolist() if self.samples else []
 
     def models(self, name: str) -> list[str]:
@@ -291,7 +291,7 @@ class Identification:
         return [m for m in MODELS if f"{name}_{m}" in self.samples]
 
     def disjoint(self) -> np.ndarray:
-        """Return which samples to show ``(N,)``: segments may overlap, and then the later one is left out."""
+        """Return a mask ``(N,)`` of samples in segments that do not overlap: of two that do, the later is left out."""
         t_s, segment, recording = (self.samples[n] for n in ("t", "segment", "recording"))
         chosen, end = np.zeros(len(t_s), bool), {}
         for number in dict.fromkeys(segment.tolist()):
@@ -348,7 +348,7 @@ class Identification:
 
 
 def _columns(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return columns that are one value a sample, at least one."""
+    """Return the columns after checking that all have one value for each of at least one sample."""
     missing = set(_COLUMNS) - set(samples)
     check(not missing, f"no {', '.join(sorted(missing))}")
     wrong = [n for n, v in samples.items() if v.ndim != 1 or v.shape != samples["t"].shape]

@@ -21,13 +21,13 @@ from sim2real.errors import Sim2RealError
 MANIFEST = "manifest.json"
 _TEXTS = ("pipeline", "stage", "status", "started")
 _DRAFT = f".{MANIFEST}.tmp"
-# Most manifests have 4 kB; the rest is for summaries.
+# Most manifests have 4 kB; long summaries need more.
 _RESERVED_BYTES = 32 * 1024
 PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return a stage folder's manifest, or None if there is none or it is not readable as one."""
+    """Return a stage folder's manifest, or None if it is missing or malformed."""
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -36,7 +36,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _is_manifest(value: Any) -> bool:
-    """Whether a JSON document has what is asked of a manifest, and its outputs lie in its folder."""
+    """Whether a JSON document has a manifest's entries, and its outputs lie in its folder."""
     if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
         return False
     for kind in ("inputs", "outputs"):
@@ -60,7 +60,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """
     text = json.dumps(plain(manifest), indent=2, allow_nan=False)
     draft = folder / _DRAFT
-    # Written over what `reserve` left: cut to its length only afterwards.
+    # Written over what `reserve` left, and cut to its length afterwards: it needs no room of its own on a full disk.
     with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
         file.write(f"{text}\n".encode())
         file.truncate()
@@ -70,7 +70,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def reserve(folder: Path) -> None:
-    """Take room on the disk for the folder's next manifest: on a full one it must still say how the stage ended."""
+    """Reserve disk space for the folder's next manifest: even on a full disk it must say how the stage ended."""
     with (folder / _DRAFT).open("wb") as file:
         file.write(b" " * _RESERVED_BYTES)
         file.flush()
@@ -130,7 +130,7 @@ def sha256(path: Path) -> str:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions that a result may depend on; None for a package that is not installed."""
+    """Return the versions of the packages that a result may depend on; None for one that is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
     for name in PACKAGES:
         try:
@@ -165,8 +165,8 @@ def git_state(folder: Path | None = None) -> dict[str, Any] | None:
         return done.stdout.strip()
 
     try:
-        # A repository may come from anywhere, and its own settings name programs that git runs: file system monitors,
-        # hooks, and filters of contents. Those of the user's settings stay.
+        # A repository may come from anywhere, and its settings may name programs that git would run: file system
+        # monitors, hooks, filters. They are switched off; the user's own settings stay.
         for line in git("config", "--list", "--name-only", "--show-scope").splitlines():
             scope, _, key = line.partition("\t")
             if scope in ("local", "worktree") and key.startswith("filter."):

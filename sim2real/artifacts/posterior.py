@@ -11,7 +11,7 @@ from sim2real.artifacts.files import check
 
 Transform = Literal["linear", "log", "logit"]
 TRANSFORMS = {
-    # to the scale, numpy; back from it, for numpy and JAX; derivative of the value on the scale, from the value
+    # value -> scale (numpy); scale -> value (numpy or JAX); d value / d scale, as a function of the value
     "linear": (lambda v: v, lambda x, m: x, lambda v: 1.0 + 0.0 * v),
     "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
     "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),

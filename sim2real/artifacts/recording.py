@@ -1,4 +1,4 @@
-"""A recorded session: its log and, of an embedded robot, the account of what really happened."""
+"""A recorded session: its log and, of an embedded robot, the file with its true states and latencies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Recording:
     Attributes:
         path: The log.
         episode: What it holds.
-        truth_path: What an embedded robot told of itself; None where there is none.
+        truth_path: An embedded robot's true states and latencies; None where there are none.
         warnings: What the log lacks: it was cut, or parts of it cannot be read.
     """
 
@@ -61,7 +61,7 @@ class Recording:
 
     @property
     def dry_run(self) -> bool:
-        """Whether nothing was moved: what it holds as commands was never sent."""
+        """Whether nothing was moved: its commands were never sent."""
         return self.episode.metadata.get("dry_run") is True
 
     @property
@@ -81,7 +81,7 @@ class Recording:
 
     @cached_property
     def truth(self) -> Truth | None:
-        """What an embedded robot told of itself; None for any other.
+        """An embedded robot's true states and latencies; None for any other robot.
 
         Raises:
             Sim2RealError: When its file is damaged.

@@ -1,8 +1,8 @@
 """Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a manifest.
 
 A stage that is run again in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: a folder is made once, by the
-process that writes into it, and never renamed. So two processes cannot meet in one, nothing recorded is overwritten,
-what refers to a file in one goes on being right, and a failed attempt does not hide a finished one.
+process that writes into it, and never renamed. So two processes never write into the same one, nothing recorded is
+overwritten, references to files stay valid, and a failed attempt does not hide a finished one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
 DRY = "dry run"
-"""Status of a stage that came to its end without moving anything: no later one takes it for a finished one."""
+"""Status of a stage that ended well but moved nothing: later stages do not use it."""
 INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NAME = re.compile(r"\w[\w.-]*")
@@ -39,7 +39,7 @@ class Source:
 
     @staticmethod
     def of(path: Path, run_dir: Path) -> Source:
-        """Return what to keep of a file that an artifact in a run folder was made from."""
+        """Describe a file that an artifact in a run folder was made from."""
         return Source(portable(path, run_dir), sha256(path))
 
 
@@ -67,7 +67,7 @@ class StageFolder:
 
     @property
     def dry(self) -> bool:
-        """Whether it moved nothing: what it holds as commands was never sent."""
+        """Whether it moved nothing: its commands were never sent."""
         return self.manifest.get("dry_run") is True
 
     @property
@@ -154,14 +154,14 @@ def open_stage(
         config: The resolved configuration, a dataclass.
         inputs: Name -> file or folder that the stage reads; hashed before it starts.
         run_dir: Run folder to add to; None makes a new one.
-        dry_run: Whether the stage only does as if.
+        dry_run: Whether the stage moves nothing.
 
     Yields:
         The running stage; at its end the manifest says 'finished', 'dry run', 'failed' or 'interrupted', and the exit
         code.
 
     Raises:
-        UsageError: When there is no such stage, or the pipeline's name is none for a folder.
+        UsageError: When there is no such stage, or the pipeline's name cannot be that of a folder.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
     _check_names(pipeline, stage)
@@ -209,7 +209,7 @@ def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str,
 
 
 def _check_names(pipeline: str, stage: str) -> None:
-    """Refuse what is no stage, and a pipeline's name that may lead out of the folder of runs: files hold such names."""
+    """Refuse unknown stages, and names of pipelines, which may come from files, that lead out of the folder of runs."""
     if stage not in STAGES:
         raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
     if not _NAME.fullmatch(pipeline):
@@ -221,7 +221,7 @@ def _check_names(pipeline: str, stage: str) -> None:
 def portable(path: Path, run_dir: Path) -> str:
     """Return a path as an artifact of a run refers to it: relative to the run folder.
 
-    A run that is moved, or copied to another machine, so still finds what lies in it.
+    So a run that is moved, or copied to another machine, still finds its own files.
     """
     return Path(os.path.relpath(path.resolve(), run_dir.resolve())).as_posix()
 
@@ -255,7 +255,7 @@ def finished(run_dir: Path, stage: str) -> StageFolder | None:
 
 
 def open_folder(folder: Path, stage: str) -> StageFolder:
-    """Return a stage's folder, finished or still at work.
+    """Return a stage's folder, finished or not.
 
     Raises:
         Sim2RealError: When there is no such folder.
@@ -306,7 +306,7 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
         root: Folder of all runs.
         pipeline: Name of the pipeline.
         stage: The stage whose artifact is wanted.
-        run_dir: Run folder that is asked first; without the artifact there, the newest of all runs is taken.
+        run_dir: Run folder to look in first; without the artifact there, the newest of all runs is taken.
 
     Raises:
         Sim2RealError: When there is none; the message says what was looked for and the hint which command makes it.
@@ -329,7 +329,7 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
 
 
 def _stage_folder(run_dir: Path, stage: str) -> Path:
-    """Make a stage's folder, under the first free number; making it takes it, whoever else is at work here."""
+    """Make a stage's folder under the first free number; whoever makes it owns it, also beside other processes."""
     number = 1
     while True:
         folder = run_dir / (stage if number == 1 else f"{stage}.{number}")
@@ -350,7 +350,7 @@ def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
 
 
 def _in_words(error: BaseException, folder: Path) -> BaseException:
-    """Return what the user is told of an exception: the cause, where a full disk is behind it."""
+    """Return the exception to show the user: a plain error where a full disk is the cause, else the same."""
     if not isinstance(error, OSError) or error.errno not in _FULL:
         return error
     where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""

@@ -1,8 +1,7 @@
 """How long everything took on the robot: what training draws its timing from, so that it needs no log.
 
-Of every node the computation, of every connection the transport, in the order in which they occurred: ``timing.npz``.
-Beside it ``timing.json`` says the same in numbers that people read, and what else the session knew: lost answers,
-overruns, the clock.
+``timing.npz`` has every node's computation times and every connection's transport times, in their order.
+``timing.json`` has their quantiles for people, and what else the session counted: lost answers, overruns, the clock.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _AGAIN = "record again, or run `sim2real identify` again on the log"
 
 @dataclass(frozen=True)
 class Spread:
-    """A distribution in numbers [s]: median, 99 % quantile and largest; None without any sample."""
+    """Median, 99 % quantile and maximum of times [s]; None without any sample."""
 
     p50: float | None
     p99: float | None
@@ -37,14 +36,14 @@ class Spread:
 
     @staticmethod
     def of(seconds: np.ndarray) -> Spread:
-        """Return the spread of times ``(N,)`` [s]; those that are no number do not count."""
+        """Return the spread of times ``(N,)`` [s]; NaN does not count."""
         there = seconds[np.isfinite(seconds)]
         return Spread(*np.quantile(there, [0.5, 0.99, 1.0]).tolist()) if there.size else Spread(None, None, None)
 
 
 @dataclass(frozen=True)
 class NodeTiming:
-    """How a node kept its times.
+    """The timing of one node.
 
     Attributes:
         steps: How many steps it made.
@@ -52,7 +51,7 @@ class NodeTiming:
         lateness: From a step's start to when its thread really ran.
         computation: From a step's start to its end, the thread's awakening and the bus included.
         age: Input -> how long before a step's start the newest message that it used was sent.
-        overruns: Steps that ended after the next was due; None where nobody counted.
+        overruns: Steps that ended after the next was due; None where they were not counted.
     """
 
     steps: int
@@ -71,7 +70,7 @@ class ConnectionTiming:
         reader: The node that reads.
         input: Name of its input.
         messages: How many were sent.
-        unread: How many no step used: newer ones had come, or the episode had ended.
+        unread: How many no step used, because newer ones had come or the episode had ended.
         transport: From a message's sending to its receipt.
     """
 
@@ -84,13 +83,13 @@ class ConnectionTiming:
 
 @dataclass(frozen=True)
 class BusTiming:
-    """What the bus of a device went through.
+    """Transactions, losses and late answers on a device's bus.
 
     Attributes:
         transactions: Questions asked.
         lost: Answers that never came.
         retries: Questions asked again.
-        late: Answers whose sample's time is not sure, or that came after they had been asked for again.
+        late: Answers whose sample's time is uncertain, or that came after their question had been repeated.
         lateness: By how much answers took longer than their bytes.
     """
 
@@ -106,11 +105,11 @@ class Timing:
     """The timing of one session.
 
     Attributes:
-        nodes: Node -> how it kept its times.
-        connections: What became of messages.
+        nodes: Node -> its timing.
+        connections: What became of the messages of each connection.
         bus: The bus; None where there is none, such as in a log that was imported.
         stamps: Node -> ``recorded`` or, in a log that was imported, ``generated`` from a rate.
-        monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None where nobody kept it.
+        monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None where it is not known.
         steps_s: Node -> how long each of its steps took ``(N,)`` [s], in their order.
         transport_s: (reader, input) -> how long each message was under way ``(M,)`` [s], in their order.
         format: Version of the files.
@@ -130,7 +129,7 @@ class Timing:
         """Return the timing of a log, its own account of the session included."""
         end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
         counted: Mapping[str, Any] = end.get("timing", {})
-        # The session counts overruns and orders nodes as their graph says; a log without it is as good otherwise.
+        # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
         stamps = episode.metadata.get("stamps", {})
         return Timing(

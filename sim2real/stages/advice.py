@@ -47,8 +47,7 @@ def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) ->
         pipeline: The robot; settings that equal its defaults need no flag.
         config: The settings of the last identification.
         root: Folder of all runs.
-        flags: The further flags; they replace equal flags of the settings, and bounds or fixed values of the same
-            parameters.
+        flags: The further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
     if not flags:
         return ""

@@ -86,6 +86,13 @@ def find_source(
 ) -> Source:
     """Return the logs that were named, the newest recording, or what recording would give.
 
+    Args:
+        pipeline: The robot.
+        config: Names logs, or asks for the planned excitation.
+        model: What is to be identified.
+        parameters: Its parameters, whose nominal values are simulated.
+        fitting: How logs are cut and simulated.
+
     Raises:
         UsageError: When there is neither a recording nor an excitation to plan one with.
     """
@@ -115,13 +122,17 @@ def find_source(
 
 
 def judge(
-    model: IdentifiableModel,
-    source: Source,
-    config: IdentifyConfig,
-    parameters: ParameterTable,
-    units: dict[str, str],
+    model: IdentifiableModel, source: Source, config: IdentifyConfig, parameters: ParameterTable, units: dict[str, str]
 ) -> dict[str, Any]:
-    """Return what the recordings show, and what they determine at the nominal values, as JSON takes it."""
+    """Return what the recordings show, and what they determine at the nominal values, as JSON takes it.
+
+    Args:
+        model: What is to be identified.
+        source: The recordings.
+        config: How logs are cut into segments.
+        parameters: The model's parameters.
+        units: Field -> unit.
+    """
     for episode in source.episodes:
         check_log(episode, model)
     spans, length_s = cut(source.episodes, config)
@@ -155,7 +166,13 @@ def judge(
 
 
 def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) -> dict[str, Any]:
-    """Return when a recording was sampled, what its joints did, and what drove them."""
+    """Return when a recording was sampled, what its joints did, and what drove them.
+
+    Args:
+        episode: The log.
+        model: Says which nodes and fields matter.
+        units: Field -> unit.
+    """
     t_s = episode.steps[model.sensor].begun_s
     outputs = episode.outputs[model.sensor]
     joints = []
@@ -217,7 +234,15 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
 def simulate(
     model: IdentifiableModel, robot: Any, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
 ) -> Episode:
-    """Return what the model at its nominal values would be recorded to do under the planned excitation."""
+    """Return the log that the planned excitation would give if the robot were the nominal model.
+
+    Args:
+        model: The model.
+        robot: Says which command is excited, and at which rate.
+        record: The excitation.
+        parameters: The model's parameters.
+        config: For which delays the model is made.
+    """
     nodes = model.nodes(config.max_delay_s)
     node, field = robot.COMMAND
     signal = command_signal(record, robot.RATE_HZ, len(robot.ACTION))

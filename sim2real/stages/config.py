@@ -61,17 +61,17 @@ class IdentifyConfig(FitConfig):
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log to identify from, one flag a log; default: the newest finished recording of the pipeline."""
     hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """MCAP log that is only predicted, one flag a log."""
+    """MCAP log that is held out: only predicted, not fitted; one flag a log."""
     settle_s: float = 0.3
-    """First part of a segment, to which the initial state is fitted where the rest is predicted [s]."""
+    """First part of a held-out segment, to which its initial state is fitted; the rest is predicted [s]."""
     horizon_s: float = 1.0
-    """Rest of a segment: how far ahead predictions are compared with the log [s]."""
+    """Rest of a segment: how far ahead it is predicted [s]."""
     spacing_s: float = 0.0
     """Distance between the starts of fitted segments [s]; 0 puts them side by side."""
     held_out: float = 0.25
-    """Share of each log, at its end, that is only predicted; 0 where whole logs are held out."""
+    """Share of each log, at its end, that is held out; 0 where whole logs are."""
     free_run_s: float = 10.0
-    """Longest free run, from one initial state, of what is held out [s]."""
+    """Longest simulation of held-out data from a single initial state [s]."""
     each: bool = False
     """Identify each log by itself as well, and report the spread between them."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
@@ -184,7 +184,7 @@ class ImportConfig:
     pipeline: str | None = None
     """Pipeline that the logs are for; default: the one that the mapping names."""
     format: Literal["npz", "json", "csv", "lerobot"] | None = None
-    """What the files are; default: what their suffixes say."""
+    """Format of the files; default: by their suffixes."""
     samples: Annotated[str | None, arg(metavar="A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None

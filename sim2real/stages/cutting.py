@@ -13,7 +13,7 @@ from sim2real.stages.config import IdentifyConfig
 
 _WINDOW_SPACING_S = 0.5
 _EDGES_S = (0.3, 0.2)
-"""What is left out at either end of a log where initial states are estimated [s]."""
+"""What is left out at the beginning and at the end of a log where initial states are estimated [s]."""
 
 
 def spans(
@@ -23,7 +23,7 @@ def spans(
     length_s: float,
     spacing_s: float = _WINDOW_SPACING_S,
 ) -> list[Span]:
-    """Return segments of a length: side by side where they are fitted, every half a second where they are held out.
+    """Return segments of one length, those to fit and those that are held out.
 
     Args:
         episodes: The logs; those that are held out whole come last.
@@ -65,6 +65,12 @@ def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
 
 
 def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
-    """Return when the part of a log begins that is held out [s]; of a log that is not fitted that is all of it."""
+    """Return when the held-out part of a log begins [s].
+
+    Args:
+        episode: The log.
+        fitted: Whether it is fitted at all; else all of it is held out.
+        config: Which share is held out.
+    """
     begin, end = reach(episode, config)
     return begin + (1.0 - config.held_out) * (end - begin) if fitted else begin

@@ -21,7 +21,7 @@ def failed(error: Sim2RealError) -> int:
     """Print the error's message, notes and hint; return its exit code."""
     if os.environ.get(DEBUG):
         traceback.print_exc()
-    # The notes name nodes and what failed on the way out; the hint stays last.
+    # Notes name nodes, and what else failed during the clean-up; the hint comes last.
     message, *hint = str(error).split("\n\nhint: ", 1)
     if not hint and isinstance(error, UsageError):
         hint = ["see `sim2real COMMAND --help`"]

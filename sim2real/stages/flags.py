@@ -116,7 +116,7 @@ def flag_names(config: Any, prefix: str = "") -> list[str]:
     for item in fields(config):
         value = getattr(config, item.name)
         if is_dataclass(value):
-            # The stage's own configuration stands at the top; see StageFlags.
+            # The flags of StageFlags.config have no prefix.
             names += flag_names(value, prefix if item.name == "config" else f"{prefix}{item.name}.")
         else:
             names.append(f"--{prefix}{item.name}".replace("_", "-"))
@@ -137,7 +137,7 @@ def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
 
 
 def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:
-    """Return the reason why the parser gave up: the configuration's own error, or the text in the parser's box."""
+    """Return why the parser gave up: the configuration's own error, or the text that the parser printed in a box."""
     cause: BaseException | None = end
     while cause is not None:
         if isinstance(cause, Sim2RealError):
@@ -151,7 +151,7 @@ def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:
 
 @contextlib.contextmanager
 def _plain_if_asked() -> Iterator[None]:
-    """Have no colour in the help where NO_COLOR is set; the parser itself does not look at it."""
+    """Print the help without colour where NO_COLOR is set, which the parser itself ignores."""
     options = tyro._experimental_options
     before = options["ansi_codes"]
     options["ansi_codes"] = before and not os.environ.get("NO_COLOR") and sys.stdout.isatty()

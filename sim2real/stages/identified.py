@@ -33,13 +33,13 @@ from sim2real.stages.console import note, table
 
 @dataclass(frozen=True)
 class Findings:
-    """A fit, and what the recordings leave open at it.
+    """A fit, and how uncertain it is.
 
     Attributes:
         fit: The fit.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         spread: Its uncertainty.
-        check: What the data determines there.
+        check: What the data determines.
         trip: The sum of the delays; None where there are none.
     """
 
@@ -51,7 +51,7 @@ class Findings:
 
     @staticmethod
     def of(fit: Fit) -> Findings:
-        """Return what the recordings leave open at a fit."""
+        """Compute how uncertain a fit is."""
         at = uncertainty.linearise(fit.problem, fit.z)
         spread = uncertainty.from_linearised(fit.problem, at)
         check = identifiability.from_linearised(fit.problem, at)
@@ -59,7 +59,7 @@ class Findings:
 
 
 def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds: float) -> Identification:
-    """Return the estimates and how sure they are; what they predict and a verdict are still to come.
+    """Return the estimates and their uncertainty; predictions and verdict are added later.
 
     Args:
         pipeline: Name of the robot's pipeline.
@@ -136,7 +136,7 @@ def scored(scores: Sequence[Score]) -> list[HeldOut]:
 
 
 def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
-    """Return what several recordings are compared by: name, unit and the parameters whose sum it is."""
+    """Return the quantities in which recordings are compared: name, unit, and the parameters that it is the sum of."""
     free = [p for p in parameters if p.free and not p.per_recording]
     delays = [p.name for p in free if p.kind == "delay"]
     rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]
@@ -144,7 +144,13 @@ def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
 
 
 def error_of(found: Fit, spread: uncertainty.Uncertainty, parts: Sequence[str]) -> float:
-    """Return the standard error of a sum of parameters."""
+    """Return the standard error of a sum of parameters.
+
+    Args:
+        found: The fit.
+        spread: Its uncertainty.
+        parts: Names of the parameters.
+    """
     return uncertainty.sum_of(spread, [found.problem.table.names.index(n) for n in parts])
 
 
@@ -228,7 +234,7 @@ def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:
 
 
 def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> Estimate:
-    """Return the row of the sum of all delays: what a log tells even where it cannot tell them apart."""
+    """Return the row of the sum of all delays, which a log determines even where it cannot tell them apart."""
     return Estimate(
         name=ROUND_TRIP,
         unit="s",

@@ -52,10 +52,10 @@ def identify(
         pipeline: The robot.
         config: How; default: the pipeline's own. The files that it may name are not read.
         hold_out: Recordings that are only predicted.
-        best: Takes the best that was found so far.
+        best: Updated with the best values so far while the search runs.
 
     Returns:
-        Estimates, how sure they are, what they predict, and whether that is worth anything.
+        Estimates, their uncertainty, what they predict, and a verdict.
 
     Raises:
         UsageError: When the recordings are too short, or the model does not fit them.

@@ -1,4 +1,4 @@
-"""What ``sim2real info`` tells: about the installation, a pipeline, a log or a run."""
+"""What ``sim2real info`` prints about the installation, a pipeline, a log or a run."""
 
 from __future__ import annotations
 

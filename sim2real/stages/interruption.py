@@ -91,7 +91,7 @@ def patiently(work: Callable[[], Result]) -> Result:
             done.set()
 
     threading.Thread(target=run, name="sim2real:work", daemon=True).start()
-    while not done.wait(_LOOK_S):  # polls, as a signal that arrives in another thread does not wake this one
+    while not done.wait(_LOOK_S):  # polls: a signal that another thread receives does not wake this one
         pass
     if failure:
         raise failure[0]

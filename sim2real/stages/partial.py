@@ -1,4 +1,4 @@
-"""What a search that is ended by a signal leaves behind: the best that it had found."""
+"""What a search that is ended by a signal leaves: the best values that it had found."""
 
 from __future__ import annotations
 
@@ -34,7 +34,14 @@ class Best:
     done: dict[str, float] = field(default_factory=lambda: {"search": 0.0, "refine": 0.0})
 
     def advance(self, stage: str, share: float, loss: float, z: np.ndarray) -> None:
-        """Take note of what ``fit`` tells; a refinement begins at the search's best, then its loss counts."""
+        """Take note of progress; the first result of a refinement replaces that of the search, even with a larger loss.
+
+        Args:
+            stage: ``search`` or ``refine``.
+            share: Share of it that was done since the last call.
+            loss: The best loss so far.
+            z: Shape ``(P,)``: where it is.
+        """
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
@@ -64,7 +71,7 @@ def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], table: Pa
 def _unfinished(
     pipeline: str, logs: Sequence[Path], run_dir: Path, table: ParameterTable, best: Best
 ) -> Identification:
-    """Return the best so far as an identification that says that it is none."""
+    """Return the best so far as an identification with the verdict ``interrupted``."""
     values = as_numbers(table, np.asarray(best.z))
     done = ", ".join(f"{share:.0%} of {what}" for what, share in best.done.items())
     reason = (
@@ -95,5 +102,5 @@ def _unfinished(
 
 
 def _each(name: str, value: Any) -> list[tuple[str, float]]:
-    """Return the names and values of a parameter, of which each recording may have its own."""
+    """Return a parameter's names and values: several where each recording has its own."""
     return [(f"{name}@{i}", v) for i, v in enumerate(value)] if isinstance(value, list) else [(name, value)]

@@ -25,6 +25,11 @@ LATE_SHARE = 0.01
 def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) -> Iterator[Session]:
     """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
 
+    Args:
+        robot: The robot.
+        config: Port, limits, seed, and whether it is a dry run.
+        truth_path: File for the emulated robot's account of itself.
+
     Raises:
         UsageError: The robot's device cannot do a dry run.
     """

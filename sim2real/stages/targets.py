@@ -14,8 +14,7 @@ from sim2real.stages.pipeline import available
 def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
     """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
 
-    Of a pipeline's runs the newest in which a stage is finished counts, if there is any: one that failed at its start
-    does not hide those before it.
+    Of a pipeline's runs the newest with a finished stage is taken: one that failed at its start does not hide it.
 
     Args:
         root: Folder of all runs.
@@ -26,7 +25,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
         UsageError: When there is no such run, or it belongs to another pipeline.
     """
     path = Path(target)
-    # What is above counts for a stage folder only: above a pipeline's name is wherever the user happens to be.
+    # Only a stage folder stands for its parent: that of a pipeline's name would be the working directory.
     options = [path.parent if read_manifest(path) is not None else path]
     options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
     for folder in options:

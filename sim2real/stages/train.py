@@ -34,11 +34,11 @@ from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 
 _LONGEST_GAP = 1.25
-"""Timelines with a longer pause between policy steps than this many medians are drawn again."""
+"""Timelines with a pause between policy steps longer than this many times the median are drawn again."""
 _HICCUP = 0.25
 """Steps that took longer than this share of the policy's period on the robot are not drawn from."""
 _LEAST_SPREAD, _MOST = 0.02, 2.0
-"""Copies differ by this share at least, and by no more than this factor: a log may have told nothing about one."""
+"""Copies differ by at least this share of a parameter, and at most by this factor, however uncertain it is."""
 _DRAWS = 1024
 
 
@@ -127,7 +127,13 @@ def model_values(
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Return the parameters to train on, and draws of the dynamics from their posterior, ``(K,)`` each.
 
-    What the log tells about combinations of parameters holds in every draw; what it tells about none is cut off.
+    Draws keep the correlations between parameters. Where the log leaves one open, draws are cut off at half and twice
+    its estimate.
+
+    Args:
+        robot: The robot, for its nominal parameters.
+        identified: What identify found; the nominal model needs none.
+        config: Which model, how far copies differ, and the seed.
     """
     if config.model == "nominal" or identified is None or identified.posterior is None:
         return robot.nominal(), {}
@@ -148,7 +154,7 @@ def model_values(
 def _computation(
     robot: Robot, identified: Identification | None, timing: Timing | None
 ) -> tuple[dict[str, DelayDistribution], dict[str, int]]:
-    """Return how long each node's steps take, and of which nodes how many are left out: hiccups.
+    """Return how long each node's steps take, and how many were left out of each node as hiccups.
 
     Raises:
         Sim2RealError: When nothing says how long they take, or most of them are hiccups.
@@ -173,6 +179,11 @@ def _timing_of(identified: Identification | None) -> Timing:
 
 def draw_timelines(nodes: Mapping[str, BaseNode], supervisor: str, config: TrainConfig) -> tuple[Timeline, int]:
     """Draw timelines without long pauses of the policy.
+
+    Args:
+        nodes: The graph.
+        supervisor: The node whose steps the policy makes.
+        config: How many timelines of which length, and the seed.
 
     Returns:
         The timelines, and how many were drawn again.

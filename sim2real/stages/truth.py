@@ -37,7 +37,13 @@ def true_values(recording: Recording) -> dict[str, float]:
 
 
 def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
-    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any."""
+    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any.
+
+    Args:
+        truth: The embedded robot's account.
+        episode: The log.
+        origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
+    """
     steps = episode.steps["sensor"]
     stamp = steps.begun * 1000 + origin_ns
     samples = truth.of(Kind.SAMPLE)
@@ -49,7 +55,13 @@ def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
 
 
 def actuation_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
-    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any."""
+    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any.
+
+    Args:
+        truth: The embedded robot's account.
+        episode: The log.
+        origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
+    """
     steps = episode.steps["actuator"]
     start, end = steps.start * 1000 + origin_ns, steps.end * 1000 + origin_ns
     effects = truth.of(Kind.EFFECT)

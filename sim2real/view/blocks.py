@@ -85,7 +85,7 @@ MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
 
 @dataclass(frozen=True)
 class Banner:
-    """A verdict at the top of a section; its sign and its words say all that its colour does."""
+    """A verdict at the top of a section, readable without its colour: a sign and words say the same."""
 
     tone: Tone
     title: str

@@ -1,4 +1,4 @@
-"""What a recording shows, before anything knows about a viewer: one tab for each episode, with curves and a scene."""
+"""What a Rerun recording shows, independent of Rerun: one tab for each episode, with curves and a scene."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Motion:
-    """What moves the robot in the 3-D view: a column ``(N,)`` for each field; a ghost is what a model says."""
+    """A motion of the robot in the 3-D view: a column ``(N,)`` for each field; a ghost is a model's prediction."""
 
     entity: str
     t_s: np.ndarray
@@ -145,7 +145,7 @@ def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
     due = steps.scheduled + steps.drift
     times = np.stack([np.minimum(due, steps.start), steps.start, steps.woken, steps.end], axis=1).ravel()
     names = ["waiting", "late", "computing", IDLE] * len(steps)
-    # A step is due before the last one has ended when that one overran: it cannot wait before it is its turn.
+    # After an overrun a step is due before the one in front of it has ended; it waits only from that end on.
     times = np.maximum.accumulate(times)
     lasting = np.append(np.diff(times) > 0, True)
     return times[lasting] / TICKS_PER_S, [name for name, lasts in zip(names, lasting, strict=True) if lasts]

@@ -1,4 +1,4 @@
-"""Figures of an identification: how well it predicts, how it was searched, and what hangs together."""
+"""Figures of an identification: predictions, the search, and correlations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SAID = {"hold": "hold: nothing changes", "told": "told: where it was told to be
 
 
 def predictions(found: Identification, name: str) -> str:
-    """Draw measured against predicted, segment by segment; what was held out is shaded and shown closer."""
+    """Draw measured against predicted, segment by segment; held-out data is shaded, and enlarged beside it."""
     panels = []
     for recording, quantity in shown(found, found.recordings):
         own = found.samples["recording"] == recording
@@ -56,7 +56,7 @@ def predictions(found: Identification, name: str) -> str:
 
 
 def free_runs(found: Identification, name: str) -> str:
-    """Draw what is held out of each recording against one simulation of all of it, with its errors."""
+    """Draw the held-out part of each recording beside one simulation of all of it, with its errors."""
     panels = []
     for recording, quantity in shown(found, np.unique(found.free["recording"]).tolist()):
         rows = found.free["recording"] == recording
@@ -145,7 +145,13 @@ def search(found: Identification, name: str) -> str:
 
 
 def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
-    """Draw a correlation matrix; the numbers stand in the cells, where they fit."""
+    """Draw a correlation matrix, with the numbers where they fit into the cells.
+
+    Args:
+        names: P parameters.
+        matrix: Shape ``(P, P)``.
+        name: Of the figure, unique on its page.
+    """
     count = len(names)
     size = 0.62 if count <= 14 else max(0.3, 8.4 / count)
     with styled():
@@ -180,7 +186,7 @@ def _errors_of(found: Identification, recording: int, quantity: str) -> str:
 
 
 def _measured(found: Identification, quantity: str, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a measurement wherever there is one, in order of time: segments may overlap, and repeat it."""
+    """Return all measurements of a field once, in order of time: segments that overlap repeat them."""
     t_s, first = np.unique(found.samples["t"][own], return_index=True)
     pieces = np.cumsum(np.diff(t_s, prepend=t_s[:1]) > 3 * np.median(np.diff(t_s)))
     return with_gaps(t_s, found.samples[f"{quantity}_measured"][own][first], pieces)
@@ -193,7 +199,7 @@ def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _model_look(model: str, number: int) -> tuple[str, Any, str]:
-    """Return colour, dash and mark of a model; those of the overlay where it is one of them."""
+    """Return colour, dash and mark of a model: those that it has in all figures, if it has any."""
     known = {
         "identified": (BLUE, style.DASHES[0], "o"),
         "no delay": (INK, style.DASHES[3], "D"),

@@ -21,7 +21,7 @@ _MOST_QUANTITIES = 12
 
 
 def intervals(estimates: Sequence[Estimate], name: str) -> str:
-    """Draw each parameter inside its bounds, and beside it, in standard errors, where truth and nominal value lie."""
+    """Draw each parameter within its bounds; beside it, in standard errors, how far truth and nominal value are off."""
     groups = [(kind, g) for kind in _KINDS if (g := [e for e in estimates if _kind(e) == kind])]
     with styled():
         figure = new_figure(0.9 + 0.36 * len(estimates) + 0.4 * len(groups))
@@ -79,7 +79,7 @@ def _recordings(axes: Axes, quantity: Quantity) -> None:
     axes.axhspan(low, high, color=SHADE, lw=0, zorder=0)
     axes.axhline(scale * quantity.mean, color=INK, lw=1.4, zorder=1)
     axes.errorbar(at, values, yerr=reach, color=BLUE, fmt="o", ms=4.5, lw=1.6, zorder=3)
-    # The interval of a further one may be very wide where recordings are few: the estimates decide what is seen.
+    # The axis fits the estimates: the interval for a further recording may be very wide where recordings are few.
     bottom, top = float((values - reach).min()), float((values + reach).max())
     room = 0.6 * (top - bottom) or 1.0
     axes.set_ylim(max(bottom - room, min(low, bottom) - 0.1 * room), min(top + room, max(high, top) + 0.1 * room))
@@ -101,7 +101,7 @@ def _kind(e: Estimate) -> str:
 
 
 def _inside_bounds(axes: Axes, group: Sequence[Estimate], kind: str) -> None:
-    """Draw the whole interval that was searched: relative to nominal on a log axis, as a share of it, or in ms."""
+    """Draw estimates within their bounds: relative to nominal on a log axis, as a share of the bounds, or in ms."""
     for row, e in enumerate(group):
         at = _placed(e, kind)
         if e.lower is not None and e.upper is not None:

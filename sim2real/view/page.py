@@ -88,7 +88,7 @@ def _write(
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
-    """Return notes about newer attempts that came to no end: the page shows an older one instead, or none."""
+    """Return notes about newer attempts that did not finish: the page shows an older one instead, or none."""
     notes = []
     for stage in STAGES:
         tried = attempts(run_dir, stage)

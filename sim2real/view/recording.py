@@ -1,7 +1,6 @@
 """A run as a Rerun recording: signals, schedule and a 3-D scene on one timeline.
 
-Everything is sent by columns after the run, never row by row: 16 us a row instead of 276, and no control loop waits for
-a viewer.
+All is sent after the run, so that no control loop waits for a viewer, and by columns: 16 us a row instead of 276.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from sim2real.view.content import IDLE, Curve, Tab, states_of, tabs_of
 from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
-"""The one timeline: with several the viewer picks one by itself."""
+"""The only timeline: of several the viewer would pick one by itself."""
 
 Scene = Callable[[Any, np.ndarray, Mapping[str, np.ndarray], str, bool], None]
 """Draws a robot: ``log_scene(recording, t_s, columns, entity, ghost)``.
 
 ``recording`` is a ``rerun.RecordingStream``, ``t_s`` ``(N,)`` [s], ``columns`` the fields ``(N,)`` by name. What never
-moves is logged as static below ``entity``, what moves is sent by columns on the timeline ``time``. A ghost is what a
-model says: drawn so that it can stand in the robot's own place.
+moves is logged as static below ``entity``, what moves is sent by columns on the timeline ``time``. A ghost is a model's
+prediction, drawn so that it can stand in the robot's own place.
 """
 
 # Readable on the viewer's dark background and on its light one; measured, identified, ... as on the page.
@@ -107,7 +106,7 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
         if not len(steps):
             continue
         lane = f"{folder}/schedule/{node}"
-        # Null would be no state at all, and the viewer takes it so, but its own `rrd verify` calls it malformed.
+        # The viewer takes null as "no state", but Rerun's own `rrd verify` calls that malformed.
         own = _own_color(episode, node)
         looks = {**_STATES, **({"computing": own} if own else {})}
         named = rr.StateConfiguration(

@@ -1,4 +1,4 @@
-"""What the identified model leaves unexplained on held-out data: over time, its distribution, how long it lasts."""
+"""Residuals of the identified model on held-out data: over time, as a histogram, and their autocorrelation."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _BINS = 41
 
 @dataclass(frozen=True)
 class Residuals:
-    """Measured minus predicted of one field, behind the part that initial states were fitted to.
+    """Measured minus predicted of one field, without the part that initial states were fitted to.
 
     Attributes:
         t_s: Shape ``(N,)``: time along all recordings [s], one after the other.
         values: Shape ``(N,)``.
         piece: Shape ``(N,)``: number of the segment.
-        every: Shape ``(M,)``: those of all segments, overlapping ones too.
+        every: Shape ``(M,)``: values of all segments, overlapping ones included.
         lag_s: Shape ``(K,)``.
         autocorrelation: Shape ``(K,)``, around zero.
     """
@@ -112,7 +112,7 @@ def _over_time(axes: Axes, rest: Residuals, sigma: float | None) -> None:
 
 
 def _histogram(axes: Axes, values: np.ndarray, sigma: float | None) -> None:
-    """Draw the density, as far as most residuals reach; what lies beyond counts into the last bins."""
+    """Draw the density over the range of most residuals; the outer bins hold what lies beyond."""
     if not values.size:
         return
     own = float(np.sqrt(np.mean(values**2))) or 1e-12

@@ -1,4 +1,4 @@
-"""What a log tells about the servos: how their answers came, what was odd, and what they were sent."""
+"""What a log says about the servos: late and lost answers, odd measurements, and what they were sent."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DRY = Banner(
 
 
 def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
-    """Return what the episodes of one session tell of the servos; nothing where the log has no servos."""
+    """Return what the episodes of one session say about the servos; nothing where the log has none."""
     ends: list[Mapping[str, Any]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
     items = [*_answers(ends[-1]), *_odd(ends)]  # answers are counted over all episodes of a session
     blocks: list[Block] = [ListBlock("Servos and their measurements", items)] if items else []

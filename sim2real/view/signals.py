@@ -18,7 +18,7 @@ class Series:
 
     Attributes:
         name: Name of the field, with its index where the field has several entries.
-        source: Who says so: a node, or a model.
+        source: The node or model that it comes from.
         t_s: Times ``(N,)`` [s].
         values: Values ``(N,)``.
     """
@@ -35,9 +35,9 @@ class Signals:
 
     Attributes:
         episode: The log.
-        measured: Outputs of nodes that read nothing of the graph, at the time of the sample.
+        measured: Outputs of nodes without inputs, at the time of the sample.
         commanded: Outputs of the other nodes, at the time of sending.
-        truth: True states by name, where an embedded robot told them.
+        truth: True states by name, of an embedded robot.
         units: Field -> unit, where the session names them.
         warnings: What the log lacks.
     """
@@ -105,7 +105,14 @@ def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
 
 
 def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> list[Series]:
-    """Return one series for each entry of a field with shape ``(N, ...)``; none for what is no number."""
+    """Return one series for each entry of a field; none if it does not hold numbers.
+
+    Args:
+        name: Name of the field.
+        source: The node or model that it comes from.
+        t_s: Times ``(N,)`` [s].
+        values: Values ``(N, ...)``.
+    """
     values = np.asarray(values)
     if values.dtype.kind not in "fiub" or not values.size:
         return []
