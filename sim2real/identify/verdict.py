@@ -239,5 +239,5 @@ def _at_bounds(
 
 
 def _bound(name: str, side: str, bound: str, flags: str) -> str:
-    what = f"identify again with {flags}" if flags else "it can be allowed no more"
-    return f"at a bound: {name} is at its {side} one, {bound.rstrip()}; {what}, or doubt the model"
+    what = f"identify again with {flags}, or doubt the model" if flags else "no flag moves it: doubt the model"
+    return f"at a bound: {name} is at its {side} one, {bound.rstrip()}; {what}"

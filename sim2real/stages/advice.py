@@ -32,7 +32,7 @@ def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
         names = ", ".join(dict.fromkeys(n for group in found["undetermined"] for n in group))
         said.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
     if found["only_sum_of_delays"]:
-        said.append("of delays on either side of the world only the sum can be told: that is as it should be")
+        said.append("of the delays before and after the world only the sum is determined: no log can tell them apart")
     if enough:
         said.append(enough)
     if found["determined"]:
@@ -80,7 +80,7 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
         yield f"{which}{s['gaps']} gaps in the measurements, the longest {s['longest_gap_s']:.3g} s"
     for j in recording["joints"]:
         if not j["moving"]:
-            yield f"{which}{j['name']} does not move at all: nothing about it can be told"
+            yield f"{which}{j['name']} does not move at all: nothing about it is determined"
             continue
         if j["moving"] < _MOVING:
             yield f"{which}{j['name']} moves {j['moving']:.0%} of the time: excite it more, or for longer"
@@ -90,7 +90,7 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
             share = j["position"]["covered"]
             yield f"{which}{j['name']} stays in {share:.0%} of its range: vary the level of the excitation"
     if recording["commands"] and all(c["low_hz"] is None for c in recording["commands"]):
-        yield f"{which}no command changes: gains and delays of the actuator cannot be told"
+        yield f"{which}no command changes: gains and delays of the actuator are not determined"
 
 
 def _enough(found: Mapping[str, Any]) -> str:
@@ -101,7 +101,7 @@ def _enough(found: Mapping[str, Any]) -> str:
     worst = max(known, key=lambda p: p["percent_of_nominal"])
     seconds = 60.0 * (worst["percent_of_nominal"] / (100 * _GOAL)) ** 2
     have = sum(r["sampling"]["duration_s"] for r in found["recordings"])
-    about = f"{worst['name']} is known worst: {worst['percent_of_nominal']:.2g} % of nominal from a minute"
+    about = f"{worst['name']} is least certain: {worst['percent_of_nominal']:.2g} % of nominal from a minute"
     if seconds <= have:
         return f"{about}; {have:.0f} s are enough for {_GOAL:.0%}, if the model is right"
     return f"{about}; {_GOAL:.0%} takes {_time(seconds)} of such data, or a better excitation"

@@ -32,7 +32,7 @@ from sim2real.view.signals import unit_of
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
     "hit a bound": ("doubt", "Hit a bound: an estimate lies where the search was not allowed to go further"),
-    "not identifiable": ("doubt", "Not identifiable: the data leaves a direction open"),
+    "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
 _STRONG = 0.9
@@ -78,11 +78,7 @@ def _sentence(text: str) -> str:
 def _parameters(found: Identification) -> list[Block]:
     """Return table and figure of the parameters, what lies at a bound, and what the data determines."""
     bounded = [e for e in found.parameters if e.verdict == "at a bound"]
-    active = (
-        f"At a bound: {', '.join(_at_bound(e) for e in bounded)}."
-        if bounded
-        else "No estimate lies at a bound: none is active."
-    )
+    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate lies at a bound."
     blocks: list[Block] = [
         _parameter_table(found.parameters),
         FigureBlock(
@@ -163,7 +159,7 @@ def _aggregate(found: Identification) -> list[Block]:
         rows.append([q.name, *numbers, ends, unit, "yes" if q.agree else "no"])
     heads = ("quantity", "mean", "s.e. of the mean", "spread", "95 % for a further recording", "unit", "agree")
     loose = ", ".join(q.name for q in quantities if not q.agree)
-    said = f" More than their errors explain they differ in {loose}." if loose else " They agree in everything."
+    said = f" Beyond what their errors explain they differ in {loose}." if loose else " They agree in everything."
     return [
         FigureBlock(
             intervals.aggregate(quantities, "identify-aggregate"),
@@ -183,8 +179,8 @@ def _predictions(found: Identification) -> list[Block]:
         blocks.append(
             FigureBlock(
                 identify_figures.prediction_errors(found, "identify-errors"),
-                "How the error grows with the horizon, from states that know only their past. What has been identified "
-                "must stay below all others on held-out data.",
+                "How the error grows with the horizon, from initial states fitted to the samples before it. On "
+                "held-out data the identified model must stay below all others.",
             )
         )
         blocks.append(_prediction_table(found))
@@ -193,7 +189,7 @@ def _predictions(found: Identification) -> list[Block]:
         blocks.append(
             FigureBlock(
                 identify_figures.free_runs(found, "identify-free"),
-                "One simulation of what is held out, from one initial state, with the recorded commands and timing."
+                "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
                 f"{_left_out(found, recordings)}",
             )
         )
@@ -204,7 +200,7 @@ def _predictions(found: Identification) -> list[Block]:
     blocks.append(
         FigureBlock(
             identify_figures.predictions(found, "identify-predictions"),
-            "Every segment is simulated freely from its own initial state. What is shaded took no part in the fit."
+            "Every segment is simulated from its own initial state. Shaded data took no part in the fit."
             f"{_left_out(found, found.recordings)}",
         )
     )
@@ -223,7 +219,7 @@ def _residuals(found: Identification) -> list[Block]:
     there = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
     if not there.any() or not any("identified" in found.models(f) for f in found.fields):
         return []
-    assumed = " Orange: what the measurement was assumed to add." if found.sigma else ""
+    assumed = " Orange: the noise that was assumed of the measurement." if found.sigma else ""
     return [
         FigureBlock(
             residuals.figure(found, "identify-residuals"),
@@ -246,7 +242,7 @@ def _correlation(found: Identification) -> list[Block]:
     return [
         FigureBlock(
             identify_figures.correlation(names, matrix, "identify-correlation"),
-            f"Correlations of the estimates. Of a pair near ±1 only a combination can be told.{strong}",
+            f"Correlations of the estimates. Of a pair near ±1 only a combination is determined.{strong}",
             narrow=True,
         )
     ]

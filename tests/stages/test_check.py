@@ -105,7 +105,7 @@ def test_how_long_to_record_follows_from_the_worst_parameter(judged):
     found = spoiled(judged)
     found["parameters"][2]["percent_of_nominal"] = 3.0
     said = "\n".join(advice.recommend(found, "pendulum"))
-    assert "damping is known worst: 3 % of nominal from a minute; 1% takes 9 min" in said
+    assert "damping is least certain: 3 % of nominal from a minute; 1% takes 9 min" in said
 
 
 def test_an_open_direction_ends_with_code_1_and_names_it(judged, monkeypatch, capsys):
