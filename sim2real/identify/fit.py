@@ -52,7 +52,7 @@ class Fit:
         return as_numbers(self.problem.table, self.z)
 
     def uncertainty(self) -> Uncertainty:
-        """Return what the recordings leave open."""
+        """Return how uncertain the estimate is."""
         return uncertainty(self.problem, self.z)
 
 
