@@ -1,6 +1,8 @@
 """Worlds from parts: entities, arenas, tasks, observables and the environment that runs them.
 
-Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``.
+Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``. What tasks are written with
+is here and in ``mjcf``, ``observation``, ``variation`` and ``initializers``. The rest is machinery: ``models`` edits
+and composes models, ``c`` and ``mjx`` are the two engines, ``interop`` has the interfaces of other libraries.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arena import Arena as Arena
+from sim2real.composer.c.physics import Physics as Physics
 from sim2real.composer.constants import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.define import abstract_observable as abstract_observable
 from sim2real.composer.define import cached_property as cached_property
@@ -23,25 +26,24 @@ from sim2real.composer.errors import PhysicsError as PhysicsError
 from sim2real.composer.hooks import HOOK_NAMES as HOOK_NAMES
 from sim2real.composer.initializer import Initializer as Initializer
 from sim2real.composer.initializers.prop_initializer import PropPlacer as PropPlacer
-from sim2real.composer.model import Model as Model
+from sim2real.composer.models.model import Model as Model
 from sim2real.composer.observables import Observables as Observables
-from sim2real.composer.physics import Physics as Physics
 from sim2real.composer.robot import Robot as Robot
 from sim2real.composer.task import NullTask as NullTask
 from sim2real.composer.task import Task as Task
 from sim2real.composer.variation.base import Variation as Variation
 
 if TYPE_CHECKING:
-    from sim2real.composer.brax_env import BraxEnv as BraxEnv
+    from sim2real.composer.interop.brax_env import BraxEnv as BraxEnv
+    from sim2real.composer.interop.vector_env import MjxVectorEnv as MjxVectorEnv
     from sim2real.composer.mjx.environment import MjxEnvironment as MjxEnvironment
-    from sim2real.composer.vector_env import MjxVectorEnv as MjxVectorEnv
     from sim2real.composer.world import ComposedWorld as ComposedWorld
 
 _LAZY = {
-    "BraxEnv": "sim2real.composer.brax_env",
+    "BraxEnv": "sim2real.composer.interop.brax_env",
     "ComposedWorld": "sim2real.composer.world",
     "MjxEnvironment": "sim2real.composer.mjx.environment",
-    "MjxVectorEnv": "sim2real.composer.vector_env",
+    "MjxVectorEnv": "sim2real.composer.interop.vector_env",
 }
 
 

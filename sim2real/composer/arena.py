@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from sim2real.composer import parse
-from sim2real.composer.element import Element
 from sim2real.composer.entity import Entity
-from sim2real.composer.model import Model
+from sim2real.composer.models import parse
+from sim2real.composer.models.element import Element
+from sim2real.composer.models.model import Model
 
 BASE = """
 <mujoco model="base">

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sim2real.composer.rendering import new_scene
-from sim2real.composer.translate import mj
+from sim2real.composer.c.rendering import new_scene
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics import Physics
+    from sim2real.composer.c.physics import Physics
 
 _FONTS = {name: getattr(mj.mjtFont, f"mjFONT_{name.upper()}") for name in ("normal", "shadow", "big")}
 _PLACES = {

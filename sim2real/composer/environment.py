@@ -13,7 +13,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from sim2real.composer.compiled import Compiler
+from sim2real.composer.c.compiled import Compiler
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.hooks import Hooks
 from sim2real.composer.observation.updater import Updater

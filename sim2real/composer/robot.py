@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.element import Element
 from sim2real.composer.entity import Entity
+from sim2real.composer.models.element import Element
 
 DOWN_QUATERNION = np.array([0.0, 0.70710678118, 0.70710678118, 0.0])
 """The orientation of a hand that points down."""

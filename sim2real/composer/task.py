@@ -12,7 +12,7 @@ from dm_env import specs
 
 from sim2real.composer import define
 from sim2real.composer.entity import Entity
-from sim2real.composer.layout import names_of
+from sim2real.composer.models.layout import names_of
 from sim2real.composer.observation.observable.base import Generic
 from sim2real.errors import UsageError
 

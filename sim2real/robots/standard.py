@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.parts import ServoDriven

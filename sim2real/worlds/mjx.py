@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from sim2real.composer.import_mjx import mjx
 from sim2real.composer.mjx import gate, stepping, warp
+from sim2real.composer.mjx.import_mjx import mjx
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseWorld

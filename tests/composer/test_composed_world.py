@@ -248,7 +248,7 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
 )
 def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):
     monkeypatch.delitem(vars(composer), name, raising=False)
-    monkeypatch.delitem(sys.modules, f"sim2real.composer.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"sim2real.composer.interop.{module}", raising=False)
     monkeypatch.setitem(sys.modules, needed, None)
     library = needed.partition(".")[0]
     with pytest.raises(Sim2RealError, match=f"{name} needs {library}, which is not installed") as caught:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 
 TOLERANCE = 1e-10
 """Norm of the error, metres and radians together, at which the pose is reached."""

@@ -12,7 +12,7 @@ from sim2real.composer import variation
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.initializer import Initializer
 from sim2real.composer.initializers.utils import JointStaticIsolator
-from sim2real.composer.traversal import get_frame_freejoint
+from sim2real.composer.models.traversal import get_frame_freejoint
 from sim2real.composer.variation.rotations import IDENTITY_QUATERNION
 from sim2real.errors import UsageError
 

@@ -10,9 +10,9 @@ from sim2real.composer import variation
 from sim2real.composer.errors import EpisodeInitializationError
 from sim2real.composer.initializer import Initializer
 from sim2real.composer.initializers import inverse_kinematics
+from sim2real.composer.models.translate import mj
+from sim2real.composer.models.traversal import get_freejoint
 from sim2real.composer.robot import DOWN_QUATERNION
-from sim2real.composer.translate import mj
-from sim2real.composer.traversal import get_freejoint
 from sim2real.errors import UsageError
 
 

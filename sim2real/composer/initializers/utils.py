@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sim2real.composer.element import Element
+from sim2real.composer.models.element import Element
 from sim2real.errors import UsageError
 
 

@@ -11,7 +11,7 @@ from mujoco import mjx
 
 from sim2real.composer.arrays import multiply_quaternions, rotate
 from sim2real.composer.mjx.warp import is_warp, varies
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _WIDTHS = {

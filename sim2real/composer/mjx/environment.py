@@ -13,15 +13,15 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
+from sim2real.composer.c.physics import Physics
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjx import gate, stepping, views, warp
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import make_rings
 from sim2real.composer.mjx.tracing import TracedHooks
-from sim2real.composer.physics import Physics
+from sim2real.composer.models.translate import mj
 from sim2real.composer.task import Task
-from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from mujoco import mjx
 
+from sim2real.composer.models.translate import mj
 from sim2real.composer.observation.observable.base import MujocoCamera, Observable
 from sim2real.composer.observation.observable.mjcf import MJCFCamera
-from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
 
 _INTEGRATORS = (mj.mjtIntegrator.mjINT_EULER, mj.mjtIntegrator.mjINT_RK4, mj.mjtIntegrator.mjINT_IMPLICITFAST)

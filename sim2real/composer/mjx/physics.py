@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from sim2real.composer import layout
-from sim2real.composer.element import as_elements
+from sim2real.composer.c.named import Named
 from sim2real.composer.mjx import constants, stepping, warp
 from sim2real.composer.mjx.random import JaxRandomState
 from sim2real.composer.mjx.views import DataView, MjxBinding, ModelView, constant
-from sim2real.composer.named import Named
-from sim2real.composer.translate import mj
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import as_elements
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
@@ -281,7 +281,7 @@ class MjxPhysics:
         """
         found, single = as_elements(elements)
         if not found:
-            from sim2real.composer.binding import EmptyBinding
+            from sim2real.composer.c.binding import EmptyBinding
 
             return EmptyBinding()
         layout.attributes(found[0].kind)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer import layout
-from sim2real.composer.binding import columns
+from sim2real.composer.c.binding import columns
+from sim2real.composer.models import layout
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from mujoco.mjx.warp import ffi
 from mujoco.mjx.warp import forward as generated
 
 from sim2real.composer.mjx.warp import varies
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 
 wp: Any = importlib.import_module("warp")  # an extra, which type checkers may not find
 Order = Callable[[Any, Any], None]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.element import Element
+from sim2real.composer.models.element import Element
 from sim2real.composer.observation.observable.base import Observable
 from sim2real.errors import UsageError
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import files, given, schema, translate
-from sim2real.composer.element import KIND_OF_TAG, REFERENCES, Element
-from sim2real.composer.translate import TREE_KINDS
+from sim2real.composer.models import files, given, schema, translate
+from sim2real.composer.models.element import KIND_OF_TAG, REFERENCES, Element
+from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 _OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
 """What every actuator but ``<general>`` sets by itself."""

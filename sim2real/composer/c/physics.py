@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer import layout
-from sim2real.composer.binding import Binding, EmptyBinding, Staleness
-from sim2real.composer.element import as_elements
+from sim2real.composer.c.binding import Binding, EmptyBinding, Staleness
+from sim2real.composer.c.named import Named
+from sim2real.composer.c.rendering import Graphics
 from sim2real.composer.engine import Camera, TextOverlay
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
-from sim2real.composer.named import Named
-from sim2real.composer.rendering import Graphics
-from sim2real.composer.translate import mj
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import as_elements
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _log = logging.getLogger(__name__)

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sim2real.composer.given import Document
-from sim2real.composer.translate import mj
+from sim2real.composer.models.given import Document
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)

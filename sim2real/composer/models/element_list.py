@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sim2real.composer.element import Element
+    from sim2real.composer.models.element import Element
 
 
 class ElementList(Sequence[Any]):

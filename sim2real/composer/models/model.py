@@ -6,12 +6,12 @@ import itertools
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
-from sim2real.composer import attaching, builder, compose, duplicate, files, merge, parse, translate
-from sim2real.composer.attaching import Attachment
-from sim2real.composer.element import KIND_OF_TAG, Element
-from sim2real.composer.given import Document, Given, Records
-from sim2real.composer.sections import SECTION_OF, Section, make_sections
-from sim2real.composer.translate import TREE_KINDS, mj
+from sim2real.composer.models import attaching, builder, compose, duplicate, files, merge, parse, translate
+from sim2real.composer.models.attaching import Attachment
+from sim2real.composer.models.element import KIND_OF_TAG, Element
+from sim2real.composer.models.given import Document, Given, Records
+from sim2real.composer.models.sections import SECTION_OF, Section, make_sections
+from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
 _ADDED_LATER = 1_000_000_000

@@ -7,13 +7,13 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import builder, merge
-from sim2real.composer.translate import mj
+from sim2real.composer.models import builder, merge
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.element import Element
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.element import Element
+    from sim2real.composer.models.model import Model
 
 _log = logging.getLogger(__name__)
 _POSE = ("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis")

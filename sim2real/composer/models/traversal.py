@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sim2real.composer import compose, schema
-from sim2real.composer.element import Element
-from sim2real.composer.model import Model
+from sim2real.composer.models import compose, schema
+from sim2real.composer.models.element import Element
+from sim2real.composer.models.model import Model
 
 
 def get_attachment_frame(mjcf_model: Model) -> Any:

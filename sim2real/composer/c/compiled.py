@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.physics import Physics
+from sim2real.composer.c.physics import Physics
+from sim2real.composer.models.translate import mj
 from sim2real.composer.task import Task
-from sim2real.composer.translate import mj
 
 _PART_NAMES: dict[type, tuple[str, ...]] = {}
 _PLAIN = (int, float, str, bytes, mj.MjModel)

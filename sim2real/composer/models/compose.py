@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import files, keyframes, layout, merge, translate
-from sim2real.composer.translate import TREE_KINDS, mj
+from sim2real.composer.models import files, keyframes, layout, merge, translate
+from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 NAMED_KINDS = (
     *TREE_KINDS,

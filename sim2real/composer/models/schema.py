@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import re
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 
 _INDENT = 3
 _ENTRY = re.compile(r"^( *)(\(?\w+\)?\w*) \([!?*R]\)\s*(.*)$")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _UPLOADED = {

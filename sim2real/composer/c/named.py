@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sim2real.composer import layout
 from sim2real.composer.arrays import is_jax
-from sim2real.composer.element import Element
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import Element
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
 _COLUMNS = {

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from mujoco.introspect.structs import STRUCTS
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 Settings = dict[tuple[str, str], Any]

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import files, given, schema, translate
-from sim2real.composer.element_list import ElementList
-from sim2real.composer.translate import TREE_KINDS, mj
+from sim2real.composer.models import files, given, schema, translate
+from sim2real.composer.models.element_list import ElementList
+from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 KIND_OF_TAG = {
     "freejoint": "joint",

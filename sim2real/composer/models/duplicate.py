@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer import compose, translate
+from sim2real.composer.models import compose, translate
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 
 def duplicate(model: Model) -> Model:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from mujoco.introspect.structs import STRUCTS
 
-from sim2real.composer.translate import mj
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 TRIGGERS = {"qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"}

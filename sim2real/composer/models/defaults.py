@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import schema, translate
-from sim2real.composer.element import KIND_OF_TAG, Element
+from sim2real.composer.models import schema, translate
+from sim2real.composer.models.element import KIND_OF_TAG, Element
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 
 class Defaults:

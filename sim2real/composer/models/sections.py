@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer import builder, merge, schema, translate
-from sim2real.composer.defaults import Defaults
-from sim2real.composer.element import FROM_DOCUMENTS, Element
-from sim2real.composer.element_list import ElementList
-from sim2real.composer.translate import mj
+from sim2real.composer.models import builder, merge, schema, translate
+from sim2real.composer.models.defaults import Defaults
+from sim2real.composer.models.element import FROM_DOCUMENTS, Element
+from sim2real.composer.models.element_list import ElementList
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 _LISTS = {
     "actuator": ("actuator",),

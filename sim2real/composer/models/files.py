@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.model import Model
+    from sim2real.composer.models.model import Model
 
 KINDS = ("mesh", "hfield", "texture", "skin")
 """Elements that may come from files."""

@@ -12,11 +12,11 @@ from xml.sax.saxutils import unescape
 
 import numpy as np
 
-from sim2real.composer import schema, translate
-from sim2real.composer.translate import mj
+from sim2real.composer.models import schema, translate
+from sim2real.composer.models.translate import mj
 
 if TYPE_CHECKING:
-    from sim2real.composer.element import Element
+    from sim2real.composer.models.element import Element
 
 _ATTRIBUTES = r"""(?:\s+[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*'))*"""
 _TAG = re.compile(rf"<!--.*?-->|<([A-Za-z]\w*)({_ATTRIBUTES})|\n", re.DOTALL)

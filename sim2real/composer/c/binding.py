@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer import layout
+from sim2real.composer.models import layout
 from sim2real.errors import UsageError
 
 

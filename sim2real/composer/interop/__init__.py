@@ -1,0 +1,1 @@
+"""Composed tasks as the environments of other libraries."""
