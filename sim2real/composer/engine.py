@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sim2real.composer.c.rendering import new_scene
+from sim2real.composer.c.rendering import Graphics, new_scene
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
-
-if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
 
 _FONTS = {name: getattr(mj.mjtFont, f"mjFONT_{name.upper()}") for name in ("normal", "shadow", "big")}
 _PLACES = {
     name: getattr(mj.mjtGridPos, f"mjGRID_{name.replace(' ', '').upper()}")
     for name in ("top left", "top right", "bottom left", "bottom right")
 }
+
+
+class Scenery(Protocol):
+    """What a camera can look at: a ``Physics``."""
+
+    model: Any
+    data: Any
+    graphics: Graphics
 
 
 class CameraMatrices(NamedTuple):
@@ -75,12 +80,12 @@ class Camera:
 
     def __init__(
         self,
-        physics: Physics,
+        physics: Scenery,
         height: int = 240,
         width: int = 320,
         camera_id: int | str = -1,
         max_geom: int | None = None,
-        scene_callback: Callable[[Physics, Any], None] | None = None,
+        scene_callback: Callable[[Any, Any], None] | None = None,
         scene: Any = None,
     ) -> None:
         model = physics.model.ptr
@@ -92,7 +97,7 @@ class Camera:
                     hint=f'a smaller image, or `<visual><global off{name}="{size}"/></visual>` in the model',
                 )
         if isinstance(camera_id, str):
-            camera_id = physics.model.name2id(camera_id, "camera")
+            camera_id = int(physics.model.name2id(camera_id, "camera"))
         if camera_id < -1:
             raise UsageError("camera_id cannot be smaller than -1.")
         if camera_id >= model.ncam:
@@ -230,11 +235,11 @@ class MovableCamera(Camera):
 
     def __init__(
         self,
-        physics: Physics,
+        physics: Scenery,
         height: int = 240,
         width: int = 320,
         max_geom: int | None = None,
-        scene_callback: Callable[[Physics, Any], None] | None = None,
+        scene_callback: Callable[[Any, Any], None] | None = None,
     ) -> None:
         super().__init__(physics, height, width, -1, max_geom, scene_callback)
 

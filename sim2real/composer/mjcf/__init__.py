@@ -4,9 +4,9 @@ from sim2real.composer.c.binding import Binding as Binding
 from sim2real.composer.c.physics import Physics as Physics
 from sim2real.composer.mjcf import element as element
 from sim2real.composer.models.element import Element as Element
+from sim2real.composer.models.export import export_with_assets as export_with_assets
+from sim2real.composer.models.export import export_with_assets_as_zip as export_with_assets_as_zip
 from sim2real.composer.models.files import Asset as Asset
-from sim2real.composer.models.files import export_with_assets as export_with_assets
-from sim2real.composer.models.files import export_with_assets_as_zip as export_with_assets_as_zip
 from sim2real.composer.models.model import Model as RootElement
 from sim2real.composer.models.traversal import commit_defaults as commit_defaults
 from sim2real.composer.models.traversal import get_attachment_frame as get_attachment_frame

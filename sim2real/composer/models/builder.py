@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from sim2real.composer.models import files, given, schema, translate
-from sim2real.composer.models.element import KIND_OF_TAG, REFERENCES, Element
+from sim2real.composer.models.references import REFERENCES, refer
+from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS
+from sim2real.composer.models.tree import H, Handle, Tree
 from sim2real.errors import UsageError
-
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
 
 _OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
 """What every actuator but ``<general>`` sets by itself."""
 
 
-def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) -> Element:
+def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
     """Add an element to a body of this model."""
     if tag == "inertial":
         return _add_inertial(model, body, attrs)
@@ -46,8 +45,8 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
                 continue
             if key == "childclass":
                 translate.assign(native, kind, key, getattr(value, "dclass", value))
-            elif key in named or isinstance(value, Element):
-                model.refer(element, translate.native_name(kind, key), value)
+            elif key in named or isinstance(value, Handle):
+                refer(element, translate.native_name(kind, key), value)
             elif translate.is_plain(native, kind, key, value):
                 translate.assign(native, kind, key, value)
             else:
@@ -61,7 +60,7 @@ def add_to_body(model: Model, body: Element, tag: str, attrs: dict[str, Any]) ->
     return element
 
 
-def add_to_section(model: Model, kind: str, tag: str, attrs: dict[str, Any]) -> Element:
+def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -> H:
     """Add an element that stands in no body; MuJoCo's parser reads its attributes."""
     model.check_name(kind, attrs.get("name"))
     defaults = _defaults(model, attrs)
@@ -77,14 +76,14 @@ def add_to_section(model: Model, kind: str, tag: str, attrs: dict[str, Any]) -> 
     return element
 
 
-def _lay_down(model: Model, element: Element) -> None:
+def _lay_down(model: Tree[Any], element: Handle) -> None:
     """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
-    native, kind, said = element._native, element.kind, model.given(element)
+    native, kind, said = element._native, element.kind, element.recorded()
     values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
     is_shortcut = kind == "actuator" and said.tag != "general"
     if is_shortcut and model.records.has_defaults:  # they set these altogether, whatever the class says
         translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
-        values = _inherited(model, element) | values
+        values = _inherited(element) | values
     if kind in files.KINDS:
         values = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in values.items()}
     references = [k for k in REFERENCES.get(kind, ()) if k in values]
@@ -93,38 +92,35 @@ def _lay_down(model: Model, element: Element) -> None:
         translate.assign(native, kind, key, values[key])
 
 
-def _inherited(model: Model, element: Element) -> dict[str, Any]:
+def _inherited(element: Handle) -> dict[str, Any]:
     """Return what the classes of an element say of its own tag: the nearest one's word counts."""
     found: dict[str, Any] = {}
     known = schema.attributes(element.kind, element.tag)
-    one = model.default_class(class_of(model, element))
-    while one is not model:
-        said = model.given(getattr(one, element.tag))
+    for said in said_by_classes(element):
         if said.tag == element.tag:  # the last one that was spoken of: a class has one actuator for all tags
             found = {k: v for k, v in said.values.items() if k in known} | found
-        one = one.parent
     return found
 
 
-def _fill(model: Model, element: Element, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
+def _fill(model: Tree[Any], element: Handle, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
     """Set what MuJoCo's parser read: plain attributes, and those that name elements."""
     native = element._native
     for key, value in fixed.items():
         setattr(native, key, value)
     for key, value in named.items():
-        if isinstance(value, Element):
-            model.refer(element, key, value)
-        elif isinstance(value, list) and any(isinstance(v, Element) for v in value):
-            setattr(native, key, ["" if isinstance(v, Element) else v for v in value])
+        if isinstance(value, Handle):
+            refer(element, key, value)
+        elif isinstance(value, list) and any(isinstance(v, Handle) for v in value):
+            setattr(native, key, ["" if isinstance(v, Handle) else v for v in value])
             for i, item in enumerate(value):
-                if isinstance(item, Element):
-                    model.refer(element, f"{key}[{i}]", item)
+                if isinstance(item, Handle):
+                    refer(element, f"{key}[{i}]", item)
         else:
             setattr(native, key, value)
     model.touch()
 
 
-def rebuild(model: Model, element: Element, key: str | None = None) -> None:
+def rebuild(model: Tree[Any], element: Handle, key: str | None = None) -> None:
     """Lay an element down anew: the defaults of its class, then the attributes given, as MuJoCo's parser reads them.
 
     For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
@@ -137,7 +133,7 @@ def rebuild(model: Model, element: Element, key: str | None = None) -> None:
     Raises:
         AttributeError: When such an element has no such attribute.
     """
-    native, kind, said = element._native, element.kind, model.given(element)
+    native, kind, said = element._native, element.kind, element.recorded()
     known = schema.attributes(kind, said.tag)
     if key is not None and key not in known:
         available = ", ".join(sorted(known))
@@ -160,7 +156,7 @@ def rebuild(model: Model, element: Element, key: str | None = None) -> None:
         said.values.update(native_only)
 
 
-def _catch_up(element: Element, said: dict[str, Any]) -> None:
+def _catch_up(element: Handle, said: dict[str, Any]) -> None:
     """Take over the numbers that an element holds now: arrays may have been written into."""
     for name in said:
         if name in ("name", "dclass") or name in REFERENCES.get(element.kind, ()):
@@ -173,35 +169,45 @@ def _catch_up(element: Element, said: dict[str, Any]) -> None:
             said[name] = np.array(given.show(value, said[name]))
 
 
-def reclass(model: Model, element: Element, name: str, value: Any) -> None:
+def reclass(model: Tree[Any], element: Handle, name: str, value: Any) -> None:
     """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
     value = getattr(value, "dclass", value)
-    model.given(element).note(name, value)
+    element.recorded().note(name, value)
     if name == "childclass":
         element._native.childclass = value or ""
-        followers = [
-            e for kind in TREE_KINDS if kind != "body" for e in element.find_all(kind, exclude_attachments=True)
-        ]
+        followers = [e for kind in TREE_KINDS if kind != "body" for e in model.walk(element._native, kind, False, True)]
     else:
         followers = [element]
     for follower in followers:
-        follower._native.classname = _defaults(model, {"dclass": class_of(model, follower)})
+        follower._native.classname = _defaults(model, {"dclass": class_of(follower)})
         rebuild(model, follower)
     model.touch()
 
 
-def class_of(model: Model, element: Element) -> str:
+def class_of(element: Handle) -> str:
     """Return the class of an element: its own one, or that of the nearest body that has one for what it holds."""
-    name, holder = model.given(element).values.get("dclass"), element.parent
-    while name is None and isinstance(holder, Element):
+    name, holder = element.recorded().values.get("dclass"), element.parent
+    while name is None and isinstance(holder, Handle):
         name, holder = holder._native.childclass or None, holder.parent
     return getattr(name, "name", name) or "main"
 
 
-def extend_tendon(model: Model, tendon: Element, tag: str, attrs: dict[str, Any]) -> Element:
+def said_by_classes(element: Handle) -> Iterator[given.Given]:
+    """Yield what the classes of an element say of elements of its kind, the nearest class first."""
+    model: Tree[Any] = element.root
+    name: str | None = class_of(element)
+    while name is not None:
+        native = getattr(model._spec.find_default(name), element.kind, None)
+        if native is None:
+            raise AttributeError(f"<default> has no elements {element.tag!r}")
+        yield model.records.of_class(native, element.kind)
+        name = model.records.class_parent(name)
+
+
+def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) -> H:
     """Add a joint, a site, a geom or a pulley to a tendon's path."""
     model.touch()
-    names = {k: v.name if isinstance(v, Element) else v for k, v in attrs.items()}
+    names = {k: v.name if isinstance(v, Handle) else v for k, v in attrs.items()}
     if tag == "joint":
         tendon._native.wrap_joint(names["joint"], names["coef"])
     elif tag == "site":
@@ -215,7 +221,7 @@ def extend_tendon(model: Model, tendon: Element, tag: str, attrs: dict[str, Any]
     return tendon
 
 
-def remove(model: Model, element: Element) -> None:
+def remove(model: Tree[Any], element: Handle) -> None:
     """Delete an element with what stands in it and what refers to it; its handles are of no use afterwards."""
     native = element._native
     gone = [native]
@@ -238,12 +244,12 @@ def _given(attrs: dict[str, Any]) -> dict[str, Any]:
     return attrs
 
 
-def _foreign(model: Model, dclass: Any) -> Any:
+def _foreign(model: Tree[Any], dclass: Any) -> Any:
     """Return a class of defaults that belongs to another model, such as that of a frame's joint; else None."""
     return dclass if getattr(dclass, "root", model) is not model else None
 
 
-def _defaults(model: Model, attrs: dict[str, Any]) -> Any:
+def _defaults(model: Tree[Any], attrs: dict[str, Any]) -> Any:
     name = attrs.get("dclass", attrs.get("class_"))
     if name is None:
         return None
@@ -254,7 +260,7 @@ def _defaults(model: Model, attrs: dict[str, Any]) -> Any:
     return found
 
 
-def _add_inertial(model: Model, body: Element, attrs: dict[str, Any]) -> Element:
+def _add_inertial(model: Tree[H], body: H, attrs: dict[str, Any]) -> H:
     names = {"pos": "ipos", "quat": "iquat", "diaginertia": "inertia", "fullinertia": "fullinertia", "mass": "mass"}
     for key, value in attrs.items():
         if key not in names:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sim2real.composer.models import schema, translate
-from sim2real.composer.models.element import KIND_OF_TAG, Element
+from sim2real.composer.models import builder, given, schema, translate
+from sim2real.composer.models.element import Element
+from sim2real.composer.models.schema import KIND_OF_TAG
+from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
-
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
 
 
 class Defaults:
@@ -26,7 +25,7 @@ class Defaults:
     __slots__ = ("_model", "name")
     tag = "default"
 
-    def __init__(self, model: Model, name: str) -> None:
+    def __init__(self, model: Tree[Any], name: str) -> None:
         self._model, self.name = model, name
 
     def __eq__(self, other: object) -> bool:
@@ -49,7 +48,7 @@ class Defaults:
         return None if self.name == "main" else self.name
 
     @property
-    def root(self) -> Model:
+    def root(self) -> Tree[Any]:
         """The model."""
         return self._model
 
@@ -149,6 +148,10 @@ class DefaultElement(Element):
         """MuJoCo's own defaults; asking a class for its class ends the process."""
         return translate.blank(self.kind)
 
+    def recorded(self) -> given.Given:
+        """Return what the class says."""
+        return self.root.records.of_class(self._native, self.kind)
+
     @property
     def full_identifier(self) -> None:
         """Defaults have no name."""
@@ -175,10 +178,10 @@ class DefaultElement(Element):
                 available = ", ".join(sorted(known))
                 raise AttributeError(f"{name!r} is not a valid attribute for <{self._tag}>. Available: {available}")
             fixed, _ = translate.from_xml(self.kind, self._tag, {name: value}, ())
-        self.root.records.note_default(self, self._tag, name, value)
+        self.root.records.note_default(self._native, self.kind, self._tag, name, value)
         for follower in self._followers(name):
             if follower.kind == "actuator" and follower.tag != "general" and not isinstance(follower, DefaultElement):
-                self.root.builder.rebuild(self.root, follower)
+                builder.rebuild(self.root, follower)
             elif fixed is None:
                 translate.assign(follower._native, self.kind, name, value)
             else:
@@ -192,12 +195,12 @@ class DefaultElement(Element):
         while classes:
             one = classes.pop()
             below = DefaultElement(one, self.kind, getattr(one.native, self.kind), self._tag)
-            if one != self._owner and name in self.root.given(below).values:
+            if one != self._owner and name in below.recorded().values:
                 continue
             found.add(one.name)
             classes += one.default
             yield below
         for element in self.root.find_all(self.kind, exclude_attachments=True):
             owner = element._native.classname
-            if (owner.name if owner else "main") in found and name not in self.root.given(element).values:
+            if (owner.name if owner else "main") in found and name not in element.recorded().values:
                 yield element

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 from sim2real.composer.models import compose, translate
+from sim2real.composer.models.tree import Tree
 
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
+T = TypeVar("T", bound=Tree[Any])
 
 
-def duplicate(model: Model) -> Model:
+def duplicate(model: T) -> T:
     """Return an independent copy of a model and of all that is attached to it; it is attached to nothing."""
-    twins: dict[Model, Model] = {}
+    twins: dict[T, T] = {}
     natives: dict[Any, Any] = {}
     made = _copy(model, twins, natives)
     for old, new in twins.items():
@@ -23,7 +23,7 @@ def duplicate(model: Model) -> Model:
     return made
 
 
-def _copy(model: Model, twins: dict[Model, Model], natives: dict[Any, Any]) -> Model:
+def _copy(model: T, twins: dict[T, T], natives: dict[Any, Any]) -> T:
     spec = compose.copy_spec(model)
     made = twins[model] = type(model).owning(spec)
     made.inherits_angle = model.inherits_angle

@@ -3,149 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sim2real.composer.models import files, given, schema, translate
+from sim2real.composer.models import attaching, builder, files, given, schema, translate
 from sim2real.composer.models.element_list import ElementList
+from sim2real.composer.models.references import REFERENCES, refer, referenced
+from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS, mj
+from sim2real.composer.models.tree import Handle, Tree
 from sim2real.errors import UsageError
 
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
-
-KIND_OF_TAG = {
-    "freejoint": "joint",
-    "worldbody": "body",
-    **dict.fromkeys(
-        ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion"),
-        "actuator",
-    ),
-    **dict.fromkeys(("connect", "weld", "flex"), "equality"),
-    **dict.fromkeys(("fixed", "spatial"), "tendon"),
-}
-"""The kind of those tags that are not called like their kind; inside a section the section decides."""
-
-REFERENCES = {
-    "actuator": ("joint", "jointinparent", "site", "tendon", "body", "refsite", "cranksite", "slidersite"),
-    "sensor": (
-        "site",
-        "joint",
-        "body",
-        "actuator",
-        "tendon",
-        "camera",
-        "objname",
-        "refname",
-        "geom1",
-        "geom2",
-        "body1",
-        "body2",
-    ),
-    "equality": ("body1", "body2", "joint1", "joint2", "tendon1", "tendon2", "site1", "site2"),
-    "pair": ("geom1", "geom2"),
-    "exclude": ("body1", "body2"),
-    "geom": ("mesh", "hfield", "material"),
-    "site": ("material",),
-    "material": ("texture",),
-    "camera": ("target",),
-    "light": ("target",),
-    "tendon": ("material",),
-}
-"""Attributes that name another element."""
-
-
 _IN_BODIES = (*TREE_KINDS, "inertial")
-_set = object.__setattr__
 _LISTED = frozenset(TREE_KINDS)
 _UNROLLED = ("composite", "flexcomp", "replicate", "frame", "attach", "plugin")
-FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
-"""The way to elements that programs cannot add."""
 
 
-class Element:
+class Element(Handle):
     """One element of a model; made by ``Model.find``, ``find_all`` and ``add``.
 
     Reading and setting any other attribute reads and sets it in the model's ``MjSpec``, in MJCF's spelling or in
     MuJoCo's own; what was not given reads as None, whatever the defaults are. There is one handle on each element.
 
-    Attributes:
+    Args:
         root: The model that the element belongs to.
         kind: What it is: ``body``, ``geom``, ``joint``, ``actuator`` and so on.
+        native: The element of the ``MjSpec``.
     """
 
-    __slots__ = ("_native", "kind", "root")
+    __slots__ = ()
 
-    root: Model
-    kind: str
-    _native: Any
-
-    def __init__(self, root: Model, kind: str, native: Any) -> None:
-        _set(self, "root", root)
-        _set(self, "kind", kind)
-        _set(self, "_native", native)
-
-    def __repr__(self) -> str:
-        return f"<{self.kind} {self.full_identifier!r}>"
-
-    @property
-    def native(self) -> Any:
-        """The element of the ``MjSpec``."""
-        self.root.expose()
-        return self._native
-
-    @property
-    def name(self) -> str | None:
-        """The name inside the element's own model; None when it has none."""
-        return self._native.name or None
-
-    @name.setter
-    def name(self, value: str) -> None:
-        self.root.check_name(self.kind, value)
-        self._native.name = value or ""
-        self.root.touch()
-
-    @property
-    def full_identifier(self) -> str:
-        """The name in the compiled model, such as ``arm/hand/finger``."""
-        return self.root.identify(self)
-
-    @property
-    def tag(self) -> str:
-        """The tag in MJCF: ``motor`` for what ``<motor>`` made, ``worldbody`` for the world."""
-        return "worldbody" if self.is_worldbody else self.root.given(self).tag
-
-    @property
-    def class_defaults(self) -> Any:
-        """The native element that holds the defaults of this element's class."""
-        found = getattr(getattr(self._native, "classname", None), self.kind, None)
-        return translate.blank(self.kind) if found is None else found
-
-    @property
-    def is_worldbody(self) -> bool:
-        """Whether this is the model's world."""
-        return self.kind == "body" and self._native.parent is None
-
-    @property
-    def is_frame(self) -> bool:
-        """Whether this is the frame that another model is attached to."""
-        return self.kind == "body" and self._native.name.endswith("/")
-
-    @property
-    def is_removed(self) -> bool:
-        """Whether the element was deleted."""
-        return self._native is None
-
-    @property
-    def parent(self) -> Any:
-        """The body that holds this element, the section where it stands in no body, the model for the world."""
-        if self.kind == "inertial":
-            return self.root.handle("body", self._native)
-        if self.is_worldbody:
-            return self.root
-        native = getattr(self._native, "parent", None)
-        return self.root.section_of(self.kind) if native is None else self.root.handle("body", native)
+    root: Tree[Element]
 
     def add(self, tag: str, **attrs: Any) -> Element:
         """Add an element to a body, or a path element to a tendon.
@@ -158,7 +47,7 @@ class Element:
             UsageError: When such an element cannot stand here.
         """
         if self.kind == "tendon":
-            return self.root.builder.extend_tendon(self.root, self, tag, attrs)
+            return builder.extend_tendon(self.root, self, tag, attrs)
         if self.is_frame and tag not in ("joint", "freejoint", "inertial"):
             raise UsageError(
                 f"a <{tag}> cannot stand in the attachment frame {self.full_identifier!r}. "
@@ -166,22 +55,22 @@ class Element:
                 hint="add it to the attached model, or to a body of the model it is attached to",
             )
         if self.kind != "body" or KIND_OF_TAG.get(tag, tag) not in _IN_BODIES:
-            hint = FROM_DOCUMENTS if tag in _UNROLLED else f"bodies hold {', '.join(_IN_BODIES)}"
+            hint = schema.FROM_DOCUMENTS if tag in _UNROLLED else f"bodies hold {', '.join(_IN_BODIES)}"
             raise UsageError(f"a <{tag}> cannot be added to the {self.kind} {self.full_identifier!r}", hint=hint)
         if tag == "freejoint" and not (self._native.parent is not None and self._native.parent.parent is None):
             raise UsageError(
                 f"a free joint is only for bodies that stand in the world, {self.full_identifier!r} does not",
                 hint="attach the model to the world, or use hinge and slide joints",
             )
-        return self.root.builder.add_to_body(self.root, self, tag, attrs)
+        return builder.add_to_body(self.root, self, tag, attrs)
 
-    def attach(self, model: Model) -> Element:
+    def attach(self, model: Tree[Element]) -> Element:
         """Attach a model at this site, or at the world; return the frame."""
         if self.kind != "site" and not self.is_worldbody:
             raise UsageError(
                 f"a model is attached to a site or the world, not to the {self.kind} {self.full_identifier!r}"
             )
-        return self.root.attach_at(self, model)
+        return attaching.attach(self, model)
 
     def find_all(
         self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
@@ -204,7 +93,7 @@ class Element:
 
     def get_attributes(self) -> dict[str, Any]:
         """Return the attributes that were given to this element: name -> value."""
-        return {name: getattr(self, name) for name in self.root.given(self).values}
+        return {name: getattr(self, name) for name in self.recorded().values}
 
     def set_attributes(self, **attrs: Any) -> None:
         """Set several attributes."""
@@ -213,7 +102,7 @@ class Element:
 
     def remove(self) -> None:
         """Delete the element from its model, with what refers to it."""
-        self.root.builder.remove(self.root, self)
+        builder.remove(self.root, self)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -228,11 +117,11 @@ class Element:
                 return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
             if name == "inertial":
                 return self.root.handle("inertial", native) if native.explicitinertial else None
-        said = self.root.given(self)
+        said = self.recorded()
         if name not in said.values and name in schema.attributes(kind, said.tag):
             return None
         if name in REFERENCES.get(kind, ()):
-            return self.root.referenced(self, name)
+            return referenced(self, name)
         if name.startswith("file") and said.values.get(name):
             return files.asset_of(self.root, kind, said.values[name])
         if name in ("dclass", "childclass"):
@@ -255,12 +144,12 @@ class Element:
         if name == "name":
             type(self).name.__set__(self, value)
             return
-        kind, said = self.kind, self.root.given(self)
+        kind, said = self.kind, self.recorded()
         value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value
         if name in ("dclass", "childclass"):
-            self.root.builder.reclass(self.root, self, name, value)
+            builder.reclass(self.root, self, name, value)
         elif name in REFERENCES.get(kind, ()) and hasattr(self._native, translate.native_name(kind, name)):
-            self.root.refer(self, translate.native_name(kind, name), value)
+            refer(self, translate.native_name(kind, name), value)
             said.note(name, value)
         elif value is not None and translate.is_plain(self._native, kind, name, value):
             translate.assign(self._native, kind, name, value)
@@ -270,7 +159,7 @@ class Element:
             before = said.values.get(name)
             said.note(name, value)
             try:
-                self.root.builder.rebuild(self.root, self, name)
+                builder.rebuild(self.root, self, name)
             except Exception:
                 said.note(name, before)
                 raise

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from sim2real.composer.models.element import Element
+from typing import Any
 
 
 class ElementList(Sequence[Any]):
@@ -17,7 +14,7 @@ class ElementList(Sequence[Any]):
         tag: What they are.
     """
 
-    def __init__(self, find: Callable[[], list[Element]], tag: str) -> None:
+    def __init__(self, find: Callable[[], Sequence[Any]], tag: str) -> None:
         self._find, self._tag = find, tag
 
     def __len__(self) -> int:

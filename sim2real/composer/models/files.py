@@ -1,19 +1,16 @@
-"""Files of meshes, textures and height fields: given as contents, collected, and written beside a model."""
+"""Files of meshes, textures and height fields: given as contents, and collected."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
-
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
 
 KINDS = ("mesh", "hfield", "texture", "skin")
 """Elements that may come from files."""
@@ -40,14 +37,14 @@ class Asset:
         return "-".join(filter(None, (self.prefix, digest))) + self.extension
 
 
-def adopt(model: Model, asset: Asset) -> str:
+def adopt(model: Tree[Any], asset: Asset) -> str:
     """Give a model the contents of a file; return the name under which it has them."""
     name = asset.get_vfs_filename()
     model._spec.assets[name] = asset.contents
     return name
 
 
-def asset_of(model: Model, kind: str, file: Asset | str) -> Asset:
+def asset_of(model: Tree[Any], kind: str, file: Asset | str) -> Asset:
     """Return a file that a model names.
 
     Raises:
@@ -67,7 +64,7 @@ def asset_of(model: Model, kind: str, file: Asset | str) -> Asset:
     return Asset(full.read_bytes(), path.suffix, path.stem)
 
 
-def collect(model: Model) -> dict[str, bytes]:
+def collect(model: Tree[Any]) -> dict[str, bytes]:
     """Return the contents of all files of a model and of what is attached to it, by the names in its MJCF."""
     found = {}
     for one in model.all_models():
@@ -76,7 +73,7 @@ def collect(model: Model) -> dict[str, bytes]:
     return found
 
 
-def _named(model: Model) -> Iterator[tuple[Any, Asset]]:
+def _named(model: Tree[Any]) -> Iterator[tuple[Any, Asset]]:
     for plural in _LISTS:
         for native in getattr(model._spec, plural):
             if native.file:
@@ -84,7 +81,7 @@ def _named(model: Model) -> Iterator[tuple[Any, Asset]]:
 
 
 @contextlib.contextmanager
-def renamed(model: Model) -> Iterator[None]:
+def renamed(model: Tree[Any]) -> Iterator[None]:
     """Call every file of a model, and of what is attached to it, as ``collect`` does, in a ``with`` block."""
     undo: list[tuple[Any, str, str]] = []
     added: list[tuple[Any, str]] = []
@@ -108,7 +105,7 @@ def renamed(model: Model) -> Iterator[None]:
             del spec.assets[name]
 
 
-def is_mixed(model: Model) -> bool:
+def is_mixed(model: Tree[Any]) -> bool:
     """Return whether a model has files in memory and others on disk: attached, MuJoCo looks for all in one place."""
     assets = model._spec.assets
     if not assets:
@@ -124,41 +121,3 @@ def flatten(spec: Any) -> None:
             if name != native.file and native.file in spec.assets:
                 spec.assets[name] = spec.assets[native.file]
                 native.file = name
-
-
-def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | None = None) -> None:
-    """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
-
-    Args:
-        mjcf_model: The model.
-        out_dir: The folder.
-        out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
-
-    Raises:
-        UsageError: When the name does not end with ``.xml``.
-    """
-    name = out_file_name or f"{mjcf_model.model}.xml"
-    if not name.lower().endswith(".xml"):
-        raise UsageError(f"out_file_name must end with '.xml': got {name!r}")
-    folder = Path(out_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, contents in collect(mjcf_model).items():
-        (folder / file).write_bytes(contents)
-    (folder / name).write_text(mjcf_model.to_xml_string(), encoding="utf-8")
-
-
-def export_with_assets_as_zip(mjcf_model: Model, out_dir: Any, model_name: str | None = None) -> str:
-    """Write a model, composed, as MJCF with all its files into an archive; return its path.
-
-    Args:
-        mjcf_model: The model.
-        out_dir: The archive's folder, which is made if it is not there.
-        model_name: What the archive, the folder in it and the MJCF file are called; default: as the model.
-    """
-    name = model_name or mjcf_model.model
-    Path(out_dir).mkdir(parents=True, exist_ok=True)
-    path = str(Path(out_dir) / f"{name}.zip")
-    with zipfile.ZipFile(path, "w") as archive:
-        for file, contents in (collect(mjcf_model) | {f"{name}.xml": mjcf_model.to_xml_string()}).items():
-            archive.writestr(f"{name}/{file}", contents)
-    return path

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import unescape
 
@@ -14,9 +14,6 @@ import numpy as np
 
 from sim2real.composer.models import schema, translate
 from sim2real.composer.models.translate import mj
-
-if TYPE_CHECKING:
-    from sim2real.composer.models.element import Element
 
 _ATTRIBUTES = r"""(?:\s+[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*'))*"""
 _TAG = re.compile(rf"<!--.*?-->|<([A-Za-z]\w*)({_ATTRIBUTES})|\n", re.DOTALL)
@@ -104,10 +101,18 @@ class Records:
         """Whether there may be a class of defaults that says something."""
         return self._has_defaults or not self.is_blank
 
-    def note_default(self, element: Element, tag: str, name: str, value: Any) -> None:
-        """Note that an attribute of a class of defaults was set."""
+    def note_default(self, native: Any, kind: str, tag: str, name: str, value: Any) -> None:
+        """Note that an attribute of a class of defaults was set.
+
+        Args:
+            native: What holds the defaults in the spec.
+            kind: Of the elements that they are for.
+            tag: The tag that they were set for.
+            name: The attribute.
+            value: What it was set to.
+        """
         self._has_defaults = True
-        said = self.of(element)
+        said = self.of_class(native, kind)
         said.tag = tag
         said.note(name, value)
 
@@ -152,20 +157,25 @@ class Records:
         made._of = {natives[n]: Given(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
         return made
 
-    def of(self, element: Element) -> Given:
+    def of(self, native: Any, kind: str) -> Given:
         """Return what was given of an element."""
-        native, kind = element._native, element.kind
         key = (native, kind) if kind == "inertial" else native
         found = self._of.get(key)
         if found is None:
-            found = self._of[key] = self._found(element)
+            found = self._of[key] = self._found(native, kind, translate.class_defaults)
         return found
 
-    def _found(self, element: Element) -> Given:
-        native, kind = element._native, element.kind
+    def of_class(self, native: Any, kind: str) -> Given:
+        """Return what a class of defaults says of the elements of a kind."""
+        found = self._of.get(native)
+        if found is None:  # asking a class for its class ends the process
+            found = self._of[native] = self._found(native, kind, lambda native, kind: translate.blank(kind))
+        return found
+
+    def _found(self, native: Any, kind: str, defaults: Callable[[Any, str], Any]) -> Given:
         if self.is_blank and kind != "inertial":
             return Given(_tag(native, kind))
-        return self._written(native, kind) or read(native, kind, element.class_defaults)
+        return self._written(native, kind) or read(native, kind, defaults(native, kind))
 
     def _written(self, native: Any, kind: str) -> Given | None:
         words = native.info.split()

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sim2real.composer.models import layout
+from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
 
-
-def restore(out: Any, models: list[Model]) -> None:
+def restore(out: Any, models: list[Tree[Any]]) -> None:
     """Add the keyframes of all models to a composed spec, under their full names.
 
     Raises:
@@ -30,7 +28,7 @@ def restore(out: Any, models: list[Model]) -> None:
                     setattr(key, part, _spread(compiled, model, element.full_identifier, part, values))
 
 
-def _spread(compiled: Any, model: Model, name: str, part: str, values: np.ndarray) -> np.ndarray:
+def _spread(compiled: Any, model: Tree[Any], name: str, part: str, values: np.ndarray) -> np.ndarray:
     """Return a part of the state of the whole world that holds a model's values at the model's own places."""
     if part in ("mpos", "mquat"):
         whole = np.array(compiled.body_pos if part == "mpos" else compiled.body_quat)

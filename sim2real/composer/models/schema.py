@@ -1,4 +1,4 @@
-"""Which attributes MJCF has for which tag, as MuJoCo's own parser knows them."""
+"""Which tags MJCF has, where they stand and with which attributes, as MuJoCo's own parser knows them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,33 @@ _INDENT = 3
 _ENTRY = re.compile(r"^( *)(\(?\w+\)?\w*) \([!?*R]\)\s*(.*)$")
 _SHARED = ("asset", "contact", "custom", "keyframe", "body")
 """Sections whose elements are called like their kind."""
+
+KIND_OF_TAG = {
+    "freejoint": "joint",
+    "worldbody": "body",
+    **dict.fromkeys(
+        ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion"),
+        "actuator",
+    ),
+    **dict.fromkeys(("connect", "weld", "flex"), "equality"),
+    **dict.fromkeys(("fixed", "spatial"), "tendon"),
+}
+"""The kind of those tags that are not called like their kind; inside a section the section decides."""
+SECTIONS = {
+    "actuator": ("actuator",),
+    "sensor": ("sensor",),
+    "equality": ("equality",),
+    "tendon": ("tendon",),
+    "contact": ("pair", "exclude"),
+    "asset": ("mesh", "material", "texture", "hfield", "skin"),
+    "custom": ("numeric", "text", "tuple"),
+    "keyframe": ("key",),
+}
+"""Section -> the kinds of elements that stand in it."""
+SECTION_OF = {kind: section for section, kinds in SECTIONS.items() for kind in kinds}
+"""Kind of element -> the section that it stands in."""
+FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
+"""The way to elements that programs cannot add."""
 
 
 @functools.cache

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sim2real.composer.models import builder, merge, schema, translate
 from sim2real.composer.models.defaults import Defaults
-from sim2real.composer.models.element import FROM_DOCUMENTS, Element
+from sim2real.composer.models.element import Element
 from sim2real.composer.models.element_list import ElementList
 from sim2real.composer.models.translate import mj
+from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
-if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
-
-_LISTS = {
-    "actuator": ("actuator",),
-    "sensor": ("sensor",),
-    "equality": ("equality",),
-    "tendon": ("tendon",),
-    "contact": ("pair", "exclude"),
-    "asset": ("mesh", "material", "texture", "hfield", "skin"),
-    "custom": ("numeric", "text", "tuple"),
-    "keyframe": ("key",),
-}
-SECTION_OF = {kind: section for section, kinds in _LISTS.items() for kind in kinds}
-"""Kind of element -> the section that it stands in."""
 _INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 _CHOICES = {
     "integrator": {k: getattr(mj.mjtIntegrator, f"mjINT_{k.upper()}") for k in _INTEGRATORS},
@@ -47,7 +33,7 @@ class Section:
 
     __slots__ = ("_kinds", "_model", "_name", "_path")
 
-    def __init__(self, model: Model, name: str, path: str = "", kinds: tuple[str, ...] = ()) -> None:
+    def __init__(self, model: Tree[Any], name: str, path: str = "", kinds: tuple[str, ...] = ()) -> None:
         for key, value in (("_model", model), ("_name", name), ("_path", path), ("_kinds", kinds)):
             object.__setattr__(self, key, value)
 
@@ -77,7 +63,7 @@ class Section:
             raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
         kind = self._kinds[0] if len(self._kinds) == 1 else tag
         if kind not in self._kinds or tag == "plugin":
-            hint = FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
+            hint = schema.FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
             raise UsageError(
                 f"a <{tag}> cannot stand in <{self._name}>. Available: {', '.join(self._kinds)}", hint=hint
             )
@@ -144,7 +130,7 @@ class Flags:
 
     __slots__ = ("_model",)
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Tree[Any]) -> None:
         object.__setattr__(self, "_model", model)
 
     def _check(self, name: str) -> None:
@@ -183,12 +169,12 @@ class DocumentsOnly:
         Raises:
             UsageError: Always.
         """
-        raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=FROM_DOCUMENTS)
+        raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=schema.FROM_DOCUMENTS)
 
 
-def make_sections(model: Model) -> dict[str, Any]:
+def make_sections(model: Tree[Any]) -> dict[str, Any]:
     """Return the sections of a model by name."""
-    found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in _LISTS.items()}
+    found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
         found[name] = Section(model, name, path)
     found["statistic"] = Section(model, "statistic", "stat")

@@ -168,6 +168,12 @@ def blank(kind: str) -> Any:
 _BLANKS: list[Any] = []
 
 
+def class_defaults(native: Any, kind: str) -> Any:
+    """Return what holds the defaults of an element's class."""
+    found = getattr(getattr(native, "classname", None), kind, None)
+    return blank(kind) if found is None else found
+
+
 def assign(native: Any, kind: str, key: str, value: Any) -> None:
     """Set an attribute of an element.
 

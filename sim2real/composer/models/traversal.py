@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sim2real.composer.models import compose, schema
+from sim2real.composer.models import builder, compose, schema
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.model import Model
 
@@ -43,11 +43,7 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
         element: The element.
         attributes: Names of the attributes; default: all.
     """
-    root = element.root
-    one: Any = root.default_class(root.builder.class_of(root, element))
-    while one is not root:
-        said = root.given(getattr(one, element.tag)).values
-        for name in said.keys() & schema.attributes(element.kind, element.tag):  # a class has one actuator for all tags
+    for said in builder.said_by_classes(element):  # a class has one actuator for all tags
+        for name in said.values.keys() & schema.attributes(element.kind, element.tag):
             if (attributes is None or name in attributes) and getattr(element, name) is None:
-                setattr(element, name, said[name])
-        one = one.parent
+                setattr(element, name, said.values[name])

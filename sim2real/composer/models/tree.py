@@ -1,0 +1,283 @@
+"""The elements of one model: a handle on each, what was given of them, and what they refer to."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+from sim2real.composer.models import translate
+from sim2real.composer.models.given import Document, Given, Records
+from sim2real.composer.models.schema import KIND_OF_TAG, SECTION_OF
+from sim2real.composer.models.scope import Scope
+from sim2real.composer.models.translate import TREE_KINDS
+from sim2real.errors import UsageError
+
+_ADDED_LATER = 1_000_000_000
+"""Elements that were parsed are ordered by their line; those that a program added come after them."""
+
+
+class Handle:
+    """One element of a model: what it is, where it stands and what it is called; its attributes are ``Element``'s.
+
+    Args:
+        root: The model that the element belongs to.
+        kind: What it is: ``body``, ``geom``, ``joint``, ``actuator`` and so on.
+        native: The element of the ``MjSpec``.
+    """
+
+    __slots__ = ("_native", "kind", "root")
+
+    root: Tree[Any]
+    kind: str
+    _native: Any
+
+    def __init__(self, root: Tree[Any], kind: str, native: Any) -> None:
+        for name, value in (("root", root), ("kind", kind), ("_native", native)):
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"<{self.kind} {self.full_identifier!r}>"
+
+    @property
+    def native(self) -> Any:
+        """The element of the ``MjSpec``."""
+        self.root.expose()
+        return self._native
+
+    @property
+    def name(self) -> str | None:
+        """The name inside the element's own model; None when it has none."""
+        return self._native.name or None
+
+    @name.setter
+    def name(self, value: str) -> None:
+        self.root.check_name(self.kind, value)
+        self._native.name = value or ""
+        self.root.touch()
+
+    @property
+    def full_identifier(self) -> str:
+        """The name in the compiled model, such as ``arm/hand/finger``."""
+        return self.root.identify(self)
+
+    @property
+    def tag(self) -> str:
+        """The tag in MJCF: ``motor`` for what ``<motor>`` made, ``worldbody`` for the world."""
+        return "worldbody" if self.is_worldbody else self.recorded().tag
+
+    @property
+    def class_defaults(self) -> Any:
+        """The native element that holds the defaults of this element's class."""
+        return translate.class_defaults(self._native, self.kind)
+
+    @property
+    def is_worldbody(self) -> bool:
+        """Whether this is the model's world."""
+        return self.kind == "body" and self._native.parent is None
+
+    @property
+    def is_frame(self) -> bool:
+        """Whether this is the frame that another model is attached to."""
+        return self.kind == "body" and self._native.name.endswith("/")
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether the element was deleted."""
+        return self._native is None
+
+    @property
+    def parent(self) -> Any:
+        """The body that holds this element, the section where it stands in no body, the model for the world."""
+        if self.kind == "inertial":
+            return self.root.handle("body", self._native)
+        if self.is_worldbody:
+            return self.root
+        native = getattr(self._native, "parent", None)
+        return self.root.section_of(self.kind) if native is None else self.root.handle("body", native)
+
+    def recorded(self) -> Given:
+        """Return what was given of this element, rather than left at its default."""
+        return self.root.records.of(self._native, self.kind)
+
+
+H = TypeVar("H", bound=Handle)
+
+
+class Tree(Scope, Generic[H]):
+    """What ``Model`` keeps: everything that adds, removes, attaches and compiles works on this.
+
+    Args:
+        model: The name; prefix of all names in it once it is attached.
+        spec: An ``MjSpec`` to wrap; default: an empty one.
+        document: What the spec was parsed from, where that is known.
+
+    Attributes:
+        references: Native element and attribute -> the element that the attribute names, whatever that is called.
+        records: What was given of every element.
+    """
+
+    handle_type: ClassVar[type[Handle]] = Handle
+    """The class of the handles."""
+
+    def __init__(self, model: str | None = None, spec: Any = None, document: Document | None = None) -> None:
+        super().__init__(model, spec)
+        self.records = Records(document, is_blank=spec is None)
+        self.references: dict[tuple[Any, str], H] = {}
+        self._handles: dict[Any, H] = {}
+        self._order: dict[Any, int] = {}
+        self._clock = itertools.count(_ADDED_LATER)
+        self._sections: dict[str, Any] = {}  # those who have them put them here
+
+    @classmethod
+    def owning(cls, spec: Any, document: Document | None = None) -> Self:
+        """Return a model around a spec that nobody else changes: changes are then seen, and results kept till then."""
+        model = cls(spec=spec, document=document)
+        model._revision = 0
+        return model
+
+    def expose(self) -> None:
+        """Note that the spec may change from now on without the model knowing."""
+        super().expose()
+        self.records.is_blank = False
+
+    def identify(self, element: Handle, relative_to: Scope | None = None) -> str:
+        """Return the compiled name of an element of this model, or its name seen from a model above."""
+        prefix = self.prefix(relative_to)
+        if element.is_worldbody:
+            return prefix or "world"
+        if element._native.name:
+            return prefix + element._native.name
+        number = self.find_all(element.kind, exclude_attachments=True).index(element)  # pyright: ignore[reportArgumentType]
+        own = f"/unnamed_{element.kind}_{number}"
+        return (prefix or ("/" if relative_to is None else "")) + own
+
+    # -- handles
+
+    @property
+    def worldbody(self) -> H:
+        """The world of this model, which becomes the attachment frame."""
+        return self.handle("body", self._spec.worldbody)
+
+    def handle(self, kind: str, native: Any) -> H:
+        """Return the handle on an element of the spec; always the same one."""
+        key = (native, kind) if kind == "inertial" else native  # a part of its body
+        found: Any = self._handles.get(key)
+        if found is None:
+            found = self._handles[key] = self.handle_type(self, kind, native)  # pyright: ignore[reportArgumentType]
+        return found
+
+    def find_handle(self, native: Any) -> H:
+        """Return the handle on an element that has one."""
+        return self._handles[native]
+
+    def section_of(self, kind: str) -> Any:
+        """Return the section that elements of a kind stand in."""
+        return self._sections[SECTION_OF[kind]]
+
+    def default_class(self, name: Any) -> Any:
+        """Return a class of defaults by its name."""
+        return self._sections["default"].find("default", getattr(name, "dclass", name))
+
+    def enlist(self, kind: str, native: Any, tag: str, values: dict[str, Any]) -> H:
+        """Note that an element was added after all others; return its handle.
+
+        Args:
+            kind: What it is.
+            native: The element of the spec.
+            tag: Its tag in MJCF.
+            values: The attributes that were given to it.
+        """
+        self._order[native] = next(self._clock)
+        self.records.note(native, tag, values)
+        return self.handle(kind, native)
+
+    def strike(self, natives: list[Any]) -> None:
+        """Forget elements that are about to be deleted."""
+        for native in natives:
+            self._order.pop(native, None)
+            self.records.forget(native)
+            handle = self._handles.pop(native, None)
+            if handle is not None:
+                object.__setattr__(handle, "_native", None)
+
+    # -- looking for elements
+
+    def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
+        """Return the element of a kind with a name such as ``finger`` or ``hand/finger``, or None.
+
+        Args:
+            kind: Of elements, or ``attachment_frame``, ``attached_model``.
+            identifier: The name.
+            name: The same.
+        """
+        identifier = name if identifier is None else identifier
+        if identifier is None:
+            raise UsageError(f"find({kind!r}) needs a name")
+        head, _, tail = identifier.partition("/")
+        if tail:
+            attachment = self.attachments.get(head)
+            return None if attachment is None else attachment.model.find(kind, tail)
+        if kind == "default":
+            return self.default_class(head)
+        if kind in ("attachment_frame", "attached_model"):
+            attachment = self.attachments.get(head)
+            if attachment is None:
+                return None
+            return attachment.model if kind == "attached_model" else self.handle("body", attachment.frame)
+        if kind == "body" and identifier == "world":
+            return self.worldbody
+        getter = getattr(self._spec, KIND_OF_TAG.get(kind, kind), None)
+        if getter is None:
+            raise UsageError(f"{kind!r} is not a kind of element")
+        native = getter(identifier)
+        return None if native is None else self.handle(KIND_OF_TAG.get(kind, kind), native)
+
+    def find_all(self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False) -> list[H]:
+        """Return all elements of a kind, in the order of the document: own ones, then those of attached models.
+
+        Args:
+            kind: Of elements.
+            immediate_children_only: Only those that stand in the world itself.
+            exclude_attachments: Only this model's own.
+        """
+        kind = KIND_OF_TAG.get(kind, kind)
+        if kind in TREE_KINDS:
+            return list(self.walk(self._spec.worldbody, kind, immediate_children_only, exclude_attachments))
+        natives = getattr(self._spec, translate.plural(kind), None)
+        if natives is None:
+            raise UsageError(f"{kind!r} is not a kind of element")
+        found = [self.handle(kind, n) for n in natives]
+        if not exclude_attachments:
+            for attachment in self.attachments.values():
+                found += attachment.model.find_all(kind)
+        return found
+
+    def walk(self, body: Any, kind: str, shallow: bool, own: bool) -> Iterator[H]:
+        """Yield the elements of a kind below a native body, in the order of the document.
+
+        Args:
+            body: The body of the spec.
+            kind: Of elements.
+            shallow: Only those that stand in the body itself.
+            own: Only this model's own.
+        """
+        attachment = self.attachments.get(body.name[:-1]) if body.name.endswith("/") else None
+        children = list(getattr(body, translate.plural(kind)))
+        if kind != "body" and not shallow:
+            children += body.bodies
+        for child in sorted(children, key=self._position) if len(children) > 1 else children:
+            is_body = child.__class__.__name__ == "MjsBody"
+            if not is_body or kind == "body":
+                yield self.handle(kind, child)
+            if is_body and not shallow:
+                yield from self.walk(child, kind, shallow, own)
+        if attachment is not None and not own and not shallow:
+            yield from attachment.model.find_all(kind)
+
+    def _position(self, native: Any) -> int:
+        added = self._order.get(native)
+        if added is not None:
+            return added
+        words = native.info.split()
+        return int(words[1]) if len(words) > 1 and words[1].isdigit() else 0
