@@ -18,7 +18,6 @@ STAGES = {"record", "identify", "train", "deploy", "check"}
 MAX_LINES = 400
 STILL_IN_CIRCLES = {
     ("sim2real.graph.timeline", "sim2real.graph.schedule"),
-    ("sim2real.composer.mjx.views", "sim2real.composer.mjx.physics"),
     ("sim2real.robots.identifiable", "sim2real.robots.servo_robot"),
     ("sim2real.robots.training", "sim2real.robots.servo_robot"),
 }

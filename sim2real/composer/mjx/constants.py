@@ -10,7 +10,7 @@ import numpy as np
 from mujoco import mjx
 
 from sim2real.composer.arrays import multiply_quaternions, rotate
-from sim2real.composer.mjx.warp import is_warp, varies
+from sim2real.composer.mjx.warp_fields import is_warp, varies
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 

@@ -12,7 +12,7 @@ import numpy as np
 from mujoco import mjx
 
 from sim2real.composer.c.named import Named
-from sim2real.composer.mjx import constants, stepping, warp
+from sim2real.composer.mjx import constants, stepping, warp_fields
 from sim2real.composer.mjx.random import JaxRandomState
 from sim2real.composer.mjx.views import DataView, MjxBinding, ModelView, constant
 from sim2real.composer.models import layout
@@ -120,7 +120,7 @@ class MjxPhysics:
         Raises:
             UsageError: With the field.
         """
-        if struct != "model" or warp.is_warp(self.mjx_model):
+        if struct != "model" or warp_fields.is_warp(self.mjx_model):
             return
         if name.endswith("_frictionloss") and not np.all(np.asarray(getattr(self.host, name))[rows] > 0):
             raise UsageError(
@@ -143,8 +143,8 @@ class MjxPhysics:
         current = _get(holder, name)
         if not isinstance(current, jax.Array):
             raise constant(name)
-        if struct == "model" and warp.is_warp(holder):
-            warp.check_field(name)
+        if struct == "model" and warp_fields.is_warp(holder):
+            warp_fields.check_field(name)
         try:
             value = jnp.broadcast_to(jnp.asarray(value, current.dtype), current.shape)
         except ValueError:
@@ -158,7 +158,7 @@ class MjxPhysics:
 
     def switch_on(self) -> None:
         """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
-        on_warp = warp.is_warp(self.mjx_model)
+        on_warp = warp_fields.is_warp(self.mjx_model)
         switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
         for path in {switches[name] for name in self.changed if name in switches}:
             if not _get(self.mjx_model, path):

@@ -10,7 +10,7 @@ from mujoco import mjx
 
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState
-from sim2real.composer.mjx.warp import is_warp
+from sim2real.composer.mjx.warp_fields import is_warp
 from sim2real.composer.variation.base import evaluate
 from sim2real.errors import UsageError
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,29 @@ from sim2real.composer.c.binding import columns
 from sim2real.composer.models import layout
 from sim2real.errors import UsageError
 
-if TYPE_CHECKING:
-    from sim2real.composer.mjx.physics import MjxPhysics
-
 _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
 """MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
+
+
+class Traced(Protocol):
+    """What is shown here: an ``MjxPhysics``, whose state and model are replaced when something is set."""
+
+    host: Any
+    mjx_model: Any
+    mjx_data: Any
+
+    def read(self, field: layout.Field) -> Any:
+        """Return a whole field."""
+        ...
+
+    def check(self, struct: str, name: str, rows: Any) -> None:
+        """Refuse what cannot be set."""
+
+    def replace(self, struct: str, name: str, value: Any) -> None:
+        """Set a whole field."""
+
+    def mark_as_dirty(self) -> None:
+        """Note that what is computed is out of date."""
 
 
 def constant(name: str) -> UsageError:
@@ -75,7 +93,7 @@ def shown(value: Any, name: str) -> Any:
 class OptionView:
     """``physics.model.opt``: gravity, wind and so on belong to each copy and can be set; the rest is constant."""
 
-    def __init__(self, physics: MjxPhysics) -> None:
+    def __init__(self, physics: Traced) -> None:
         object.__setattr__(self, "_physics", physics)
 
     def __getattr__(self, name: str) -> Any:
@@ -89,7 +107,7 @@ class OptionView:
 class ModelView:
     """``physics.model``: what differs from copy to copy comes from MJX, the rest from ``ptr``, the ``MjModel``."""
 
-    def __init__(self, physics: MjxPhysics) -> None:
+    def __init__(self, physics: Traced) -> None:
         object.__setattr__(self, "_physics", physics)
         object.__setattr__(self, "opt", OptionView(physics))
 
@@ -120,7 +138,7 @@ class ModelView:
 class DataView:
     """``physics.data``: fields of the state, in MuJoCo's shapes."""
 
-    def __init__(self, physics: MjxPhysics) -> None:
+    def __init__(self, physics: Traced) -> None:
         object.__setattr__(self, "_physics", physics)
 
     def __getattr__(self, name: str) -> Any:
@@ -141,7 +159,7 @@ class MjxBinding:
 
     __slots__ = ("_fields", "_ids", "_kind", "_physics", "_single", "element_id")
 
-    def __init__(self, physics: MjxPhysics, kind: str, ids: tuple[int, ...], single: bool) -> None:
+    def __init__(self, physics: Traced, kind: str, ids: tuple[int, ...], single: bool) -> None:
         numbers = ids[0] if single else np.array(ids, int)
         values = (layout.attributes(kind), ids, kind, physics, single, numbers)
         for name, value in zip(self.__slots__, values, strict=True):

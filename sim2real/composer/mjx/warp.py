@@ -119,31 +119,6 @@ def find_device() -> Any:
     return device
 
 
-def varies(path: str) -> bool:
-    """Return whether a field of the model, such as ``body_mass`` or ``opt.gravity``, may differ from copy to copy."""
-    from mujoco.mjx.warp import types
-
-    return bool(types._BATCH_DIM["Model"].get(path.replace(".", "__")))
-
-
-def check_field(path: str) -> None:
-    """Refuse a field of the model that cannot differ from copy to copy.
-
-    Raises:
-        UsageError: With the field.
-    """
-    if not varies(path):
-        raise UsageError(
-            f"MJX-Warp cannot change {path!r}: it is the same in all copies",
-            hint='set it in the model before it is compiled, or use impl="jax"',
-        )
-
-
-def is_warp(model: Any) -> bool:
-    """Return whether an ``mjx.Model`` is MuJoCo Warp's."""
-    return model.impl == mjx.Impl.WARP
-
-
 def _is_cuda(device: Any, warp: Any) -> bool:
     try:
         return device in jax.devices("cuda") and warp.is_cuda_available()

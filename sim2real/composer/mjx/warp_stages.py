@@ -23,7 +23,7 @@ from mujoco.mjx.third_party.mujoco_warp._src.types import Contact, DisableBit, E
 from mujoco.mjx.warp import ffi
 from mujoco.mjx.warp import forward as generated
 
-from sim2real.composer.mjx.warp import varies
+from sim2real.composer.mjx.warp_fields import varies
 from sim2real.composer.models.translate import mj
 
 wp: Any = importlib.import_module("warp")  # an extra, which type checkers may not find
