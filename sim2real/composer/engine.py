@@ -249,7 +249,14 @@ class MovableCamera(Camera):
         return Pose(camera.lookat.copy(), camera.distance, camera.azimuth, camera.elevation)
 
     def set_pose(self, lookat: Any, distance: float, azimuth: float, elevation: float) -> None:
-        """Put the camera somewhere; see ``Pose``."""
+        """Put the camera somewhere; see ``Pose``.
+
+        Args:
+            lookat: The point in the middle of the image, shape ``(3,)`` [m].
+            distance: From that point [m].
+            azimuth: [degrees].
+            elevation: [degrees].
+        """
         self._camera.lookat[:] = lookat
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
 

@@ -205,7 +205,13 @@ class Entity(ABC):
         return (bound.qpos[:3], bound.qpos[3:]) if free else (bound.pos, bound.quat)
 
     def set_pose(self, physics: Any, position: Any = None, quaternion: Any = None) -> None:
-        """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent."""
+        """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent.
+
+        Args:
+            physics: The physics.
+            position: ``(3,)`` [m]; None: it stays.
+            quaternion: ``(4,)``, scalar first; None: it stays.
+        """
         holder, free = self._pose_holder()
         if quaternion is not None:
             xp = namespace(quaternion)
@@ -258,7 +264,13 @@ class Entity(ABC):
         return qvel[:3], qvel[3:]
 
     def set_velocity(self, physics: Any, velocity: Any = None, angular_velocity: Any = None) -> None:
-        """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint."""
+        """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint.
+
+        Args:
+            physics: The physics.
+            velocity: Linear, ``(3,)`` [m/s]; None: it stays.
+            angular_velocity: ``(3,)`` [rad/s, local frame]; None: it stays.
+        """
         holder, free = self._pose_holder()
         if not free:
             _log.warning("Cannot set velocity on Entity with no free joint.")

@@ -105,7 +105,13 @@ class Observables:
             value.enabled = False
 
     def add_observable(self, name: str, observable: Any, enabled: bool = True) -> None:
-        """Add an observable, or a function of ``physics`` that returns the value."""
+        """Add an observable, or a function of ``physics`` that returns the value.
+
+        Args:
+            name: The observable's name.
+            observable: The observable, or the function.
+            enabled: Whether it is part of the observation.
+        """
         if not isinstance(observable, Observable):
             observable = Generic(observable)
         self._observables[name] = observable

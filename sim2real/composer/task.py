@@ -149,12 +149,24 @@ class Task(ABC):
         """Set the state at the start of an episode."""
 
     def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
-        """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
+        """Act before a control step; default: the action, shape ``(nu,)``, becomes the control.
+
+        Args:
+            physics: The physics.
+            action: What the agent does, as ``action_spec`` says.
+            random_state: The random numbers of this episode.
+        """
         del random_state
         physics.set_control(action)
 
     def before_substep(self, physics: Any, action: Any, random_state: Any) -> None:  # noqa: B027
-        """Act before a step of the physics."""
+        """Act before a step of the physics.
+
+        Args:
+            physics: The physics.
+            action: What the agent does, as ``action_spec`` says.
+            random_state: The random numbers of this episode.
+        """
 
     def after_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
         """Act after a step of the physics."""

@@ -25,6 +25,11 @@ class Staleness:
 class Place:
     """Where an attribute of bound elements lies.
 
+    Args:
+        array: MuJoCo's array.
+        index: The rows in it.
+        derived: Whether it is computed from others.
+
     Attributes:
         array: MuJoCo's array.
         index: The rows in it.
@@ -87,6 +92,12 @@ class Binding:
 
     Attribute names are MuJoCo's without the kind's prefix. One element: a row, shape ``(...)``; several: ``(n, ...)``;
     what has several entries per element (``qpos``, ``qvel``, ``sensordata``) is concatenated.
+
+    Args:
+        physics: The physics.
+        kind: What the elements are.
+        ids: Their numbers in the compiled model.
+        single: Whether one element is bound, rather than a sequence of them.
     """
 
     __slots__ = ("_fields", "_ids", "_kind", "_physics", "_places", "_single", "_staleness", "element_id")

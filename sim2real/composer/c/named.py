@@ -26,6 +26,11 @@ class NamedArray(NDArrayOperatorsMixin):
     """One array whose rows are indexed by numbers, names or elements; otherwise it is that array.
 
     A name that is not there may leave out the models it is attached below, as long as only one element ends with it.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        field: Which array.
+        holder: What has the array as an attribute: the model or the data.
     """
 
     def __init__(self, model: Any, field: layout.Field, holder: Any) -> None:
@@ -125,7 +130,13 @@ def _column(key: Any) -> Any:
 
 
 class NamedFields:
-    """The arrays of ``model`` or ``data``, each as a ``NamedArray``."""
+    """The arrays of ``model`` or ``data``, each as a ``NamedArray``.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        struct: ``model`` or ``data``.
+        holder: What has the arrays as attributes.
+    """
 
     def __init__(self, model: Any, struct: str, holder: Any) -> None:
         self._model, self._struct, self._holder = model, struct, holder
@@ -141,7 +152,13 @@ class NamedFields:
 
 
 class Named:
-    """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name."""
+    """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        model_holder: What has the model's arrays as attributes.
+        data_holder: What has the data's.
+    """
 
     def __init__(self, model: Any, model_holder: Any, data_holder: Any) -> None:
         self.model = NamedFields(model, "model", model_holder)

@@ -13,6 +13,7 @@ import numpy as np
 from sim2real.composer.c.binding import Binding, EmptyBinding, Staleness
 from sim2real.composer.c.named import Named
 from sim2real.composer.c.rendering import Graphics
+from sim2real.composer.c.views import DataView, ModelView
 from sim2real.composer.engine import Camera, TextOverlay
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.models import layout
@@ -22,61 +23,6 @@ from sim2real.errors import UsageError
 
 _log = logging.getLogger(__name__)
 _RK4 = int(mj.mjtIntegrator.mjINT_RK4)
-
-
-class _Wrapper:
-    """An mjModel or mjData whose attributes are those of ``ptr``, the native object."""
-
-    __slots__ = ("ptr",)
-
-    def __init__(self, ptr: Any) -> None:
-        object.__setattr__(self, "ptr", ptr)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.ptr, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self.ptr, name, value)
-
-
-def _kind(kind: str | int) -> str:
-    if isinstance(kind, str):
-        return kind
-    kinds = {int(number): name for name, number in layout.OBJECT_TYPES.items()}
-    if int(kind) not in kinds:
-        raise UsageError(f"no elements have the mjtObj {kind}. Available: {', '.join(layout.OBJECT_TYPES)}")
-    return kinds[int(kind)]
-
-
-class ModelView(_Wrapper):
-    """``physics.model``: the ``MjModel``, and names to numbers and back."""
-
-    __slots__ = ()
-
-    def name2id(self, name: str, kind: str | int) -> int:
-        """Return the number of the element of a kind, or ``mjtObj``, with a name; UsageError when there is none."""
-        return layout.resolve(self.ptr, _kind(kind), (name,))[0]
-
-    def id2name(self, number: int, kind: str | int) -> str:
-        """Return the name of an element of a kind, or ``mjtObj``; '' when it has none."""
-        return mj.mj_id2name(self.ptr, layout.OBJECT_TYPES[_kind(kind)], number) or ""
-
-    @contextlib.contextmanager
-    def disable(self, *flags: str) -> Iterator[None]:
-        """Switch parts of the physics off, such as ``'actuation'`` or ``'contact'``, inside a ``with`` block."""
-        before = self.ptr.opt.disableflags
-        try:
-            for flag in flags:
-                self.ptr.opt.disableflags |= int(getattr(mj.mjtDisableBit, f"mjDSBL_{flag.upper()}"))
-            yield
-        finally:
-            self.ptr.opt.disableflags = before
-
-
-class DataView(_Wrapper):
-    """``physics.data``: the ``MjData``."""
-
-    __slots__ = ()
 
 
 class Physics:
@@ -326,12 +272,25 @@ class Physics:
         return getattr(self.bind(elements), name)
 
     def set(self, elements: Any, name: str, value: Any) -> Physics:
-        """Set an attribute of elements and return the physics; the same call on both engines."""
+        """Set an attribute of elements and return the physics; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What it is set to, in the shape in which it is read.
+        """
         setattr(self.bind(elements), name, value)
         return self
 
     def write(self, elements: Any, name: str, value: Any, index: Any) -> Physics:
-        """Set a part of an attribute of elements; the same call on both engines."""
+        """Set a part of an attribute of elements; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What the part is set to.
+            index: Which part of the attribute, as in ``attribute[index]``.
+        """
         getattr(self.bind(elements), name)[index] = value
         return self
 
@@ -369,6 +328,17 @@ class Physics:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
         See ``engine.Camera`` and its ``render``.
+
+        Args:
+            height: Of the image [pixels].
+            width: Of the image [pixels].
+            camera_id: Number or name of one of the model's cameras; -1 is the free camera.
+            overlays: Texts to draw over it.
+            depth: Measure distances instead of colours.
+            segmentation: Tell objects by numbers and types (``mjtObj``) instead.
+            scene_option: What is drawn: an ``MjvOption``.
+            render_flag_overrides: Flags of ``mjtRndFlag`` -> value, for this image.
+            scene_callback: Called with the physics and the ``MjvScene`` before it is drawn, to add shapes.
         """
         scene = None if scene_callback else self.graphics.scene()  # what a callback changes is not for the next image
         camera = Camera(self, height, width, camera_id, scene_callback=scene_callback, scene=scene)

@@ -293,7 +293,13 @@ class MjxEnvironment:
         return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
 
     def select(self, condition: Any, a: State, b: State) -> State:
-        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done."""
+        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done.
+
+        Args:
+            condition: A boolean.
+            a: A copy.
+            b: Another copy.
+        """
 
         def choose(x: Any, y: Any) -> Any:
             if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):

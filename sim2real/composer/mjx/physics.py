@@ -117,6 +117,11 @@ class MjxPhysics:
     def check(self, struct: str, name: str, rows: Any = slice(None)) -> None:
         """Refuse to set rows of a field where MJX would not see it.
 
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            rows: Which rows of it; default: all.
+
         Raises:
             UsageError: With the field.
         """
@@ -135,6 +140,11 @@ class MjxPhysics:
 
     def replace(self, struct: str, name: str, value: Any) -> None:
         """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
+
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            value: What it is set to.
 
         Raises:
             UsageError: When the field is a constant of compiled programs.
@@ -293,12 +303,25 @@ class MjxPhysics:
         return getattr(self.bind(elements), name)
 
     def set(self, elements: Any, name: str, value: Any) -> MjxPhysics:
-        """Set an attribute of elements and return the physics; the same call on both engines."""
+        """Set an attribute of elements and return the physics; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What it is set to, in the shape in which it is read.
+        """
         setattr(self.bind(elements), name, value)
         return self
 
     def write(self, elements: Any, name: str, value: Any, index: Any) -> MjxPhysics:
-        """Set a part of an attribute of elements; the same call on both engines."""
+        """Set a part of an attribute of elements; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What the part is set to.
+            index: Which part of the attribute, as in ``attribute[index]``.
+        """
         whole = jnp.asarray(self.get(elements, name))
         return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
 
@@ -328,6 +351,11 @@ class MjxPhysics:
         """Run a function until it no longer calls ``fail``, at most so many times; return whether the last one failed.
 
         Every attempt starts from the same state, with new random numbers.
+
+        Args:
+            attempt: The function: without arguments.
+            random_state: The random numbers that it draws from.
+            attempts: How often it runs at most.
         """
         start, model, outer, dirty = self.tree(random_state), self.mjx_model, self.failed, self.is_dirty
 

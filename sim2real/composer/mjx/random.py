@@ -67,17 +67,35 @@ class JaxRandomState:
         return key
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
-        """Return floats in ``[low, high)``."""
+        """Return floats in ``[low, high)``.
+
+        Args:
+            low: The lower bound.
+            high: The upper bound.
+            size: Shape of what is drawn; default: that of the bounds.
+        """
         low, high = jnp.asarray(low, float), jnp.asarray(high, float)
         return low + (high - low) * jax.random.uniform(self.next_key(), _shape(size, low, high))
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
-        """Return normally distributed floats."""
+        """Return normally distributed floats.
+
+        Args:
+            loc: The mean.
+            scale: The standard deviation.
+            size: Shape of what is drawn; default: that of the parameters.
+        """
         loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
         return loc + scale * jax.random.normal(self.next_key(), _shape(size, loc, scale))
 
     def lognormal(self, mean: Any = 0.0, sigma: Any = 1.0, size: Any = None) -> Any:
-        """Return exponentials of normally distributed floats."""
+        """Return exponentials of normally distributed floats.
+
+        Args:
+            mean: Of the logarithm.
+            sigma: Standard deviation of the logarithm.
+            size: Shape of what is drawn; default: that of the parameters.
+        """
         return jnp.exp(self.normal(mean, sigma, size))
 
     def exponential(self, scale: Any = 1.0, size: Any = None) -> Any:
@@ -91,16 +109,35 @@ class JaxRandomState:
         return jax.random.poisson(key, lam, _shape(size, lam))
 
     def binomial(self, n: Any, p: Any, size: Any = None) -> Any:
-        """Return binomially distributed integers."""
+        """Return binomially distributed integers.
+
+        Args:
+            n: How many trials.
+            p: Probability of success in each.
+            size: Shape of what is drawn; default: that of the parameters.
+        """
         return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
 
     def randint(self, low: Any, high: Any = None, size: Any = None) -> Any:
-        """Return integers in ``[low, high)``, or in ``[0, low)``."""
+        """Return integers in ``[low, high)``, or in ``[0, low)``.
+
+        Args:
+            low: The lower bound; without ``high``, the upper one.
+            high: The upper bound.
+            size: Shape of what is drawn; default: that of the bounds.
+        """
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
-        """Return items of ``a``, or integers below it, with probabilities ``p``."""
+        """Return items of ``a``, or integers below it, with probabilities ``p``.
+
+        Args:
+            a: The items, or how many integers there are to choose from.
+            size: Shape of what is drawn; default: a single item.
+            replace: Whether an item may be drawn again.
+            p: Probability of each item; default: all the same.
+        """
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
         return jax.random.choice(self.next_key(), values, _shape(size), replace, None if p is None else jnp.asarray(p))
 
@@ -117,11 +154,23 @@ class JaxRandomState:
         return self.normal(size=size)
 
     def beta(self, a: Any, b: Any, size: Any = None) -> Any:
-        """Return Beta distributed floats."""
+        """Return Beta distributed floats.
+
+        Args:
+            a: The first shape.
+            b: The second shape.
+            size: Shape of what is drawn; default: that of the parameters.
+        """
         return jax.random.beta(self.next_key(), a, b, _shape(size, a, b))
 
     def gamma(self, shape: Any, scale: Any = 1.0, size: Any = None) -> Any:
-        """Return Gamma distributed floats."""
+        """Return Gamma distributed floats.
+
+        Args:
+            shape: The shape of the distribution.
+            scale: Its scale.
+            size: Shape of what is drawn; default: that of the parameters.
+        """
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
     def shuffle(self, x: Any) -> None:

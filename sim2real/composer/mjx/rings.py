@@ -96,7 +96,16 @@ class Ring:
         return self._insert(ring, jnp.zeros((), jnp.int32), value, random_state)
 
     def update(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState, counts: Any) -> Any:
-        """Return the ring after a physics step; ``counts`` is False for a step that is observed later."""
+        """Return the ring after a physics step, with a new sample in it when one is due.
+
+        Args:
+            ring: The ring before the step.
+            now: Physics steps since the start of the episode.
+            physics: The physics after the step.
+            random_state: What noise and delays are drawn from.
+            counts: Whether a sample may be taken now. Not so after the last physics step of a control step: that sample
+                is taken once the task's ``after_step`` hooks have run, by another call.
+        """
         if self.direct:
             return {"value": self.sample(physics, random_state)}
         due = (now == ring["next"]) & counts
@@ -151,7 +160,15 @@ class Ring:
 def make_rings(
     observables: Mapping[str, Observable], steps: int, strip: bool, pad_initial: bool, call: Call = _call
 ) -> list[Ring]:
-    """Return the rings of the enabled ones of some observables."""
+    """Return the rings of the enabled ones of some observables.
+
+    Args:
+        observables: Key -> observable, enabled or not.
+        steps: Physics steps that a control step has.
+        strip: Whether the axis of single samples is left out, as in the environment.
+        pad_initial: Whether what was never sampled reads as the first sample, rather than as zeros.
+        call: Calls a function of the task, with its label, the function and its arguments.
+    """
     return [Ring(name, o, steps, strip, pad_initial, call) for name, o in observables.items() if o.enabled]
 
 

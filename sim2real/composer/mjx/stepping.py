@@ -8,10 +8,15 @@ from mujoco import mjx
 
 
 def advance(model: Any, data: Any, legacy: bool) -> Any:
-    """Return the data a time step later; with ``legacy``, with positions and velocities of the new state.
+    """Return the data a time step later.
 
     With ``legacy`` the data must be consistent, what ``forward`` or an earlier step returned, and that is no dearer:
     the same stages, begun elsewhere (``mj_step2; mj_step1``).
+
+    Args:
+        model: The ``mjx.Model``.
+        data: The ``mjx.Data``.
+        legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
     """
     if not legacy:
         return _integrate(model, forward(model, data))
@@ -32,6 +37,11 @@ def forward(model: Any, data: Any, actuation: bool = True) -> Any:
     """Compute everything that follows from the state; without actuation, as at the start of an episode.
 
     ``mjx.forward`` leaves accelerometers and force sensors at 0 in models without constraints; this does not.
+
+    Args:
+        model: The ``mjx.Model``.
+        data: The ``mjx.Data``.
+        actuation: Whether actuators act.
     """
     if not actuation:
         flags = model.opt.disableflags | mjx.DisableBit.ACTUATION

@@ -28,10 +28,22 @@ class Traced(Protocol):
         ...
 
     def check(self, struct: str, name: str, rows: Any) -> None:
-        """Refuse what cannot be set."""
+        """Refuse what cannot be set.
+
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            rows: Which rows of it.
+        """
 
     def replace(self, struct: str, name: str, value: Any) -> None:
-        """Set a whole field."""
+        """Set a whole field.
+
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            value: What it is set to.
+        """
 
     def mark_as_dirty(self) -> None:
         """Note that what is computed is out of date."""
@@ -155,7 +167,14 @@ class DataView:
 
 
 class MjxBinding:
-    """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model."""
+    """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model.
+
+    Args:
+        physics: The physics.
+        kind: What the elements are.
+        ids: Their numbers in the compiled model.
+        single: Whether one element is bound, rather than a sequence of them.
+    """
 
     __slots__ = ("_fields", "_ids", "_kind", "_physics", "_single", "element_id")
 

@@ -50,12 +50,24 @@ class WarpEngine:
         self.start = self._pack(data)
 
     def advance(self, model: Any, data: Any, legacy: bool) -> Any:
-        """Return the data a time step later; with ``legacy``, with positions and velocities of the new state."""
+        """Return the data a time step later.
+
+        Args:
+            model: The ``mjx.Model``.
+            data: The ``mjx.Data``.
+            legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
+        """
         step = self._stages.legacy_step if legacy else self._stages.step
         return self._pack(step(model, self._unpack(data)))
 
     def forward(self, model: Any, data: Any, actuation: bool = True) -> Any:
-        """Compute everything that follows from the state; without actuation, as at the start of an episode."""
+        """Compute everything that follows from the state; without actuation, as at the start of an episode.
+
+        Args:
+            model: The ``mjx.Model``.
+            data: The ``mjx.Data``.
+            actuation: Whether actuators act.
+        """
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
             model = model.tree_replace({"opt.disableflags": flags})
@@ -72,6 +84,12 @@ class WarpEngine:
 
 def make_engine(host: Any, impl: str, nconmax: int | None, njmax: int | None) -> WarpEngine | None:
     """Return what steps a model with Warp; None with ``impl="jax"``.
+
+    Args:
+        host: The compiled ``mujoco.MjModel``.
+        impl: ``jax`` or ``warp``.
+        nconmax: See ``WarpEngine``; None with JAX.
+        njmax: See ``WarpEngine``; None with JAX.
 
     Raises:
         UsageError: When there is no such implementation, or it cannot be had.

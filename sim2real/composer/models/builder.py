@@ -19,7 +19,14 @@ _OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biaspr
 
 
 def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
-    """Add an element to a body of this model."""
+    """Add an element to a body of this model.
+
+    Args:
+        model: The model.
+        body: The body, or the frame of an attached model.
+        tag: The element's tag in MJCF.
+        attrs: Its attributes in MJCF; they are put under PyMJCF's names.
+    """
     if tag == "inertial":
         return _add_inertial(model, body, attrs)
     kind = KIND_OF_TAG.get(tag, tag)
@@ -61,7 +68,14 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
 
 
 def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -> H:
-    """Add an element that stands in no body; MuJoCo's parser reads its attributes."""
+    """Add an element that stands in no body; MuJoCo's parser reads its attributes.
+
+    Args:
+        model: The model.
+        kind: What is added, such as ``actuator``.
+        tag: Its tag in MJCF, such as ``motor``.
+        attrs: Its attributes in MJCF; they are put under PyMJCF's names.
+    """
     model.check_name(kind, attrs.get("name"))
     defaults = _defaults(model, attrs)
     adder = getattr(model._spec, f"add_{kind}")
@@ -170,7 +184,14 @@ def _catch_up(element: Handle, said: dict[str, Any]) -> None:
 
 
 def reclass(model: Tree[Any], element: Handle, name: str, value: Any) -> None:
-    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
+    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``.
+
+    Args:
+        model: The model.
+        element: The element, or the body.
+        name: ``dclass`` or ``childclass``.
+        value: The class, or its name.
+    """
     value = getattr(value, "dclass", value)
     element.recorded().note(name, value)
     if name == "childclass":
@@ -205,7 +226,14 @@ def said_by_classes(element: Handle) -> Iterator[given.Given]:
 
 
 def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) -> H:
-    """Add a joint, a site, a geom or a pulley to a tendon's path."""
+    """Add a joint, a site, a geom or a pulley to a tendon's path.
+
+    Args:
+        model: The model.
+        tendon: The tendon.
+        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
+        attrs: The attributes in MJCF; elements, or their names.
+    """
     model.touch()
     names = {k: v.name if isinstance(v, Handle) else v for k, v in attrs.items()}
     if tag == "joint":

@@ -113,6 +113,12 @@ class DefaultElement(Element):
 
     What is set here also reaches the elements of the class, and those of the classes below it, that do not say it
     themselves.
+
+    Args:
+        owner: The class.
+        kind: What the elements are.
+        native: What holds their defaults in the ``MjSpec``.
+        tag: The tag under which they were asked for: a class has the same defaults for all actuators.
     """
 
     __slots__ = ("_owner", "_tag")

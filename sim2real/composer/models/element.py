@@ -75,7 +75,13 @@ class Element(Handle):
     def find_all(
         self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
     ) -> list[Element]:
-        """Return the elements of a kind below this body, in the order of the document."""
+        """Return the elements of a kind below this body, in the order of the document.
+
+        Args:
+            kind: Of elements.
+            immediate_children_only: Only those that stand in this body itself.
+            exclude_attachments: Only those of this body's own model.
+        """
         if self.kind != "body":
             return []
         kind = KIND_OF_TAG.get(kind, kind)

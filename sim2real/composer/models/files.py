@@ -47,6 +47,11 @@ def adopt(model: Tree[Any], asset: Asset) -> str:
 def asset_of(model: Tree[Any], kind: str, file: Asset | str) -> Asset:
     """Return a file that a model names.
 
+    Args:
+        model: The model.
+        kind: The kind of element that names the file: textures have a folder of their own.
+        file: The name, or the contents.
+
     Raises:
         UsageError: When there is no such file.
     """

@@ -127,7 +127,13 @@ class Records:
             self._document.says_angle = True
 
     def note(self, native: Any, tag: str, values: dict[str, Any]) -> None:
-        """Note that an element was added."""
+        """Note that an element was added.
+
+        Args:
+            native: The element of the ``MjSpec``.
+            tag: Its tag in MJCF.
+            values: The attributes that were given to it.
+        """
         self._of[native] = Given(tag, values)
 
     def class_parent(self, name: str) -> str | None:
@@ -185,7 +191,13 @@ class Records:
 
 
 def read(native: Any, kind: str, blank: Any) -> Given:
-    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``."""
+    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        kind: What it is.
+        blank: The element that holds its defaults.
+    """
     tag = _tag(native, kind)
     found = Given(tag)
     for name in schema.attributes(kind, tag):

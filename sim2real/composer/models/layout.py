@@ -142,6 +142,11 @@ def index(model: Any, field: Field, ids: tuple[int, ...], single: bool) -> Any:
 def resolve(model: Any, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
     """Return the numbers of elements in a compiled model.
 
+    Args:
+        model: The compiled ``mujoco.MjModel``.
+        kind: What the elements are.
+        names: Their full names.
+
     Raises:
         UsageError: When the model has no element of one of the names.
     """

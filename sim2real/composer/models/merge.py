@@ -188,14 +188,27 @@ def merged(models: Iterable[Any]) -> Settings:
 
 
 def note(model: Any, path: str, name: str) -> None:
-    """Note that a program wrote a setting of a model: it counts as set, and holds over what attached models had set."""
+    """Note that a program wrote a setting of a model: it counts as set, and holds over what attached models had set.
+
+    Args:
+        model: The model.
+        path: Part of the spec, such as ``option`` or ``visual.map``; '' for sizes.
+        name: The field.
+    """
     _author(model._spec, path, name)
     model.overrides.note((path, name), (m for m in model.root_model.all_models() if m is not model))
     model.touch_settings()
 
 
 def in_world(model: Any, path: str, name: str, own: Any) -> Any:
-    """Return the value of a setting in the world that a model is a part of, given the model's own."""
+    """Return the value of a setting in the world that a model is a part of, given the model's own.
+
+    Args:
+        model: The model.
+        path: Part of the spec, such as ``option`` or ``visual.map``; '' for sizes.
+        name: The field.
+        own: The value in the model itself.
+    """
     if model.parent_model is None and not model.attachments:
         return own
     value = merged(model.root_model.all_models()).get((path, name), own)
@@ -228,7 +241,13 @@ def apply(spec: Any, found: Settings) -> None:
 
 
 def set_flag(spec: Any, name: str, value: str) -> None:
-    """Switch a flag: ``enable`` or ``disable``."""
+    """Switch a flag: ``enable`` or ``disable``.
+
+    Args:
+        spec: The ``MjSpec``.
+        name: The flag's name in MJCF.
+        value: ``enable`` or ``disable``.
+    """
     field, bit = FLAGS[name]
     bits = getattr(spec.option, field)
     raised = (value == "enable") == (field == "enableflags")

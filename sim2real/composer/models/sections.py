@@ -29,6 +29,12 @@ class Section:
     """One section of a model, such as ``option``, ``actuator`` or ``visual.map``.
 
     Attributes read and set the fields of the ``MjSpec``; ``add`` adds an element to the sections that hold some.
+
+    Args:
+        model: The model.
+        name: The section's name.
+        path: Where its fields are in the ``MjSpec``; '' for the spec itself.
+        kinds: The kinds of elements that stand in it.
     """
 
     __slots__ = ("_kinds", "_model", "_name", "_path")

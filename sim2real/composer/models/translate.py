@@ -99,7 +99,13 @@ def native_name(kind: str, key: str) -> str:
 
 
 def read(native: Any, kind: str, key: str) -> Any:
-    """Return an attribute of an element; AttributeError when there is none of that name."""
+    """Return an attribute of an element; AttributeError when there is none of that name.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        kind: What it is.
+        key: The attribute in MJCF.
+    """
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return np.array(getattr(native.alt, key))
     value = getattr(native, native_name(kind, key))
@@ -112,7 +118,13 @@ def read(native: Any, kind: str, key: str) -> Any:
 
 
 def point(native: Any, key: str, name: str) -> None:
-    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several."""
+    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        key: The attribute, in the spelling of ``MjSpec``.
+        name: The other element's name; '' for none.
+    """
     key, _, number = key.partition("[")
     if not number:
         setattr(native, key, name)
@@ -123,7 +135,14 @@ def point(native: Any, key: str, name: str) -> None:
 
 
 def is_plain(native: Any, kind: str, key: str, value: Any) -> bool:
-    """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
+    """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        kind: What it is.
+        key: The attribute in MJCF.
+        value: The value.
+    """
     found = _PLAIN.get((kind, key))
     if found is None:
         found = _PLAIN[kind, key] = _is_plain(native, kind, key)
@@ -146,7 +165,13 @@ def _is_plain(native: Any, kind: str, key: str) -> tuple[bool, bool]:
 
 
 def reset(native: Any, source: Any, names: tuple[str, ...] | None = None) -> None:
-    """Put attributes of an element back to those of another one, its defaults; default: all but its name."""
+    """Put attributes of an element back to those of another one, its defaults; default: all but its name.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        source: The element that holds its defaults.
+        names: The attributes, in the spelling of ``MjSpec``; default: all but the name.
+    """
     for name in attributes(native) if names is None else names:
         if name in _ORIENTATIONS:
             native.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
@@ -176,6 +201,12 @@ def class_defaults(native: Any, kind: str) -> Any:
 
 def assign(native: Any, kind: str, key: str, value: Any) -> None:
     """Set an attribute of an element.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        kind: What it is.
+        key: The attribute in MJCF.
+        value: What it is set to: numbers, keywords or text, as in MJCF.
 
     Raises:
         AttributeError: When elements of this kind have no such attribute.

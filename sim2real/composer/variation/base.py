@@ -103,7 +103,13 @@ class UnaryOperation(Variation):
 
 
 class BinaryOperation(Variation):
-    """An operator applied to two values, at least one of which varies."""
+    """An operator applied to two values, at least one of which varies.
+
+    Args:
+        op: The operator, a function of two values.
+        first: The left value.
+        second: The right value.
+    """
 
     def __init__(self, op: Callable[[Any, Any], Any], first: Any, second: Any) -> None:
         self._op, self._first, self._second = op, first, second

@@ -12,7 +12,14 @@ from sim2real.composer.variation.base import Variation, evaluate
 
 
 class RgbVariation(Variation):
-    """Red, green, blue and alpha."""
+    """Red, green, blue and alpha.
+
+    Args:
+        r: Red, from 0 to 1.
+        g: Green, from 0 to 1.
+        b: Blue, from 0 to 1.
+        alpha: Opacity, from 0 to 1.
+    """
 
     def __init__(self, r: Any, g: Any, b: Any, alpha: Any = 1.0) -> None:
         self._channels = [r, g, b, alpha]
@@ -33,7 +40,14 @@ class RgbVariation(Variation):
 
 
 class HsvVariation(Variation):
-    """Hue, saturation, value and alpha."""
+    """Hue, saturation, value and alpha.
+
+    Args:
+        h: Hue, from 0 to 1.
+        s: Saturation, from 0 to 1.
+        v: Value, from 0 to 1.
+        alpha: Opacity, from 0 to 1.
+    """
 
     def __init__(self, h: Any, s: Any, v: Any, alpha: Any = 1.0) -> None:
         self._channels = (h, s, v, alpha)

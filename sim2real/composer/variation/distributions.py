@@ -64,7 +64,13 @@ class Distribution(Variation):
 
 
 class Uniform(Distribution):
-    """Uniform in ``[low, high)``."""
+    """Uniform in ``[low, high)``.
+
+    Args:
+        low: The lower bound.
+        high: The upper bound.
+        single_sample: Draw one sample, whatever the shape of the initial value.
+    """
 
     __slots__ = ()
 
@@ -76,7 +82,13 @@ class Uniform(Distribution):
 
 
 class UniformInteger(Distribution):
-    """Integers in ``[low, high)``, or in ``[0, low)`` without ``high``."""
+    """Integers in ``[low, high)``, or in ``[0, low)`` without ``high``.
+
+    Args:
+        low: The lower bound; without ``high``, the upper one.
+        high: The upper bound.
+        single_sample: Draw one sample, whatever the shape of the initial value.
+    """
 
     __slots__ = ()
 
@@ -122,7 +134,13 @@ class UniformPointOnSphere(Variation):
 
 
 class Normal(Distribution):
-    """Normal with mean ``loc`` and standard deviation ``scale``."""
+    """Normal with mean ``loc`` and standard deviation ``scale``.
+
+    Args:
+        loc: The mean.
+        scale: The standard deviation.
+        single_sample: Draw one sample, whatever the shape of the initial value.
+    """
 
     __slots__ = ()
 
@@ -134,7 +152,13 @@ class Normal(Distribution):
 
 
 class LogNormal(Distribution):
-    """The exponential of a normal variable."""
+    """The exponential of a normal variable.
+
+    Args:
+        mean: Of the logarithm.
+        sigma: Standard deviation of the logarithm.
+        single_sample: Draw one sample, whatever the shape of the initial value.
+    """
 
     __slots__ = ()
 

@@ -85,7 +85,13 @@ class QuaternionPreMultiply(Variation):
 
 
 class QuaternionRotate(Variation):
-    """A vector ``(3,)`` that is rotated: a given one, else the initial or the current value."""
+    """A vector ``(3,)`` that is rotated: a given one, else the initial or the current value.
+
+    Args:
+        quat: The rotation, ``(4,)``, scalar first.
+        vec: The vector; None: the initial or the current value.
+        cumulative: Whether the current value is rotated, rather than the initial one.
+    """
 
     def __init__(self, quat: Any, vec: Any = None, cumulative: bool = False) -> None:
         self._quat, self._vec, self._cumulative = quat, vec, cumulative
