@@ -28,27 +28,34 @@ class Compiler:
         self._key: Any = None
         self._model: Any = None
         self._content = np.empty(0, np.uint8)
-        self._last: _Loan | None = None
+        self._memory: _Memory | None = None
 
     def start(self, legacy_step: bool) -> Physics:
-        """Return the task's world in its initial state.
-
-        The ``MjModel`` and ``MjData`` are those of the last physics when it is gone, nobody holds a part of them, and
-        the model is as it was compiled; else they are new.
-        """
+        """Return the task's world in its initial state, in memory that nobody else looks into: see ``_Memory``."""
         model = self._task.root_entity.mjcf_model.root_model
         key = [(m, m.revision()) for m in model.all_models()]
         if None in (revision for _, revision in key) or key != self._key:
-            self._model, self._key, self._last = model.compile(), key, None
+            self._model, self._key, self._memory = model.compile(), key, None
             self._content = _content(self._model)
-        if self._last is None or self._last.is_held() or not np.array_equal(_content(self._last.model), self._content):
-            self._last = _Loan(self._model)
-        mj.mj_resetData(self._last.model, self._last.data)
-        return Physics(self._last.model, legacy_step, self._last.data)
+        memory = self._memory
+        if memory is None or memory.is_held() or not np.array_equal(_content(memory.model), self._content):
+            memory = self._memory = _Memory(self._model)
+        mj.mj_resetData(memory.model, memory.data)
+        return Physics(memory.model, legacy_step, memory.data)
 
 
-class _Loan:
-    """A model and a state that are lent out, and whether anybody still holds them or an array of theirs.
+class _Memory:
+    """An ``MjModel`` and an ``MjData`` that serve one episode after another, unless somebody has kept a part of them.
+
+    Whoever keeps an array, such as ``physics.data.qpos`` in a list of what happened, has to find the same numbers in it
+    in the next episode, so that every episode gets memory of its own in dm_control. To make it anew takes two thirds of
+    a reset: with 20 robots 0.91 ms, against 0.28 ms in the memory of the last episode (and 35 ms in dm_control). So the
+    memory is used again, but only if nobody has a part of it.
+
+    How that is known: MuJoCo makes each array of a model or a state once and hands out the same object every time, so
+    whoever keeps one, or a slice of one, adds to Python's count of the references to that object. When all counts are
+    what they were at the start, nobody does. Weak references cannot tell it, as MuJoCo's own references keep the arrays
+    alive. A count that differs for any other reason costs a new memory, never a wrong number.
 
     Args:
         model: The model that it copies.
@@ -58,14 +65,14 @@ class _Loan:
         self.model = copy.copy(model)
         self.data = mj.MjData(self.model)
         self._parts = [self.model, self.data, *_parts(self.model), *_parts(self.data)]
-        self._holders = self._count()
+        self._at_first = self._counts()
 
-    def _count(self) -> int:
-        return sum(map(sys.getrefcount, self._parts))
+    def _counts(self) -> list[int]:
+        return list(map(sys.getrefcount, self._parts))
 
     def is_held(self) -> bool:
         """Return whether a part of it is referred to from elsewhere."""
-        return self._count() != self._holders
+        return self._counts() != self._at_first
 
 
 def _parts(owner: Any) -> list[Any]:
