@@ -11,6 +11,7 @@ import numpy as np
 from dm_env import specs
 
 from sim2real.composer import define
+from sim2real.composer.arena import Arena
 from sim2real.composer.entity import Entity
 from sim2real.composer.models.layout import names_of
 from sim2real.composer.observation.observable.base import Generic
@@ -202,8 +203,6 @@ class NullTask(Task):
 
     def __init__(self, root_entity: Entity | None = None) -> None:
         if root_entity is None:
-            from sim2real.composer.arena import Arena
-
             root_entity = Arena()
         self._root_entity = root_entity
 

@@ -11,6 +11,7 @@ NAMES = {
         "ModelWrapperEntity", "NullTask", "Observables", "ObservationPadding", "Physics", "PhysicsError", "PropPlacer",
         "Robot", "SENSOR_SITES_GROUP", "Task", "Variation", "abstract_observable", "cached_property", "observable",
     ],
+    "composer.engine": ["Camera", "MovableCamera", "TextOverlay"],
     "composer.mjcf": [
         "Asset", "Binding", "Element", "PREFIX_SEPARATOR", "Physics", "RootElement", "commit_defaults", "element",
         "export_with_assets", "export_with_assets_as_zip", "from_file", "from_path", "from_xml_string",
@@ -27,7 +28,7 @@ NAMES = {
     "composer.variation": ["MJCFVariator", "PhysicsVariator", "Variation", "evaluate"],
 }  # fmt: skip
 MODULES = [
-    "arena", "constants", "define", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
+    "arena", "constants", "define", "engine", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
     "initializers.prop_initializer", "initializers.tcp_initializer", "initializers.utils",
     "observation.observable.base", "observation.observable.mjcf", "observation.updater",
     *(f"variation.{name}" for name in (

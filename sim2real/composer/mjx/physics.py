@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from sim2real.composer.c.binding import EmptyBinding
 from sim2real.composer.c.named import Named
 from sim2real.composer.mjx import constants, stepping, warp_fields
 from sim2real.composer.mjx.random import JaxRandomState
@@ -291,8 +292,6 @@ class MjxPhysics:
         """
         found, single = as_elements(elements)
         if not found:
-            from sim2real.composer.c.binding import EmptyBinding
-
             return EmptyBinding()
         layout.attributes(found[0].kind)
         ids = layout.resolve(self.host, found[0].kind, tuple(e.full_identifier for e in found))

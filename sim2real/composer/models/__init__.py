@@ -1,1 +1,1 @@
-"""What a world is made of: models that stay editable, how they are composed and compiled. Machinery."""
+"""Models that stay editable, and how they are composed and compiled. Machinery."""

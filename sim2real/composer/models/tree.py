@@ -127,7 +127,7 @@ class Tree(Scope, Generic[H]):
         self._handles: dict[Any, H] = {}
         self._order: dict[Any, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
-        self._sections: dict[str, Any] = {}  # those who have them put them here
+        self._sections: dict[str, Any] = {}  # by name; ``Model`` makes them, as they need what works on a tree
 
     @classmethod
     def owning(cls, spec: Any, document: Document | None = None) -> Self:
