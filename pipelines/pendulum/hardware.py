@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.hardware.bus import BusConfig, StateReading
-from sim2real.hardware.drive import VoltageDrive
+from sim2real.hardware.dynamixel.bus import BusConfig, StateReading
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
 from sim2real.robots import hardware
 from sim2real.stages.config import GateLimits
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import IO, Any, Final, Self, cast
 
 from sim2real.errors import HardwareLost
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.truth import Truth, read_truth
-from sim2real.hardware.wire import EmulatorConfig
 
 _LOGGER = logging.getLogger(__name__)
 _START_TIMEOUT_S: Final = 20.0

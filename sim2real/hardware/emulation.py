@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sim2real.errors import UsageError
-from sim2real.hardware import registers as reg
+from sim2real.hardware.dynamixel import registers as reg
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.hardware.dynamixel.wire import EmulatedBus, EmulatorConfig, truth_header
 from sim2real.hardware.plant import Plant, load_plant
 from sim2real.hardware.truth import TruthLog
-from sim2real.hardware.wire import EmulatedBus, EmulatorConfig, truth_header
 
 __all__ = ["EmulatedBus", "EmulatorConfig", "Plant", "main"]
 

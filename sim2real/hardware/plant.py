@@ -8,6 +8,7 @@ import importlib.util
 import math
 import sys
 from collections.abc import Callable, Mapping
+from enum import IntEnum
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Protocol, runtime_checkable
@@ -16,6 +17,16 @@ from sim2real.errors import UsageError
 from sim2real.hardware.truth import Kind, TruthLog
 
 STATE_PERIOD_S: Final = 0.005
+
+
+class OperatingMode(IntEnum):
+    """What a motor is driven by; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
+
+    OFF = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    PWM = 16
 
 
 class Plant(Protocol):
@@ -43,7 +54,7 @@ class Plant(Protocol):
 
         Args:
             servo_id: One of `servo_ids`.
-            mode: 16: PWM, 3: position, 1: velocity, 0: torque off.
+            mode: One of `OperatingMode`: PWM, position, velocity, or off.
             goal: PWM: fraction of the supply voltage in [-1, 1]; position: [rad]; velocity: [rad/s]; torque off: 0.
         """
         ...

@@ -10,8 +10,8 @@ from typing import Final, Self
 import numpy as np
 
 from sim2real.errors import HardwareLost, Sim2RealError
-from sim2real.hardware.bus import BusConfig, ServoBus, StateReading
-from sim2real.hardware.drive import Drive
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus, StateReading
+from sim2real.hardware.dynamixel.drive import Drive
 from sim2real.hardware.gate import GateConfig, SafetyGate
 from sim2real.hardware.plausibility import Plausibility
 

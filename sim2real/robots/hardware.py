@@ -14,12 +14,12 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.bus import BusConfig, StateReading
-from sim2real.hardware.drive import Drive
+from sim2real.hardware.dynamixel.bus import BusConfig, StateReading
+from sim2real.hardware.dynamixel.drive import Drive
 from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,12 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.wire import EmulatedBus, EmulatorConfig, truth_header
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.plant import load_plant
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode, load_plant
 from sim2real.hardware.truth import TruthLog, read_truth
-from sim2real.hardware.wire import EmulatedBus, EmulatorConfig, truth_header
 
 PLANTS = Path(__file__).parent / "plants.py"
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -149,7 +149,7 @@ def test_missing_port():
 def test_port_in_use(start_robot, open_bus):
     robot = start_robot()
     open_bus(robot)
-    code = f"from sim2real.hardware.bus import *; ServoBus(BusConfig({robot.port!r}))"
+    code = f"from sim2real.hardware.dynamixel.bus import *; ServoBus(BusConfig({robot.port!r}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "HardwareLost" in result.stderr
     assert "cannot be opened" in result.stderr
@@ -225,8 +225,8 @@ def test_a_servo_that_can_stops_by_itself_within_200_ms_of_the_hosts_kill(start_
     robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.01))
     code = f"""
 import time
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.plant import OperatingMode
 bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.1, guardian=False))
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)
@@ -315,8 +315,8 @@ def test_signals_end_with_torque_off(start_robot, number):
     robot = start_robot()
     code = f"""
 import signal, sys, time
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.plant import OperatingMode
 bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.0))
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)

@@ -13,12 +13,12 @@ import pytest
 from dynamixel_sdk import GroupBulkRead, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.protocol import Instruction, Parser, StatusError, build
 from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.plant import load_plant
-from sim2real.hardware.protocol import Instruction, Parser, StatusError, build
 from sim2real.hardware.truth import Kind, TruthLog, read_truth
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 

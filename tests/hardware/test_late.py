@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.emulation import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 

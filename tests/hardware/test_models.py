@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from sim2real.hardware import models
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.dynamixel import models
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.emulation import EmulatorConfig
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"
 

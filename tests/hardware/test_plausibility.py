@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.plausibility import Plausibility
 from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 

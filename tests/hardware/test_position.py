@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import ServoRig
 from sim2real.hardware.truth import Kind
 
@@ -223,8 +223,8 @@ def test_motors_stop_within_200_ms_of_the_hosts_kill(start_robot):
     code = f"""
 import time
 import numpy as np
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import PositionDrive
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.drive import PositionDrive
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
 rig = ServoRig(BusConfig({robot.port!r}, watchdog_s=0.1), GateConfig(**{GATE!r}), {IDS!r}, PositionDrive(800, 20.0))

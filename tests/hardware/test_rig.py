@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import VoltageDrive
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import ServoRig
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 

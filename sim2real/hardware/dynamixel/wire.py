@@ -15,12 +15,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from sim2real.hardware import registers as reg
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.protocol import BROADCAST_ID, Instruction, Packet, Parser, StatusError, build_status
+from sim2real.hardware.dynamixel.servo import Servo
 from sim2real.hardware.emulation import EmulatorConfig
-from sim2real.hardware.plant import Plant, PlantClock
-from sim2real.hardware.protocol import BROADCAST_ID, Instruction, Packet, Parser, StatusError, build_status
-from sim2real.hardware.registers import OperatingMode
-from sim2real.hardware.servo import Servo
+from sim2real.hardware.plant import OperatingMode, Plant, PlantClock
 from sim2real.hardware.truth import Kind, TruthLog
 
 __all__ = ["EmulatedBus", "EmulatorConfig", "truth_header"]

@@ -15,11 +15,13 @@ from typing import Final, Self
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.guardian import Guardian, torque_off_packet
-from sim2real.hardware.link import BusConfig, BusLink, Transaction, watchdog_message
-from sim2real.hardware.models import model
-from sim2real.hardware.registers import OperatingMode, Register
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.link import BusConfig, BusLink, Transaction, watchdog_message
+from sim2real.hardware.dynamixel.models import model
+from sim2real.hardware.dynamixel.off import torque_off_packet, torque_queries
+from sim2real.hardware.dynamixel.registers import Register
+from sim2real.hardware.guardian import Guardian
+from sim2real.hardware.plant import OperatingMode
 
 __all__ = ["BusConfig", "ServoBus", "StateReading", "Transaction"]
 
@@ -352,7 +354,8 @@ class ServoBus:
             return
         link = self._link
         if link.guardian is None:
-            link.guardian = Guardian(link.port.fd, self._ids, self.config.watchdog_s, self.config.reply_timeout_s)
+            packets, config = (torque_off_packet(self._ids), torque_queries(self._ids)), self.config
+            link.guardian = Guardian(link.port.fd, *packets, config.watchdog_s, config.reply_timeout_s)
         link.guardian.arm()
 
     def _ping(self, servo_id: int) -> int:

@@ -10,10 +10,11 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 
 from sim2real.errors import HardwareLost, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import ServoBus, StateReading
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import ServoBus, StateReading
+from sim2real.hardware.dynamixel.registers import Register
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode, Register
+from sim2real.hardware.plant import OperatingMode
 
 
 class Drive(Protocol):
