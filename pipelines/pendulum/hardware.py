@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2real.hardware.dynamixel.bus import BusConfig, StateReading
 from sim2real.hardware.dynamixel.drive import VoltageDrive
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
 from sim2real.robots import hardware

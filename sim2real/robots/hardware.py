@@ -17,7 +17,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.dynamixel.bus import BusConfig, StateReading
 from sim2real.hardware.dynamixel.drive import Drive
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.rig import ServoRig
 
@@ -33,7 +33,7 @@ class Embedded:
     """
 
     plant: str
-    emulator: EmulatorConfig = field(default_factory=EmulatorConfig)
+    emulator: Emulation
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -19,7 +19,7 @@ from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.dynamixel.bus import BusConfig, StateReading
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard

@@ -4,8 +4,10 @@ import pytest
 
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.wire import EmulatedBus, EmulatorConfig, truth_header
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.wire import EmulatedBus
 from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.planned import truth_header
 from sim2real.hardware.plant import OperatingMode, load_plant
 from sim2real.hardware.truth import TruthLog, read_truth
 
@@ -19,7 +21,7 @@ def start_robot(tmp_path):
 
     def start(plant="FirstOrder", config=None, **plant_args):
         path = tmp_path / f"truth{len(robots)}.bin"
-        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config, plant_args, path))
+        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
         return robots[-1]
 
     yield start

@@ -13,7 +13,7 @@ import pytest
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 

@@ -13,7 +13,7 @@ import pytest
 from sim2real.errors import SAFETY_STOP, SafetyStop
 from sim2real.hardware import guardian_process
 from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 

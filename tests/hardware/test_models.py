@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sim2real.hardware.dynamixel import models
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"
 

@@ -8,7 +8,7 @@ import pytest
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.plausibility import Plausibility
 from sim2real.hardware.rig import ServoRig

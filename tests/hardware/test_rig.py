@@ -10,7 +10,7 @@ from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.drive import VoltageDrive
-from sim2real.hardware.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import ServoRig

@@ -8,8 +8,8 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import BROADCAST_ID, Instruction, build
-from sim2real.hardware.emulation import EmulatorConfig
 from sim2real.hardware.plant import ConfigurablePlant
 from sim2real.hardware.truth import Kind
 
