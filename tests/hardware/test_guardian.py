@@ -199,7 +199,7 @@ def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
     for _ in range(50):
         bus.read_state()
         time.sleep(0.005)
-    asked = bus.transactions + bus.retries
+    asked = bus.counters.transactions + bus.counters.retries
     bus.close()  # which asks twice more, or so
     robot.stop()
     kinds = robot.truth().rows["kind"]

@@ -15,6 +15,7 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware.device import Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.port import WaitingPort
 from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
@@ -76,25 +77,6 @@ class BusConfig:
     def watchdog_count(self) -> int:
         """Value of the register Bus Watchdog: `watchdog_s` in units of 20 ms, at least 1 unless it is 0 (off)."""
         return max(1, round(self.watchdog_s / reg.WATCHDOG_UNIT_S)) if self.watchdog_s > 0.0 else 0
-
-
-@dataclass(frozen=True)
-class Transaction:
-    """The times of one instruction with its answer and its retries.
-
-    Args:
-        t_sent_ns: When the instruction that was answered was sent, CLOCK_MONOTONIC [ns].
-        lock_wait_ns: How long it waited for another thread's use of the bus [ns].
-        transfer_ns: Time from getting the bus to having the answer, retries included [ns].
-        retries: Number of times that the instruction was sent again.
-        late_ns: How much longer the answer took than its bytes need on the wire [ns].
-    """
-
-    t_sent_ns: int
-    lock_wait_ns: int
-    transfer_ns: int
-    retries: int
-    late_ns: int = 0
 
 
 class BusLink:
