@@ -252,21 +252,6 @@ while True:
     assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < 0.2
 
 
-def test_an_exception_ends_with_torque_off(open_arm):
-    rig, robot = open_arm()
-
-    def fail():
-        with rig:
-            rig.start()
-            run(rig, [0.1, 0.1, 0.1], 0.1)
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    _, modes, _ = effects(robot)
-    assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
-
-
 def test_a_joint_outside_of_what_servos_take_keeps_its_torque_off(open_arm, start_robot):
     robot = start_robot("Joints", start_rad=[0.0, 3.3, 0.0])
     rig, _ = open_arm(robot=robot)
