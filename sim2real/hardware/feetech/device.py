@@ -17,9 +17,9 @@ from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import POSITION, Alone, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.link import BusConfig, BusLink
+from sim2real.hardware.feetech.drive import StsDrive
+from sim2real.hardware.feetech.link import StsConfig, StsLink
 from sim2real.hardware.feetech.off import torque_off_packet, torque_queries
-from sim2real.hardware.feetech.settings import PositionSettings
 from sim2real.hardware.guardian import Guardian
 
 _LOGGER = logging.getLogger(__name__)
@@ -45,22 +45,22 @@ class StsServos(Device):
     Args:
         bus: Port and limits of the bus.
         joints: The joints, each with the servo that moves it; `read_calibration` makes them of LeRobot's file.
-        settings: How the servos follow a position.
+        drive: How the servos follow a position; its joints do not matter here.
 
     Raises:
         UsageError: There are no joints, or two with one servo.
     """
 
-    def __init__(self, bus: BusConfig, joints: Sequence[Joint], settings: PositionSettings | None = None) -> None:
+    def __init__(self, bus: StsConfig, joints: Sequence[Joint], drive: StsDrive | None = None) -> None:
         self.config = bus
         self.joints = tuple(joints)
         self._ids = tuple(joint.servo_id for joint in joints)
         if not joints or len(set(self._ids)) < len(self._ids):
             raise UsageError(f"servos {list(self._ids)}: there must be at least one, each with an id of its own")
-        self._settings = settings or PositionSettings()
+        self._drive = drive or StsDrive()
         self._zero = np.array([joint.zero_count for joint in joints])
         self._scale = np.array([joint.rad_per_count for joint in joints])
-        self._link: BusLink | None = None
+        self._link: StsLink | None = None
         self._off = torque_off_packet(self._ids)  # built here, as make_safe must not need any time
         self._models: dict[int, str] = {}
         self._unit_rad_s = np.ones(len(joints))
@@ -109,7 +109,7 @@ class StsServos(Device):
         if self._link is not None and not self._link.closed:
             raise UsageError("the servos are open already", hint="close them first")
         self._armed = self._halted = False
-        self._link = link = BusLink(self.config)
+        self._link = link = StsLink(self.config)
         atexit.register(self.close)
         try:
             for joint in self.joints:
@@ -211,8 +211,8 @@ class StsServos(Device):
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the duty that the P gain computes from the position error, ignoring the profile."""
         gear = np.abs(self._scale) / reg.RAD_PER_COUNT
-        most = self._settings.torque
-        return np.clip((command - position_rad) / gear * self._settings.p_gain * reg.P_GAIN_UNIT_PER_RAD, -most, most)
+        most = self._drive.torque
+        return np.clip((command - position_rad) / gear * self._drive.p_gain * reg.P_GAIN_UNIT_PER_RAD, -most, most)
 
     def check(self) -> None:
         """Raise SafetyStop if a servo has lost its settings, or its torque is not as it was left."""
@@ -222,7 +222,7 @@ class StsServos(Device):
         begin, end = reg.TORQUE_ENABLE.address, reg.TORQUE_LIMIT.end
         blocks, _ = self._opened().read_each(self._ids, begin, end - begin, "read of the settings")
         for servo_id, block in zip(self._ids, blocks, strict=True):
-            expected = {reg.TORQUE_ENABLE: 1, **self._settings.registers(self._phases[servo_id])}
+            expected = {reg.TORQUE_ENABLE: 1, **self._drive.registers(self._phases[servo_id])}
             for register, value in expected.items():
                 if not begin <= register.address < end:
                     continue
@@ -277,9 +277,9 @@ class StsServos(Device):
             guardian.end(confirmed=not left)
         atexit.unregister(self.close)
 
-    def _opened(self) -> BusLink:
+    def _opened(self) -> StsLink:
         if self._link is None:
-            raise UsageError("the servos are not open", hint="call open first")
+            raise HardwareLost(f"the servos on {self.config.port} are not open", hint="call open first")
         return self._link
 
     def _stop_if_halted(self) -> None:
@@ -287,7 +287,7 @@ class StsServos(Device):
         if self._halted:
             self.make_safe()
 
-    def _find(self, link: BusLink, joint: Joint) -> None:
+    def _find(self, link: StsLink, joint: Joint) -> None:
         """Find a joint's servo; raise HardwareLost if it is not there, another model, or calibrated differently."""
         servo_id = joint.servo_id
         where = f"{self.config.port} at {self.config.baud_rate} baud"
@@ -311,7 +311,7 @@ class StsServos(Device):
                 hint="this is another arm's calibration, or the servo was changed: run lerobot-calibrate",
             )
 
-    def _prepare(self, link: BusLink, joint: Joint) -> None:
+    def _prepare(self, link: StsLink, joint: Joint) -> None:
         """Write a servo's settings, with torque off, and check that it can go wherever its joint may."""
         servo_id = joint.servo_id
         phase = self._phases[servo_id] = link.read(servo_id, reg.PHASE)
@@ -327,13 +327,13 @@ class StsServos(Device):
             (reg.LOCK, 1),
             (reg.RESPONSE_LEVEL, 1),
             (reg.RETURN_DELAY_TIME, 0),
-            (reg.OPERATING_MODE, int(reg.OperatingMode.POSITION)),
+            (reg.OPERATING_MODE, int(reg.Mode.POSITION)),
         ):
             link.set(servo_id, register, value)
         self._write_settings(link, servo_id)
 
-    def _write_settings(self, link: BusLink, servo_id: int) -> None:
-        for register, value in self._settings.registers(self._phases[servo_id]).items():
+    def _write_settings(self, link: StsLink, servo_id: int) -> None:
+        for register, value in self._drive.registers(self._phases[servo_id]).items():
             link.set(servo_id, register, value)
 
     def _rest_count(self, joint: Joint, count: int) -> int:
@@ -350,3 +350,18 @@ class StsServos(Device):
     def _force_off(self, servo_id: int) -> None:
         if not self._opened().force(servo_id, reg.TORQUE_ENABLE, 0):
             raise HardwareLost(f"servo {servo_id} does not confirm that its torque is off", hint="cut its power")
+
+
+def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, silence_s: float) -> StsServos:
+    """Return servos on a port, not opened yet.
+
+    Args:
+        port: Device file of the port.
+        ids: The servos' ids, in the order of commands and measurements.
+        drive: How they follow a position, and the joints that they move.
+        baud_rate: Bits per second.
+        silence_s: Longest time without an instruction while torque is on [s].
+    """
+    joints = {joint.servo_id: joint for joint in drive.joints}
+    chosen = [joints.get(i) or Joint(f"servo {i}", i) for i in ids]
+    return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), chosen, drive)

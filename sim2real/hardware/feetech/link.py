@@ -17,7 +17,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 import serial
 from serial.tools import list_ports
@@ -46,7 +46,7 @@ _CONFIRMING_BYTES: Final = 14  # no other read is as long: what confirms cannot 
 
 
 @dataclass(frozen=True)
-class BusConfig:
+class StsConfig:
     """Port and time limits of the bus.
 
     Args:
@@ -80,7 +80,7 @@ class BusConfig:
                 raise UsageError(f"{name} = {getattr(self, name)} is no time")
 
 
-class BusLink:
+class StsLink:
     """Owner of port and lock. Every method may be called from any thread.
 
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
@@ -92,7 +92,7 @@ class BusLink:
         HardwareLost: The port cannot be opened, or another process uses it.
     """
 
-    def __init__(self, config: BusConfig) -> None:
+    def __init__(self, config: StsConfig) -> None:
         self.config = config
         self.transactions = 0
         self.retries = 0
@@ -117,7 +117,7 @@ class BusLink:
                 f"serial port {config.port} cannot be opened: {error}",
                 hint=f"serial ports here: {ports}; a port that is there but refused needs group 'dialout'",
             ) from error
-        self.fd: int = self._serial.fileno()
+        self.fd = cast(int, self._serial.fileno())
 
     def read(self, servo_id: int, register: Register, despite_alarm: bool = False) -> int:
         """Return a register's value in counts; of a goal that was withheld, that goal.

@@ -31,8 +31,8 @@ PHASE_ZERO_IS_FASTEST: Final = 0x08  # Goal Speed 0 means as fast as it can; if 
 PHASE_FULL_ANGLE: Final = 0x10  # positions count turns; if not set, they wrap from 4095 to 0
 
 
-class OperatingMode(IntEnum):
-    """Operating modes of the register Mode."""
+class Mode(IntEnum):
+    """Values of the register Operating Mode."""
 
     POSITION = 0
     VELOCITY = 1

@@ -81,9 +81,9 @@ class StsServo:
         if not self.get(reg.TORQUE_ENABLE) or self.alarms & self.get(reg.UNLOADING):
             return OperatingMode.OFF, 0.0
         mode = self.get(reg.OPERATING_MODE)
-        if mode == reg.OperatingMode.PWM:
+        if mode == reg.Mode.PWM:
             return OperatingMode.PWM, self.get(reg.GOAL_TIME) / reg.LOAD_FULL_SCALE
-        if mode == reg.OperatingMode.VELOCITY:
+        if mode == reg.Mode.VELOCITY:
             return OperatingMode.VELOCITY, self.get(reg.GOAL_SPEED) * reg.speed_unit_rad_s(self.get(reg.PHASE))
         low, high = self.get(reg.MIN_POSITION), self.get(reg.MAX_POSITION)
         count = self.get(reg.GOAL_POSITION)

@@ -8,7 +8,7 @@ import pytest
 
 from sim2real.hardware import emulator
 from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.device import BusConfig, StsServos
+from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.feetech.wire import StsBus
 from sim2real.hardware.planned import truth_header
@@ -78,10 +78,10 @@ def connect():
     """Open a device to emulated servos; patient, for the machine may be busy."""
     devices = []
 
-    def open_(robot, ids=IDS, joints=None, settings=None, **config):
+    def open_(robot, ids=IDS, joints=None, drive=None, **config):
         patience = {"max_silence_s": 1.0, "silence_s": 1.0}
         joints = joints or [Joint(f"joint{i}", i) for i in ids]
-        device = StsServos(BusConfig(robot.port, **{**patience, **config}), joints, settings)
+        device = StsServos(StsConfig(robot.port, **{**patience, **config}), joints, drive)
         devices.append(device)
         device.open()
         return device

@@ -11,9 +11,9 @@ from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.device import BusConfig, StsServos
+from sim2real.hardware.feetech.device import StsConfig, StsServos, servos
+from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.feetech.settings import PositionSettings
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.realtime
 
 def test_it_moves_and_measures(serve, connect):
     robot = serve()
-    device = connect(robot, settings=PositionSettings(p_gain=254))
+    device = connect(robot, drive=StsDrive(p_gain=254))
     device.enable()
     assert device.rest() == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
     goal = device.rest() + np.array([0.2, 0.1, -0.1])
@@ -50,8 +50,8 @@ def test_one_servo_confirms_its_goals(serve, connect):
 
 def test_settings_are_read_back_and_nothing_is_made_permanent(serve, connect):
     robot = serve(config=StsEmulation(return_delay_us=500))
-    settings = PositionSettings(p_gain=20, d_gain=5, i_gain=1, speed_rad_s=2.0, acceleration_rad_s2=10.0, torque=0.5)
-    device = connect(robot, settings=settings)
+    drive = StsDrive(p_gain=20, d_gain=5, i_gain=1, speed_rad_s=2.0, acceleration_rad_s2=10.0, torque=0.5)
+    device = connect(robot, drive=drive)
     device.enable()
     expected = {
         reg.P_GAIN: 20, reg.D_GAIN: 5, reg.I_GAIN: 1, reg.GOAL_SPEED: 1304, reg.ACCELERATION: 65, reg.TORQUE_LIMIT: 500,
@@ -69,7 +69,7 @@ def test_settings_are_read_back_and_nothing_is_made_permanent(serve, connect):
 def test_speeds_of_servos_with_the_other_unit(serve, connect):
     robot = serve("Ramp", ids=[1], speed_rad_s=1.0)
     robot.bus.servos[1].put(reg.PHASE, 0)
-    device = connect(robot, ids=(1,), settings=PositionSettings(speed_rad_s=3.0))
+    device = connect(robot, ids=(1,), drive=StsDrive(speed_rad_s=3.0))
     assert device.measure().velocity_rad_s == pytest.approx([1.0], abs=0.04)
     assert robot.bus.servos[1].get(reg.GOAL_SPEED) == 39  # of 0.732 rpm
 
@@ -155,13 +155,21 @@ def test_a_setting_that_a_servo_does_not_keep(serve, connect):
         connect(robot, joints=[Joint("pan", 1), Joint("lift", 2)])
 
 
+def test_servos_by_the_devices_name(serve):
+    drive = StsDrive(joints=(Joint("lift", 2, direction=-1), Joint("elbow", 3)))
+    with servos(serve().port, (1, 2), drive, baud_rate=1_000_000, silence_s=0.2) as device:
+        assert device.silence_s == 0.2
+        assert [joint.name for joint in device.joints] == ["servo 1", "lift"]
+        assert device.measure().position_rad == pytest.approx([0.5, 0.8], abs=reg.RAD_PER_COUNT)
+
+
 def test_usage_that_makes_no_sense(serve, connect):
-    bus = BusConfig("/dev/ttyNONE")
+    bus = StsConfig("/dev/ttyNONE")
     with pytest.raises(UsageError, match=r"servos \[1, 1\]: there must be at least one, each with an id of its own"):
         StsServos(bus, [Joint("a", 1), Joint("b", 1)])
     with pytest.raises(HardwareLost, match=r"(?s)/dev/ttyNONE cannot be opened.*hint: serial ports here:"):
         StsServos(bus, [Joint("a", 1)]).open()
-    with pytest.raises(UsageError, match="not open"):
+    with pytest.raises(HardwareLost, match="not open"):
         StsServos(bus, [Joint("a", 1)]).measure()
     StsServos(bus, [Joint("a", 1)]).close()
     robot = serve()
@@ -178,10 +186,10 @@ def test_usage_that_makes_no_sense(serve, connect):
 @pytest.mark.parametrize("bad", [{"p_gain": 255}, {"speed_rad_s": 0.0}, {"acceleration_rad_s2": -1.0}, {"torque": 1.5}])
 def test_settings_that_make_no_sense(bad):
     with pytest.raises(UsageError, match=next(iter(bad))):
-        PositionSettings(**bad)
+        StsDrive(**bad)
 
 
 @pytest.mark.parametrize("bad", [{"baud_rate": 2_000_000}, {"silence_s": math.nan}, {"max_silence_s": -1.0}])
 def test_limits_that_make_no_sense(bad):
     with pytest.raises(UsageError, match=next(iter(bad)).replace("_", "[_ ]")):
-        BusConfig("/dev/null", **bad)
+        StsConfig("/dev/null", **bad)

@@ -209,9 +209,9 @@ HOST = """
 import os, signal, sys, time
 import numpy as np
 from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.device import BusConfig, StsServos
+from sim2real.hardware.feetech.device import StsConfig, StsServos
 
-config = BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0, guardian={guardian})
+config = StsConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0, guardian={guardian})
 device = StsServos(config, [Joint(f"joint{{i}}", i) for i in (1, 2, 3)])
 
 def die_in_the_middle_of_a_packet(number, frame):

@@ -155,7 +155,7 @@ def test_goals_are_cut_to_the_limits_and_bad_values_dropped_without_a_word(make_
 
 def test_other_modes(make_bench):
     bench = make_bench("FirstOrder")
-    for mode, register, value in ((reg.OperatingMode.PWM, reg.GOAL_TIME, -500), (1, reg.GOAL_SPEED, 1000)):
+    for mode, register, value in ((reg.Mode.PWM, reg.GOAL_TIME, -500), (1, reg.GOAL_SPEED, 1000)):
         bench.ask(write(reg.OPERATING_MODE, mode))
         bench.ask(write(register, value))
         bench.ask(write(reg.TORQUE_ENABLE, 1))

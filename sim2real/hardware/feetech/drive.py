@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers as reg
+from sim2real.hardware.feetech.calibration import Joint
 from sim2real.hardware.feetech.registers import Register
 
 
 @dataclass(frozen=True)
-class PositionSettings:
+class StsDrive:
     """How the servos follow a position.
 
     Args:
@@ -21,6 +22,8 @@ class PositionSettings:
         speed_rad_s: Speed at which a servo's setpoint moves to its goal; inf: the setpoint is the goal.
         acceleration_rad_s2: How fast that speed may change, rounded to a multiple of 0.15 rad/s^2; inf: at once.
         torque: Largest fraction of the torque that a servo may use, in [0, 1].
+        joints: What the servos move, e.g. of `read_calibration`; a servo that moves none of them is a joint by itself,
+            with its zero at 2048 counts.
     """
 
     p_gain: int = 16
@@ -29,6 +32,7 @@ class PositionSettings:
     speed_rad_s: float = math.inf
     acceleration_rad_s2: float = math.inf
     torque: float = 1.0
+    joints: tuple[Joint, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the values fit the registers."""
