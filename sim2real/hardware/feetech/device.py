@@ -29,6 +29,8 @@ _SOURCE: Final = "Feetech, STS Series Servo Memory Table: no register for it; no
 _STATE: Final = (reg.PRESENT_POSITION, reg.PRESENT_SPEED, reg.PRESENT_LOAD)
 _SAFE_REPEATS: Final = 5
 _SAFE_PAUSE_S: Final = 0.002
+_SCANNED: Final = 20
+"""Ids that are looked for if a servo does not answer; all 254 would take 2 s."""
 _BEYOND_RAD: Final = 0.1
 """How far outside its range a joint may be when torque goes on [rad]; it is pulled back to the end of the range."""
 
@@ -157,15 +159,17 @@ class StsServos(Device):
                 link.guardian = Guardian(link.fd, *packets, self.config.silence_s, self.config.reply_timeout_s)
             link.guardian.arm()
         goals = []
-        for joint in self.joints:
-            self._write_settings(link, joint.servo_id)
-            goals.append(self._rest_count(joint, link.read(joint.servo_id, reg.PRESENT_POSITION)))
-            # Before torque goes on; some firmware switches it on by itself at this moment, where it stands.
-            link.set(joint.servo_id, reg.GOAL_POSITION, goals[-1])
-            link.write(joint.servo_id, reg.TORQUE_ENABLE, 1)
-        self._rest = (np.array(goals) - self._zero) * self._scale
-        self._armed = True
-        self._stop_if_halted()
+        try:
+            for joint in self.joints:
+                self._write_settings(link, joint.servo_id)
+                goals.append(self._rest_count(joint, link.read(joint.servo_id, reg.PRESENT_POSITION)))
+                # Before torque goes on; some firmware may switch it on by itself at this moment, where it stands.
+                link.set(joint.servo_id, reg.GOAL_POSITION, goals[-1])
+                link.write(joint.servo_id, reg.TORQUE_ENABLE, 1)
+            self._rest = (np.array(goals) - self._zero) * self._scale
+            self._armed = True
+        finally:
+            self._stop_if_halted()
 
     def rest(self) -> np.ndarray:
         """Return the angles that the servos hold since `enable` [rad], ``(n,)``."""
@@ -295,7 +299,8 @@ class StsServos(Device):
             link.ping(servo_id)
         except HardwareLost as error:
             raise HardwareLost(
-                f"servo {servo_id} (joint {joint.name!r}) does not answer on {where}",
+                f"servo {servo_id} (joint {joint.name!r}) does not answer on {where}. "
+                f"Available of 0 to {_SCANNED - 1}: {[i for i in range(_SCANNED) if link.answers(i)]}",
                 hint="check power, cable, id and baud rate; lerobot-setup-motors sets ids",
             ) from error
         number = link.read(servo_id, reg.MODEL_NUMBER, despite_alarm=True)
@@ -324,8 +329,8 @@ class StsServos(Device):
                 hint="run lerobot-calibrate, or narrow the joint's range",
             )
         for register, value in (
-            (reg.LOCK, 1),
             (reg.RESPONSE_LEVEL, 1),
+            (reg.LOCK, 1),
             (reg.RETURN_DELAY_TIME, 0),
             (reg.OPERATING_MODE, int(reg.Mode.POSITION)),
         ):

@@ -208,6 +208,11 @@ class StsLink:
         packet = build(servo_id, Instruction.PING)
         self._exchange(lambda: (packet, 0), (servo_id,), f"ping of servo {servo_id}", despite_alarm=True)
 
+    def answers(self, servo_id: int) -> bool:
+        """Return whether a servo answers a single ping."""
+        with self.hold():
+            return self._attempt(build(servo_id, Instruction.PING), (servo_id,), 0) is not None
+
     def force(self, servo_id: int, register: Register, value: int) -> bool:
         """Write a register despite a held lock, missing answers or alarms, until it reads back. Never raises.
 

@@ -103,12 +103,12 @@ RESPONSE_LEVEL = _eeprom("response_level", 8, 1, 0, 1, 1)
 MIN_POSITION = _eeprom("min_position", 9, 2, 0, 4094, 0)
 MAX_POSITION = _eeprom("max_position", 11, 2, 0, 4095, 4095)
 MAX_TEMPERATURE = _eeprom("max_temperature", 13, 1, 0, 100, 70)
-MAX_VOLTAGE = _eeprom("max_voltage", 14, 1, 0, 254, 140)
+MAX_VOLTAGE = _eeprom("max_voltage", 14, 1, 0, 254, 140)  # assumed: that of a servo for 12 V; in units of 0.1 V
 MIN_VOLTAGE = _eeprom("min_voltage", 15, 1, 0, 254, 40)
 MAX_TORQUE = _eeprom("max_torque", 16, 2, 0, 1000, 1000)
 # Default assumed: the protocol manual's examples have speeds in counts/s; LeRobot leaves speeds alone, and servos move.
 PHASE = _eeprom("phase", 18, 1, 0, 254, PHASE_COUNTS_PER_S | PHASE_ZERO_IS_FASTEST)
-UNLOADING = _eeprom("unloading", 19, 1, 0, 254, 0b101111)
+UNLOADING = _eeprom("unloading", 19, 1, 0, 254, 0b101111)  # alarms that switch the motor off; assumed: all
 P_GAIN = _eeprom("p_gain", 21, 1, 0, 254, 32)  # defaults of the gains: LeRobot, so101_follower.py
 D_GAIN = _eeprom("d_gain", 22, 1, 0, 254, 32)
 I_GAIN = _eeprom("i_gain", 23, 1, 0, 254, 0)

@@ -5,10 +5,11 @@ import time
 
 import numpy as np
 import pytest
-from conftest import IDS
+from sts_bench import IDS, PLANTS
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
+from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos, servos
@@ -130,7 +131,11 @@ def test_what_they_do_without_a_host_is_said(serve, connect):
         ((reg.MODEL_NUMBER, 1284), Joint("pan", 1), r"servo 1 is model 1284.*Available: STS3215 \(777\)"),
         ((reg.HOMING_OFFSET, -7), Joint("pan", 1, homing_offset=5), "homing offset -7, its calibration says 5"),
         ((reg.MAX_POSITION, 3000), Joint("pan", 1), "goes from 0 to 3000 counts only, its joint from 0 to 4095"),
-        ((reg.ID, 1), Joint("pan", 7), r"(?s)servo 7 \(joint 'pan'\) does not answer on .* at 1000000 baud.*hint: "),
+        (
+            (reg.ID, 1),
+            Joint("pan", 7),
+            r"(?s)servo 7 \(joint 'pan'\) does not answer on .* at 1000000 baud.*: \[1, 2, 3\].*hint: ",
+        ),
     ],
 )
 def test_servos_that_do_not_fit_their_joints(serve, connect, change, joint, said):
@@ -153,6 +158,37 @@ def test_a_setting_that_a_servo_does_not_keep(serve, connect):
     robot.bus.servos[2].write = lambda address, data: False
     with pytest.raises(HardwareLost, match="servo 2 does not keep its settings: p_gain is 32 after 16 was written"):
         connect(robot, joints=[Joint("pan", 1), Joint("lift", 2)])
+
+
+def test_servos_that_answer_reads_only_are_told_to_answer_all(serve, connect):
+    robot = serve()
+    for servo in robot.bus.servos.values():
+        servo.put(reg.RESPONSE_LEVEL, 0)
+        servo.put(reg.LOCK, 0)
+    device = connect(robot)
+    device.enable()
+    device.check()
+
+
+def test_the_emulator_as_a_process_keeps_its_latencies(tmp_path, connect):
+    """The robot that stages get; the position tells when it was sampled, 0.4 ms a count."""
+    config = StsEmulation(sensing_latency_s=0.004, actuation_latency_s=0.006)
+    plant = {"ids": [1, 2], "speed_rad_s": 4.0}
+    with EmbeddedRobot(f"{PLANTS}:Ramp", config, plant, tmp_path / "truth.bin") as robot:
+        device = connect(robot, joints=[Joint("a", 1, zero_count=0), Joint("b", 2, zero_count=0)])
+        readings = [device.measure() for _ in range(30)]
+        device.enable()
+        device.command(device.rest())
+        device.close()
+        time.sleep(0.02)
+        robot.stop()
+        truth = robot.truth()
+    means = truth.mean_latencies()
+    assert means["actuation_s"] == pytest.approx(0.0062, abs=0.0005)
+    assert means["sensing_s"] == pytest.approx(0.0043 + truth.lateness_s().mean(), abs=0.0005)
+    sent_s = 1e-9 * np.array([r.transaction.t_sent_ns - truth.header["start_ns"] for r in readings])
+    sampled_s = np.array([r.position_rad for r in readings]) / 4.0
+    assert np.median(sent_s[:, None] - sampled_s) == pytest.approx(0.004 - 0.0001, abs=0.001)
 
 
 def test_servos_by_the_devices_name(serve):

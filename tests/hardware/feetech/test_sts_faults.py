@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import IDS
+from sts_bench import IDS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError
 from sim2real.hardware.feetech import registers as reg
