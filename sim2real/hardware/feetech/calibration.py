@@ -97,11 +97,11 @@ def read_calibration(path: Path | str) -> tuple[Joint, ...]:
     """
     path = Path(path)
     try:
-        motors = json.loads(path.read_text(encoding="utf-8"))
+        motors = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
     except OSError as error:
         raise UsageError(f"calibration file {path} cannot be read: {error.strerror}", hint=_HINT) from error
     except ValueError as error:
-        raise UsageError(f"calibration file {path} is no JSON: {error}", hint=_HINT) from error
+        raise UsageError(f"calibration file {path} is not valid JSON: {error}", hint=_HINT) from error
     if not isinstance(motors, dict) or not motors:
         raise UsageError(f"calibration file {path} holds no motors by name", hint=_HINT)
     joints = tuple(_joint(path, name, entry) for name, entry in motors.items())
@@ -116,6 +116,14 @@ def read_calibration(path: Path | str) -> tuple[Joint, ...]:
 
 
 _HINT: Final = "lerobot-calibrate writes one"
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object as a dict; raise ValueError if it has a name twice, of which one would be lost."""
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{twice[0]!r} is there twice")
+    return dict(pairs)
 
 
 def _joint(path: Path, name: str, entry: Any) -> Joint:

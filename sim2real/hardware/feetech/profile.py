@@ -27,20 +27,18 @@ class _Setpoint:
     top_rad_s: float = math.inf
     gain_rad_s2: float = math.inf
 
-    def advance(self, step_s: float) -> float:
-        """Move for a step of time, so that it comes to rest at the goal; return where it is [rad]."""
-        left = (self.goal_rad if self.goal_rad is not None else self.at_rad) - self.at_rad
+    def advance(self, goal_rad: float, step_s: float) -> float:
+        """Move towards the goal for a step of time, so that it comes to rest there; return where it is [rad]."""
+        left = goal_rad - self.at_rad
         change = self.gain_rad_s2 * step_s
-        # Fastest speed from which it can still stop at the goal, one step from now on.
-        stopping = math.inf
+        stopping = math.inf  # the fastest speed from which it can still stop at the goal, one step from now on
         if math.isfinite(change):
             stopping = math.sqrt(2.0 * self.gain_rad_s2 * abs(left) + change**2 / 4) - change / 2
         wanted = math.copysign(min(self.top_rad_s, stopping, abs(left) / step_s), left)
         speed = min(max(wanted, self.speed_rad_s - change), self.speed_rad_s + change)
-        if abs(left - speed * step_s) < 1e-12 or (abs(speed) <= change and abs(left) <= abs(speed) * step_s):
-            self.at_rad, self.speed_rad_s = self.at_rad + left, 0.0
-        else:
-            self.at_rad, self.speed_rad_s = self.at_rad + speed * step_s, speed
+        there = abs(left - speed * step_s) < 1e-12 or (abs(speed) <= change and abs(left) <= abs(speed) * step_s)
+        self.speed_rad_s = 0.0 if there else speed
+        self.at_rad = goal_rad if there else self.at_rad + speed * step_s
         return self.at_rad
 
 
@@ -60,8 +58,9 @@ class ProfiledPlant:
     def advance(self, t_s: float) -> None:
         """Move the setpoints and integrate the plant up to a time [s]."""
         for servo_id, setpoint in self._setpoints.items():
-            if setpoint.goal_rad is not None and setpoint.at_rad != setpoint.goal_rad:
-                self._plant.command(servo_id, OperatingMode.POSITION, setpoint.advance(t_s - self._t_s))
+            goal_rad = setpoint.goal_rad
+            if goal_rad is not None and goal_rad != setpoint.at_rad:
+                self._plant.command(servo_id, OperatingMode.POSITION, setpoint.advance(goal_rad, t_s - self._t_s))
         self._t_s = t_s
         self._plant.advance(t_s)
 

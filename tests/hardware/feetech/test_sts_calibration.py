@@ -70,7 +70,8 @@ def entry(**changes):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("{", "is no JSON"),
+        ("{", "is not valid JSON"),
+        ('{"elbow": {}, "elbow": {}}', "'elbow' is there twice"),
         ([1], "holds no motors by name"),
         ({}, "holds no motors by name"),
         ({"elbow": 3}, "motor 'elbow' is no object"),
