@@ -11,7 +11,10 @@ from sim2real.hardware.device import Device
 from sim2real.hardware.plant import load_named
 
 ENTRY_POINT_GROUP: Final = "sim2real.devices"
-OWN: Final = {"dynamixel": "sim2real.hardware.dynamixel.device:servos"}
+OWN: Final = {
+    "dynamixel": "sim2real.hardware.dynamixel.device:servos",
+    "feetech": "sim2real.hardware.feetech.device:servos",
+}
 """Name -> ``module:callable`` of the devices that come with sim2real."""
 
 

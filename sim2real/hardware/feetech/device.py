@@ -358,7 +358,7 @@ class StsServos(Device):
 
 
 def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, silence_s: float) -> StsServos:
-    """Return servos on a port, not opened yet.
+    """Return servos on a port, not opened yet; what the name ``feetech`` stands for.
 
     Args:
         port: Device file of the port.

@@ -12,10 +12,11 @@ from sim2real.hardware.device import Alone
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.device import StsConfig, StsServos, servos
+from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.registry import load_device
 from sim2real.hardware.truth import Kind
 
 pytestmark = pytest.mark.realtime
@@ -192,6 +193,7 @@ def test_the_emulator_as_a_process_keeps_its_latencies(tmp_path, connect):
 
 
 def test_servos_by_the_devices_name(serve):
+    servos = load_device("feetech")
     drive = StsDrive(joints=(Joint("lift", 2, direction=-1), Joint("elbow", 3)))
     with servos(serve().port, (1, 2), drive, baud_rate=1_000_000, silence_s=0.2) as device:
         assert device.silence_s == 0.2
