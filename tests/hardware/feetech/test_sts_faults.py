@@ -186,6 +186,23 @@ def test_no_goal_switches_torque_on_again_once_made_safe(serve, connect):
     assert_off(robot)
 
 
+def test_a_goal_that_was_on_its_way_is_followed_by_torque_off(serve, connect, monkeypatch):
+    robot = serve()
+    device = connect(robot)
+    device.enable()
+    time.sleep(0.02)
+    write_each = device._link.write_each
+
+    def after_make_safe(register, values):
+        device.make_safe()
+        return write_each(register, values)
+
+    monkeypatch.setattr(device._link, "write_each", after_make_safe)
+    device.command(device.rest())
+    time.sleep(0.02)
+    assert_off(robot)
+
+
 def test_make_safe_needs_no_lock(serve, connect):
     robot = serve()
     device = connect(robot)
