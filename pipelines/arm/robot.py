@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.robots.hardware import Embedded
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo_robot import ServoRobot, Servos

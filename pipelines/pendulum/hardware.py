@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.hardware.bus import BusConfig, StateReading
-from sim2real.hardware.drive import VoltageDrive
+from sim2real.hardware.device import Reading
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.rig import Rig
 from sim2real.robots import hardware
 from sim2real.stages.config import GateLimits
 
@@ -57,9 +59,13 @@ class Session(hardware.ServoSession):
             joints=("hinge",),
             stuck_effort=limits.stuck_effort,
         )
-        bus = BusConfig(port, BAUD_RATE, watchdog_s=limits.servo_watchdog_s)
         embedded = hardware.Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
-        super().__init__(bus, gate, [SERVO_ID], VoltageDrive(SUPPLY_V), embedded, truth_path, seed)
+
+        def device(port: str) -> DynamixelServos:
+            bus = BusConfig(port, BAUD_RATE, watchdog_s=limits.servo_watchdog_s)
+            return DynamixelServos(bus, [SERVO_ID], VoltageDrive(SUPPLY_V))
+
+        super().__init__(port, device, gate, embedded, truth_path, seed)
 
 
 class ServoSensor(hardware.ServoSensor):
@@ -72,7 +78,7 @@ class ServoSensor(hardware.ServoSensor):
         **options: As of ``BaseNode``.
     """
 
-    def __init__(self, name: str, rate: float, rig: ServoRig, **options: Any) -> None:
+    def __init__(self, name: str, rate: float, rig: Rig, **options: Any) -> None:
         hanging = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
         super().__init__(name, rate, rig, _measurement, hanging, **options)
 
@@ -87,7 +93,7 @@ class ServoActuator(hardware.ServoActuator):
         **options: As of ``BaseNode``.
     """
 
-    def __init__(self, name: str, rate: float, rig: ServoRig, **options: Any) -> None:
+    def __init__(self, name: str, rate: float, rig: Rig, **options: Any) -> None:
         super().__init__(name, rate, rig, "action", Command, **options)
 
 
@@ -105,5 +111,5 @@ class Excitation(hardware.Excitation):
         super().__init__(name, rate, np.reshape(signal, (-1, 1)), Command, **options)
 
 
-def _measurement(reading: StateReading) -> Measurement:
+def _measurement(reading: Reading) -> Measurement:
     return Measurement(th=reading.position_rad[0] - UPRIGHT_RAD, thdot=reading.velocity_rad_s[0])

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import IO, Any, Final, Self, cast
 
 from sim2real.errors import HardwareLost
+from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.truth import Truth, read_truth
-from sim2real.hardware.wire import EmulatorConfig
 
 _LOGGER = logging.getLogger(__name__)
 _START_TIMEOUT_S: Final = 20.0
@@ -42,7 +42,7 @@ class EmbeddedRobot:
     def __init__(
         self,
         plant: str,
-        config: EmulatorConfig | None = None,
+        config: Emulation,
         plant_args: Mapping[str, Any] | None = None,
         truth_path: Path | str | None = None,
     ) -> None:
@@ -53,8 +53,9 @@ class EmbeddedRobot:
         self._messages_path = folder / "messages.txt"
         # -P: files in the working directory, which is the user's, must not be imported as modules.
         command = [sys.executable, "-P", "-m", "sim2real.hardware.emulator", "--until-stdin-closes", "--plant", plant]
+        command += ["--emulation", f"{type(config).__module__}:{type(config).__qualname__}"]
         command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
-        for name, value in asdict(config or EmulatorConfig()).items():
+        for name, value in asdict(config).items():
             if value is not None:
                 command.append(f"--{name.replace('_', '-')}={value!r}")
         with self._messages_path.open("wb") as messages:

@@ -1,15 +1,22 @@
-"""Settings of the emulated bus and servos: latencies, firmware and faults."""
+"""Settings of an emulated bus and its servos that do not depend on the protocol: latencies and faults."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from sim2real.errors import UsageError
-from sim2real.hardware import registers as reg
+
+if TYPE_CHECKING:
+    from sim2real.hardware.planned import PlannedBus
+    from sim2real.hardware.plant import Plant
+    from sim2real.hardware.truth import TruthLog
 
 
 @dataclass(frozen=True)
-class EmulatorConfig:
+class Emulation(ABC):
     """Settings of the emulated bus and servos; times of faults count from the emulator's start.
 
     Args:
@@ -24,11 +31,9 @@ class EmulatorConfig:
         corrupt: Probability that an answer has a corrupted byte.
         encoder_counts: Resolution of the encoder [counts per revolution].
         plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
-        model_number: The servos' model number; their firmware behaves as that of the model.
         seed: Seed of jitter, loss and corruption.
         silent_after_s: Time from which nothing is received or answered, as with an unplugged cable [s]; None: never.
         overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never.
-        watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
         late: Probability that an answer is delayed, as by a USB adapter; later answers wait for it.
         late_s: That delay [s].
         wild: Probability that a read returns a position that no motor can reach, with a correct checksum.
@@ -43,13 +48,11 @@ class EmulatorConfig:
     return_delay_us: int = 500
     reply_loss: float = 0.0
     corrupt: float = 0.0
-    encoder_counts: int = reg.COUNTS_PER_REVOLUTION
+    encoder_counts: int = 4096
     plant_step_s: float = 0.0005
-    model_number: int = 1060
     seed: int = 0
     silent_after_s: float | None = None
     overload_after_s: float | None = None
-    watchdog_stops: bool | None = None
     late: float = 0.0
     late_s: float = 0.009
     wild: float = 0.0
@@ -74,3 +77,14 @@ class EmulatorConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
+
+    @abstractmethod
+    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
+        """Return the emulated bus with these settings.
+
+        Args:
+            plant: The mechanism.
+            truth: Log of true states and latencies.
+            send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+            start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
+        """

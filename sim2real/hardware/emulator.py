@@ -1,6 +1,7 @@
 """The emulator process: servos behind a pseudo-terminal, in real time.
 
-    python -m sim2real.hardware.emulator --plant my_robot/plant.py:Plant --truth truth.bin --sensing-latency-s 0.004
+    python -m sim2real.hardware.emulator --emulation sim2real.hardware.dynamixel.emulation:EmulatorConfig \
+        --plant my_robot/plant.py:Plant --truth truth.bin --sensing-latency-s 0.004
 
 prints one line of JSON with the port when it is ready, and runs until SIGTERM.
 """
@@ -24,11 +25,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.hardware.plant import Plant, load_plant
+from sim2real.hardware.emulation import Emulation
+from sim2real.hardware.planned import PlannedBus, truth_header
+from sim2real.hardware.plant import load_named, load_plant
 from sim2real.hardware.truth import TruthLog
-from sim2real.hardware.wire import EmulatedBus, EmulatorConfig, truth_header
-
-__all__ = ["EmulatedBus", "EmulatorConfig", "Plant", "main"]
 
 _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
@@ -77,7 +77,7 @@ class _StopFlag:
         self.is_set = True
 
 
-def _serve(bus: EmulatedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_fd: int | None) -> None:
+def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_fd: int | None) -> None:
     """Run the bus until `stop` is set; with `parent_fd`, also until the other end of that pipe is closed."""
     inputs = [pty.fd] if parent_fd is None else [pty.fd, parent_fd]
     while not stop.is_set:
@@ -109,15 +109,24 @@ def _keep_time() -> None:
     gc.disable()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m sim2real.hardware.emulator", description=__doc__)
-    parser.add_argument("--plant", required=True, metavar="MODULE_OR_FILE:NAME", help="what is called to get the plant")
+def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with a flag for each setting of the emulation that it names."""
+    parser = argparse.ArgumentParser(prog="python -m sim2real.hardware.emulator", description=__doc__, add_help=False)
+    place = "MODULE_OR_FILE:NAME"
+    parser.add_argument("--emulation", required=True, metavar=place, help="the settings, which say what bus it is")
+    named = parser.parse_known_args(arguments)[0]
+    settings = load_named(named.emulation, "emulation")
+    if not (isinstance(settings, type) and issubclass(settings, Emulation)):
+        raise UsageError(f"emulation {named.emulation!r} is no class of settings of an emulated bus")
+    parser.set_defaults(settings=settings)
+    parser.add_argument("-h", "--help", action="help")
+    parser.add_argument("--plant", required=True, metavar=place, help="what is called to get the plant")
     parser.add_argument("--plant-args", default="{}", metavar="JSON", help="keyword arguments of that call")
     parser.add_argument("--truth", type=Path, required=True, metavar="FILE", help="where the truth is logged")
     parser.add_argument(
         "--until-stdin-closes", action="store_true", help="also stop when stdin ends, as when the parent dies"
     )
-    for field in fields(EmulatorConfig):
+    for field in fields(settings):
         flag = f"--{field.name.replace('_', '-')}"
         parser.add_argument(flag, type=_TYPES[str(field.type).split()[0]], default=field.default)
     return parser
@@ -135,14 +144,14 @@ def _plant_arguments(text: str) -> dict[str, Any]:
 
 def _run(options: argparse.Namespace) -> None:
     stop = _StopFlag()
-    config = EmulatorConfig(**{field.name: getattr(options, field.name) for field in fields(EmulatorConfig)})
+    config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
     plant = load_plant(options.plant, _plant_arguments(options.plant_args))
     pty = _Pty()
     _keep_time()
     start_ns = time.monotonic_ns()
     truth = TruthLog(options.truth, truth_header(plant, config, start_ns))
     try:
-        bus = EmulatedBus(plant, config, truth, pty.send, start_ns)
+        bus = config.bus(plant, truth, pty.send, start_ns)
         ready = {"port": pty.port, "pid": os.getpid(), "truth": str(options.truth.resolve())}
         print(json.dumps(ready), flush=True)
         _serve(bus, pty, truth, stop, sys.stdin.fileno() if options.until_stdin_closes else None)
@@ -152,9 +161,8 @@ def _run(options: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the emulator's command line; return its exit code."""
-    options = _parser().parse_args(arguments)
     try:
-        _run(options)
+        _run(_parser(arguments).parse_args(arguments))
     except Sim2RealError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

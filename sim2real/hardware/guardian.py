@@ -15,8 +15,6 @@ from typing import Final
 
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware import guardian_process as process
-from sim2real.hardware import registers as reg
-from sim2real.hardware.protocol import ALERT_BIT, BROADCAST_ID, Instruction, build, build_status
 
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
@@ -28,13 +26,6 @@ _UNHEARD_BYTES: Final = 20_000
 _DEAD: Final = "the guardian has died: nothing would take the torque off if this process died too"
 
 
-def torque_off_packet(ids: Sequence[int]) -> bytes:
-    """Return the instruction that takes the torque of all servos off, which they do not answer."""
-    register = reg.TORQUE_ENABLE
-    head = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
-    return build(BROADCAST_ID, Instruction.SYNC_WRITE, head + b"".join(bytes((i, 0)) for i in ids))
-
-
 class Guardian:
     """A separate process that takes the torque off when this one dies, or gives no sign of life while torque is on.
 
@@ -43,7 +34,8 @@ class Guardian:
 
     Args:
         port_fd: File descriptor of the open port.
-        ids: The servos.
+        off: The packet that takes the torque of all servos off.
+        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
             counts.
         answer_s: How long a servo's answer may take [s].
@@ -52,7 +44,14 @@ class Guardian:
         HardwareLost: It does not start.
     """
 
-    def __init__(self, port_fd: int, ids: Sequence[int], silence_s: float, answer_s: float) -> None:
+    def __init__(
+        self,
+        port_fd: int,
+        off: bytes,
+        servos: Sequence[tuple[bytes, Sequence[bytes]]],
+        silence_s: float,
+        answer_s: float,
+    ) -> None:
         self._silence_s = silence_s
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = 0.0
@@ -61,21 +60,15 @@ class Guardian:
         self._said = b""
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
-        torque = reg.TORQUE_ENABLE
-        head = torque.address.to_bytes(2, "little") + torque.size.to_bytes(2, "little")
-        servos = [
-            f"{build(i, Instruction.READ, head).hex()}:"
-            + ",".join(build_status(i, error, b"\0").hex() for error in (0, ALERT_BIT))
-            for i in ids
-        ]
         longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
         numbers = [str(port_fd), str(other.fileno()), repr(longest_s), repr(answer_s)]
         # -I -S: neither the user's site packages nor the working directory may affect what runs here.
-        command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, torque_off_packet(ids).hex()]
+        command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, off.hex()]
+        command += [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
         try:
             # In a new session, so that Ctrl-C in a terminal reaches only the control process.
             self._process = subprocess.Popen(
-                [*command, *servos],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(port_fd, other.fileno()),

@@ -8,6 +8,7 @@ import importlib.util
 import math
 import sys
 from collections.abc import Callable, Mapping
+from enum import IntEnum
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Protocol, runtime_checkable
@@ -16,6 +17,16 @@ from sim2real.errors import UsageError
 from sim2real.hardware.truth import Kind, TruthLog
 
 STATE_PERIOD_S: Final = 0.005
+
+
+class OperatingMode(IntEnum):
+    """What a motor is driven by; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
+
+    OFF = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    PWM = 16
 
 
 class Plant(Protocol):
@@ -43,7 +54,7 @@ class Plant(Protocol):
 
         Args:
             servo_id: One of `servo_ids`.
-            mode: 16: PWM, 3: position, 1: velocity, 0: torque off.
+            mode: One of `OperatingMode`: PWM, position, velocity, or off.
             goal: PWM: fraction of the supply voltage in [-1, 1]; position: [rad]; velocity: [rad/s]; torque off: 0.
         """
         ...
@@ -195,23 +206,37 @@ def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
     Raises:
         UsageError: The module, the file or the name does not exist.
     """
+    return load_named(spec, "plant")(**(arguments or {}))
+
+
+def load_named(spec: str, what: str) -> Callable[..., Any]:
+    """Return what a command line names as `package.module:Name` or `path/to/file.py:Name`.
+
+    Args:
+        spec: Module or file, and name.
+        what: What it is, for errors.
+
+    Raises:
+        UsageError: The module, the file or the name does not exist, or it cannot be called.
+    """
     place, _, name = spec.rpartition(":")
     if not place or not name:
-        raise UsageError(f"plant {spec!r} is not of the form MODULE_OR_FILE:NAME", hint="e.g. my_robot/plant.py:Plant")
-    module = _load_module(place)
-    factory: Callable[..., Plant] | None = getattr(module, name, None)
-    if not callable(factory):
+        hint = f"e.g. my_robot/{what}.py:{what.title()}"
+        raise UsageError(f"{what} {spec!r} is not of the form MODULE_OR_FILE:NAME", hint=hint)
+    module = _load_module(place, what)
+    found: Callable[..., Any] | None = getattr(module, name, None)
+    if not callable(found):
         available = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise UsageError(f"{place} has no callable {name!r}. Available: {available}")
-    return factory(**(arguments or {}))
+    return found
 
 
-def _load_module(place: str) -> ModuleType:
+def _load_module(place: str, what: str) -> ModuleType:
     path = Path(place)
     if path.suffix == ".py":
-        module_spec = importlib.util.spec_from_file_location(f"_sim2real_plant_{path.stem}", path)
+        module_spec = importlib.util.spec_from_file_location(f"_sim2real_{what}_{path.stem}", path)
         if not path.is_file() or module_spec is None or module_spec.loader is None:
-            raise UsageError(f"there is no plant file {path}")
+            raise UsageError(f"there is no {what} file {path}")
         module = importlib.util.module_from_spec(module_spec)
         sys.modules[module.__name__] = module  # dataclasses look up their module there
         module_spec.loader.exec_module(module)
@@ -220,5 +245,5 @@ def _load_module(place: str) -> ModuleType:
         return importlib.import_module(place)
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"plant module {place!r} cannot be imported: {error}", hint="a file's path must end in .py"
+            f"{what} module {place!r} cannot be imported: {error}", hint="a file's path must end in .py"
         ) from error

@@ -6,15 +6,17 @@ model's structure: what is wrong in the MJCF is wrong in its twin too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
 from sim2real.errors import UsageError
-from sim2real.hardware.registers import COUNTS_PER_REVOLUTION, RAD_PER_COUNT, OperatingMode
+from sim2real.hardware.plant import OperatingMode
 
-_CENTRE_RAD = COUNTS_PER_REVOLUTION // 2 * RAD_PER_COUNT
+_RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
+_CENTRE_RAD = 2048 * _RAD_PER_COUNT
 _FACTORS = ("gain", "damping", "armature", "friction")
 
 
@@ -87,8 +89,8 @@ class TwinPlant:
                     continue
                 reach = self._profiles[i] * step_s
                 self._references[i] += min(max(goal - self._references[i], -reach), reach)
-                counts = round(self._references[i] / RAD_PER_COUNT) - round(angle / RAD_PER_COUNT)
-                data.ctrl[motor] = angle + counts * RAD_PER_COUNT
+                counts = round(self._references[i] / _RAD_PER_COUNT) - round(angle / _RAD_PER_COUNT)
+                data.ctrl[motor] = angle + counts * _RAD_PER_COUNT
             mj_step(model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim2real.hardware.drive import PositionDrive
-from sim2real.hardware.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COUNT
+from sim2real.hardware.dynamixel.drive import PositionDrive
+from sim2real.hardware.dynamixel.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COUNT
 
 
 @dataclass(frozen=True)

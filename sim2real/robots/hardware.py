@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,12 +14,11 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.bus import BusConfig, StateReading
-from sim2real.hardware.drive import Drive
+from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Embedded:
     """
 
     plant: str
-    emulator: EmulatorConfig = field(default_factory=EmulatorConfig)
+    emulator: Emulation
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -41,25 +40,23 @@ class ServoSession:
     """An open robot: the rig, and, for the port ``embedded``, the process of the emulated robot.
 
     Args:
-        bus: Port and limits of the bus; the port may be ``embedded``.
+        port: What the device is connected to; may be ``embedded``.
+        device: Returns the device on a port, not opened yet.
         gate: The safety gate's limits.
-        ids: The servos' ids.
-        drive: How the servos are driven.
         embedded: The emulated robot; None: there is none.
         truth_path: File for the emulated robot's true states and latencies.
         seed: Seed of the emulated robot's jitter and faults.
 
     Raises:
         UsageError: The port is ``embedded``, but the robot has none.
-        HardwareLost: The port cannot be opened, or a servo does not answer.
+        HardwareLost: The device cannot be opened, or a motor does not answer.
     """
 
     def __init__(
         self,
-        bus: BusConfig,
+        port: str,
+        device: Callable[[str], Device],
         gate: GateConfig,
-        ids: Sequence[int],
-        drive: Drive,
         embedded: Embedded | None,
         truth_path: Path,
         seed: int,
@@ -67,17 +64,17 @@ class ServoSession:
         self._stack = ExitStack()
         self.embedded: EmbeddedRobot | None = None
         with ExitStack() as opening:
-            if bus.port == "embedded":
+            if port == "embedded":
                 if embedded is None:
                     raise UsageError("this robot has no embedded twin", hint="name its port with --port")
                 config = replace(embedded.emulator, seed=seed)
                 self.embedded = opening.enter_context(
                     EmbeddedRobot(embedded.plant, config, embedded.plant_args, truth_path)
                 )
-                bus = replace(bus, port=self.embedded.port)
+                port = self.embedded.port
                 # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
                 opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
-            self.rig = opening.enter_context(ServoRig(bus, gate, ids, drive))
+            self.rig = opening.enter_context(Rig(device(port), gate))
             self._stack = opening.pop_all()
 
     def __enter__(self) -> Self:
@@ -107,8 +104,8 @@ class ServoSensor(BaseNode):
         self,
         name: str,
         rate: float,
-        rig: ServoRig,
-        message: Callable[[StateReading], Any],
+        rig: Rig,
+        message: Callable[[Reading], Any],
         rest: Any,
         **options: Any,
     ) -> None:
@@ -142,7 +139,7 @@ class ServoActuator(BaseNode):
     jittable = False
 
     def __init__(
-        self, name: str, rate: float, rig: ServoRig, field: str, message: Callable[[np.ndarray], Any], **options: Any
+        self, name: str, rate: float, rig: Rig, field: str, message: Callable[[np.ndarray], Any], **options: Any
     ) -> None:
         super().__init__(name, rate, **options)
         self._rig, self._field, self._message = rig, field, message
@@ -150,7 +147,7 @@ class ServoActuator(BaseNode):
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a message with zeros."""
         del rng, graph_state
-        return self._message(np.zeros(len(self._rig.ids)))
+        return self._message(np.zeros(len(self._rig.device.motors)))
 
     def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
         """Switch the torque on."""

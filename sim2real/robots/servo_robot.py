@@ -17,10 +17,11 @@ import numpy as np
 from sim2real.errors import SafetyStop
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.bus import BusConfig, StateReading
 from sim2real.hardware.config import GateLimits
+from sim2real.hardware.device import Device, Reading
+from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.registry import load_device
 from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
@@ -54,6 +55,7 @@ class Servos:
         rest: Where the joints hang without torque [rad]; default: 0.
         rest_tolerance: How far from there an episode may start [rad].
         baud_rate: Of the bus.
+        device: Name of the device that they are; see `sim2real.hardware.registry`.
     """
 
     joints: tuple[str, ...]
@@ -65,6 +67,7 @@ class Servos:
     rest: tuple[float, ...] = ()
     rest_tolerance: float = 0.4
     baud_rate: int = 1_000_000
+    device: str = "dynamixel"
 
     @property
     def at_rest(self) -> np.ndarray:
@@ -150,7 +153,7 @@ class ServoRobot(ABC):
         own = standard.place(values, s.sheet, s.joints, self.task.physics_timestep)
         return {**own, **self.place_aim(aim)}
 
-    def twin(self, emulator: EmulatorConfig, **factors: float) -> Embedded:
+    def twin(self, emulator: Emulation, **factors: float) -> Embedded:
         """Return a robot inside the computer that is made of this one's model.
 
         Args:
@@ -262,8 +265,12 @@ class ServoRobot(ABC):
             joints=s.joints,
             stuck_effort=limits.stuck_effort,
         )
-        bus = BusConfig(port, s.baud_rate, watchdog_s=limits.servo_watchdog_s)
-        return ServoSession(bus, gate, s.ids, s.sheet.drive, self.embedded, truth_path, seed)
+        make, silence_s = load_device(s.device), limits.servo_watchdog_s
+
+        def device(port: str) -> Device:
+            return make(port, s.ids, s.sheet.drive, baud_rate=s.baud_rate, silence_s=silence_s)
+
+        return ServoSession(port, device, gate, self.embedded, truth_path, seed)
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the robot to where it rests, slowly; torque is off before and afterwards.
@@ -369,7 +376,7 @@ class ServoRobot(ABC):
         return GoalAgent("agent", self.RATE_HZ, s.low, s.high, self.observe, self.history, len(self.aim), **options)
 
     def _on_hardware(self, session: ServoSession, agent: BaseNode) -> dict[str, BaseNode]:
-        def read(reading: StateReading) -> JointReading:
+        def read(reading: Reading) -> JointReading:
             return JointReading(reading.position_rad, reading.velocity_rad_s)
 
         n, rate = len(self.servos.joints), self.RATE_HZ

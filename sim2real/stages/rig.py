@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.gate import SafetyGate
-from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.rig import Rig
 from sim2real.runtime.clock import realtime
 from sim2real.stages.config import DeployConfig, RecordConfig
 from sim2real.stages.console import note, table
@@ -49,7 +49,7 @@ def _withhold_torque(rig: Any) -> None:
     if not is_dry(rig):
         raise UsageError(
             f"this robot's device, {type(rig).__name__}, cannot do a dry run: it cannot withhold its torque",
-            hint="give it `withhold_torque()` and `torque_withheld`, as sim2real.hardware.rig.ServoRig has them",
+            hint="give it `withhold_torque()` and `torque_withheld`, as sim2real.hardware.rig.Rig has them",
         )
 
 
@@ -59,12 +59,12 @@ def is_dry(rig: Any) -> bool:
 
 
 def announce(session: Session) -> None:
-    """Say what the servos do by themselves when this computer's side dies, and what stops them then."""
-    for line in session.rig.bus.without_host():
+    """Say what the motors do by themselves when this computer's side dies, and what stops them then."""
+    for line in session.rig.device.without_host():
         note(f"if this process dies: {line}; the guardian takes the torque off")
 
 
-def rig_summary(rig: ServoRig) -> dict[str, Any]:
+def rig_summary(rig: Rig) -> dict[str, Any]:
     """Return what the rig adds to an episode's summary.
 
     Returns:
@@ -72,9 +72,9 @@ def rig_summary(rig: ServoRig) -> dict[str, Any]:
         ``late_s``: by how much answers took longer than their bytes, median, 99 % and largest [s];
         ``suspects``: what was odd about the measurements.
     """
-    late = rig.bus.late_s
-    quantiles = np.quantile(late, [0.5, 0.99, 1.0]).tolist() if late.size else [None] * 3
-    return {"late_replies": rig.bus.late_replies, "late_s": quantiles, "suspects": list(rig.suspects)}
+    counters = rig.device.counters
+    quantiles = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
+    return {"late_replies": counters.late_replies, "late_s": quantiles, "suspects": list(rig.suspects)}
 
 
 def answer_rows(summary: Mapping[str, Any]) -> list[list[Any]]:

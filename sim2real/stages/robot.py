@@ -14,7 +14,7 @@ from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.rig import Rig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.stages.pipeline import Pipeline
 from sim2real.train.env import Task
@@ -24,11 +24,11 @@ class Session(AbstractContextManager["Session"], Protocol):
     """An open robot, as a context manager; leaving it takes the torque off.
 
     Attributes:
-        rig: The servos behind the safety gate.
+        rig: The device behind the safety gate.
         embedded: The emulated robot, if the session has one.
     """
 
-    rig: ServoRig
+    rig: Rig
     embedded: EmbeddedRobot | None
 
 

@@ -197,7 +197,7 @@ def _recorder(
 
 
 def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
-    rig, command = session.rig, robot.COMMAND[1]
+    rig, command, counters = session.rig, robot.COMMAND[1], session.rig.device.counters
     timing = {
         n: {
             "steps": s.steps,
@@ -211,9 +211,9 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
     return {
         "monotonic_ns": watch.monotonic_ns,
         "timing": timing,
-        "transactions": rig.bus.transactions,
-        "lost_replies": rig.bus.lost_replies,
-        "retries": rig.bus.retries,
+        "transactions": counters.transactions,
+        "lost_replies": counters.lost_replies,
+        "retries": counters.retries,
         "command_timeouts": rig.timeouts,
         **rig_summary(rig),
         "gate": asdict(rig.gate.counts),

@@ -2,13 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.wire import EmulatedBus
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.plant import load_plant
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.planned import truth_header
+from sim2real.hardware.plant import OperatingMode, load_plant
 from sim2real.hardware.truth import TruthLog, read_truth
-from sim2real.hardware.wire import EmulatedBus, EmulatorConfig, truth_header
 
 PLANTS = Path(__file__).parent / "plants.py"
 
@@ -20,7 +21,7 @@ def start_robot(tmp_path):
 
     def start(plant="FirstOrder", config=None, **plant_args):
         path = tmp_path / f"truth{len(robots)}.bin"
-        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config, plant_args, path))
+        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
         return robots[-1]
 
     yield start

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -102,7 +102,7 @@ def test_lost_replies_are_counted_and_asked_for_again(start_robot, open_bus):
         if transaction.retries == 1:
             worst_ns = max(worst_ns, transaction.transfer_ns)
     robot.stop()
-    assert bus.lost_replies == bus.retries >= 4
+    assert bus.counters.lost_replies == bus.counters.retries >= 4
     assert robot.truth().of(Kind.LOSS).size >= 4
     # One loss costs the timeout of 8 ms and the time to ask again.
     assert 8e6 < worst_ns < 30e6
@@ -112,7 +112,7 @@ def test_corrupt_replies_are_asked_for_again(start_robot, open_bus):
     robot = start_robot("Ramp", config=EmulatorConfig(corrupt=0.2, seed=4))
     bus = open_bus(robot)
     positions_rad = [bus.read_state().position_rad[0] for _ in range(60)]
-    assert bus.lost_replies >= 4
+    assert bus.counters.lost_replies >= 4
     assert np.all(np.diff(positions_rad) >= 0.0)
     assert positions_rad[-1] < 2.0
 
@@ -149,7 +149,7 @@ def test_missing_port():
 def test_port_in_use(start_robot, open_bus):
     robot = start_robot()
     open_bus(robot)
-    code = f"from sim2real.hardware.bus import *; ServoBus(BusConfig({robot.port!r}))"
+    code = f"from sim2real.hardware.dynamixel.bus import *; ServoBus(BusConfig({robot.port!r}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "HardwareLost" in result.stderr
     assert "cannot be opened" in result.stderr
@@ -195,7 +195,7 @@ def test_threads_share_the_bus(start_robot, open_bus):
         bus.write_goal_pwm({1: i / 100})
     for thread in threads:
         thread.join()
-    assert bus.lost_replies == 0
+    assert bus.counters.lost_replies == 0
     assert max(waits_ns) > 200_000
 
 
@@ -225,8 +225,8 @@ def test_a_servo_that_can_stops_by_itself_within_200_ms_of_the_hosts_kill(start_
     robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.01))
     code = f"""
 import time
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.plant import OperatingMode
 bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.1, guardian=False))
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)
@@ -275,7 +275,7 @@ def test_one_lost_answer_of_several_is_asked_for_again(start_robot, open_bus):
     for _ in range(40):
         assert bus.read_state().position_rad - np.pi == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
         assert bus.read_state((3, 1)).position_rad - np.pi == pytest.approx([0.3, 0.5], abs=reg.RAD_PER_COUNT)
-    assert bus.retries == bus.lost_replies >= 10
+    assert bus.counters.retries == bus.counters.lost_replies >= 10
 
 
 def test_a_servo_that_restarted_is_noticed(start_robot, open_bus):
@@ -315,8 +315,8 @@ def test_signals_end_with_torque_off(start_robot, number):
     robot = start_robot()
     code = f"""
 import signal, sys, time
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.plant import OperatingMode
 bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.0))
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)

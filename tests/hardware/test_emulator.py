@@ -13,12 +13,13 @@ import pytest
 from dynamixel_sdk import GroupBulkRead, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
+from sim2real.hardware import emulator
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.protocol import Instruction, Parser, StatusError, build
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.plant import load_plant
-from sim2real.hardware.protocol import Instruction, Parser, StatusError, build
 from sim2real.hardware.truth import Kind, TruthLog, read_truth
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -54,7 +55,7 @@ class Sdk:
 
 @pytest.fixture(scope="module")
 def robot_of_this_module():
-    with EmbeddedRobot(f"{PLANTS}:FirstOrder", plant_args={"ids": [1, 2, 5]}) as robot:
+    with EmbeddedRobot(f"{PLANTS}:FirstOrder", EmulatorConfig(), {"ids": [1, 2, 5]}) as robot:
         yield robot
 
 
@@ -233,6 +234,7 @@ def test_truth_file_can_be_read_at_any_time_and_cut_anywhere(start_robot, tmp_pa
 
 def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
     command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", f"{PLANTS}:Ramp"]
+    command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig"]
     began_s = time.monotonic()
     process = subprocess.Popen(
         [*command, "--truth", tmp_path / "t.bin", "--plant-args", '{"ids": [4]}'], stdout=subprocess.PIPE
@@ -251,7 +253,8 @@ def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
 def test_robot_goes_when_its_parent_is_killed(tmp_path):
     code = (
         "import time; from sim2real.hardware.embedded import EmbeddedRobot;"
-        f"print(EmbeddedRobot({f'{PLANTS}:Ramp'!r}).pid, flush=True); time.sleep(60)"
+        "from sim2real.hardware.dynamixel.emulation import EmulatorConfig;"
+        f"print(EmbeddedRobot({f'{PLANTS}:Ramp'!r}, EmulatorConfig()).pid, flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=_env(tmp_path))
     pid = int(parent.stdout.readline())
@@ -277,7 +280,16 @@ def test_import_is_light():
 
 def test_a_plant_that_does_not_start_says_why():
     with pytest.raises(HardwareLost, match=r"(?s)has no callable 'Rampp'.*FirstOrder"):
-        EmbeddedRobot(f"{PLANTS}:Rampp")
+        EmbeddedRobot(f"{PLANTS}:Rampp", EmulatorConfig())
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("EmulatorConfigg", "has no callable"), ("Plant", "no class of settings")]
+)
+def test_an_emulation_that_is_none_says_so(capsys, name, message):
+    module = "sim2real.hardware.plant" if name == "Plant" else "sim2real.hardware.dynamixel.emulation"
+    assert emulator.main(["--emulation", f"{module}:{name}", "--plant", f"{PLANTS}:Ramp", "--truth", "t.bin"]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_plants_may_be_dataclasses():
@@ -313,6 +325,6 @@ def test_an_account_that_cannot_be_written_does_not_stop_the_robot(tmp_path):
 def test_the_embedded_robot_imports_nothing_from_the_working_directory(tmp_path, monkeypatch):
     (tmp_path / "numpy.py").write_text("open('ran', 'w')")
     monkeypatch.chdir(tmp_path)
-    with EmbeddedRobot(f"{PLANTS}:Ramp") as robot:
+    with EmbeddedRobot(f"{PLANTS}:Ramp", EmulatorConfig()) as robot:
         assert robot.running
     assert not (tmp_path / "ran").exists()

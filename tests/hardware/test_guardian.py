@@ -12,10 +12,10 @@ import pytest
 
 from sim2real.errors import SAFETY_STOP, SafetyStop
 from sim2real.hardware import guardian_process
-from sim2real.hardware import registers as reg
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -24,8 +24,8 @@ XL330 = 1200
 HOST = """
 import os, signal, sys, time
 from sim2real.errors import Sim2RealError
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.plant import OperatingMode
 
 bus = ServoBus(BusConfig({port!r}, watchdog_s={watchdog_s}, max_silence_s=1.0, guardian={guardian}))
 
@@ -199,7 +199,7 @@ def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
     for _ in range(50):
         bus.read_state()
         time.sleep(0.005)
-    asked = bus.transactions + bus.retries
+    asked = bus.counters.transactions + bus.counters.retries
     bus.close()  # which asks twice more, or so
     robot.stop()
     kinds = robot.truth().rows["kind"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -21,17 +21,17 @@ def test_late_answers_do_not_move_the_time_of_a_sample(start_robot, open_bus, id
     sent_s = np.array([r.transaction.t_sent_ns - robot.truth().header["start_ns"] for r in readings]) * 1e-9
     # None was taken before its instruction was sent, as a stamp that is too late says; later ones are the machine's.
     assert (sent_s[:, None] - sampled_s).max() < 0.002
-    assert bus.late_replies >= 10
+    assert bus.counters.late_replies >= 10
     assert np.count_nonzero([r.transaction.late_ns > 4e6 for r in readings]) >= (10 if late_s < 0.008 else 0)
-    assert bus.late_s.max() < 0.1
+    assert bus.counters.late_s.max() < 0.1
 
 
 def test_answers_in_time_are_not_called_late(start_robot, open_bus):
     bus = open_bus(start_robot(config=EmulatorConfig(reply_loss=0.1, seed=1)))
     for _ in range(40):
         bus.read_state()
-    assert bus.lost_replies >= 2
-    assert bus.late_replies < 10  # a busy machine may have some
+    assert bus.counters.lost_replies >= 2
+    assert bus.counters.late_replies < 10  # a busy machine may have some
 
 
 def test_misses_in_a_row_are_no_lost_bus_while_they_are_short(start_robot, open_bus):

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from sim2real.hardware import models
-from sim2real.hardware.bus import BusConfig, ServoBus
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.device import Alone
+from sim2real.hardware.dynamixel import models
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"
 
@@ -14,9 +15,9 @@ def test_the_guide_has_the_table():
 
 
 def test_of_an_unknown_model_the_worst_is_assumed():
-    assert "goes on" in models.model(99).without_host(0.1)
+    assert models.model(99).without_host(0.1).does is Alone.GOES_ON
     assert models.model(99).name == "model 99"
-    assert "watchdog is off" in models.model(1060).without_host(0.0)
+    assert models.model(1060).without_host(0.0).words == "goes on as commanded last (its bus watchdog is off)"
 
 
 def test_an_open_bus_says_what_its_servos_do_alone(start_robot):
@@ -25,4 +26,4 @@ def test_an_open_bus_says_what_its_servos_do_alone(start_robot):
     with ServoBus(BusConfig(robot.port)) as bus:
         bus.handshake({1: None, 4: None})
         (said,) = bus.without_host()
-    assert said == "XL330-M288 (servo 1, 4) notices after 0.1 s, but goes on as commanded last"
+    assert str(said) == "XL330-M288 (servo 1, servo 4) notices after 0.1 s, but goes on as commanded last"

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.plausibility import Plausibility
-from sim2real.hardware.rig import ServoRig
-from sim2real.hardware.wire import EmulatorConfig
+from sim2real.hardware.rig import Rig
 
 pytestmark = pytest.mark.realtime
 
@@ -101,7 +102,7 @@ def open_rig(start_robot):
     def open_(plant, drive, gate, config, ids):
         robot = start_robot(plant, config)
         bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
-        rigs.append(ServoRig(bus, gate, ids, drive))
+        rigs.append(Rig(DynamixelServos(bus, ids, drive), gate))
         return rigs[-1]
 
     yield open_
@@ -122,7 +123,7 @@ def swing(rig, duration_s):
     while (t_s := time.monotonic() - begin_s) < duration_s:
         sign = 1.0 if int(t_s / 0.3) % 2 else -1.0
         rig.measure()
-        rig.command(np.full(len(rig.ids), sign * 1.9), 0.0, time.monotonic())
+        rig.command(np.full(len(rig.device.motors), sign * 1.9), 0.0, time.monotonic())
         time.sleep(PERIOD_S)
 
 

@@ -5,7 +5,7 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim2real.hardware.protocol import HEADER, Instruction, Packet, Parser, build, build_status, crc16
+from sim2real.hardware.dynamixel.protocol import HEADER, Instruction, Packet, Parser, build, build_status, crc16
 
 # Bytes that headers and stuffing are made of come often.
 tricky = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55, 0x03]) | st.integers(0, 255), max_size=40).map(bytes)

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from sim2real.hardware import registers as reg
+from sim2real.hardware.dynamixel import registers as reg
 
 
 def test_registers_do_not_overlap():

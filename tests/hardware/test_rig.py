@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import VoltageDrive
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode
-from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.rig import Rig
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -32,7 +33,7 @@ def open_rig(start_robot):
         # Patient with lost answers, for the machine may be busy; not with the host itself.
         bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s)
         limits = GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate})
-        rigs.append(ServoRig(bus, limits, [1], VoltageDrive(SUPPLY_V)))
+        rigs.append(Rig(DynamixelServos(bus, [1], VoltageDrive(SUPPLY_V)), limits))
         return rigs[-1], robot
 
     yield open_
@@ -67,7 +68,7 @@ def test_commands_are_volts_and_come_back_as_sent(open_rig):
     run(rig, 2.5, 0.4)
     assert rig.measure().velocity_rad_s[0] == pytest.approx(3.0, rel=0.1)
     rig.stop()
-    assert rig.bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert rig.device.bus.read(1, reg.TORQUE_ENABLE) == 0
     assert rig.gate.counts.clamped == 1
     assert rig.timeouts == 0
 
@@ -82,7 +83,7 @@ def test_a_stalled_policy_gets_zero_while_measuring_goes_on(open_rig):
     while time.monotonic() - stalled_s < 0.5:
         rig.measure()
         reads += 1
-        if zero_s is None and rig.bus.read(1, reg.GOAL_PWM) == 0:
+        if zero_s is None and rig.device.bus.read(1, reg.GOAL_PWM) == 0:
             zero_s = time.monotonic() - stalled_s
         time.sleep(0.005)
     # The watcher looks every fifth of the timeout; the rest is for a busy machine.
@@ -91,7 +92,7 @@ def test_a_stalled_policy_gets_zero_while_measuring_goes_on(open_rig):
     assert reads > 10
     assert 3 <= rig.timeouts <= 5
     assert abs(rig.measure().velocity_rad_s[0]) < 0.1
-    assert rig.bus.read(1, reg.BUS_WATCHDOG) != reg.WATCHDOG_TRIPPED
+    assert rig.device.bus.read(1, reg.BUS_WATCHDOG) != reg.WATCHDOG_TRIPPED
     assert volts(rig, 2.5) == 2.5  # a loop that comes back goes on
 
 
@@ -214,5 +215,5 @@ def test_waiting_until_still(open_rig):
 def test_a_bus_that_cannot_be_set_up_is_closed(start_robot):
     robot = start_robot("FirstOrder")
     with pytest.raises(HardwareLost, match="servo 7 does not answer"):
-        ServoRig(BusConfig(robot.port), GateConfig(), [7], VoltageDrive(SUPPLY_V))
-    ServoRig(BusConfig(robot.port), GateConfig(), [1], VoltageDrive(SUPPLY_V)).close()
+        Rig(DynamixelServos(BusConfig(robot.port), [7], VoltageDrive(SUPPLY_V)), GateConfig())
+    Rig(DynamixelServos(BusConfig(robot.port), [1], VoltageDrive(SUPPLY_V)), GateConfig()).close()

@@ -2,10 +2,10 @@ import math
 
 import pytest
 
-from sim2real.hardware import registers as reg
-from sim2real.hardware.protocol import StatusError
-from sim2real.hardware.registers import OperatingMode
-from sim2real.hardware.servo import Servo
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.protocol import StatusError
+from sim2real.hardware.dynamixel.servo import Servo
+from sim2real.hardware.plant import OperatingMode
 
 
 def write(servo, register, value):

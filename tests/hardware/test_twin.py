@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.registers import RAD_PER_COUNT, OperatingMode
+from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.twin import TwinPlant
 from sim2real.stages.pipeline import load_pipeline
 

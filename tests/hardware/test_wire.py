@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware import registers as reg
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.protocol import BROADCAST_ID, Instruction, build
 from sim2real.hardware.plant import ConfigurablePlant
-from sim2real.hardware.protocol import BROADCAST_ID, Instruction, build
 from sim2real.hardware.truth import Kind
-from sim2real.hardware.wire import EmulatorConfig
 
 MS = 1_000_000
 STEP_NS = 500_000

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig
-from sim2real.hardware.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
 from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode
-from sim2real.hardware.rig import ServoRig
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.rig import Rig
 from sim2real.hardware.truth import Kind
 
 pytestmark = pytest.mark.realtime
@@ -26,7 +27,7 @@ def open_rig(start_robot):
     def open_(drive, plant, ids, withhold=True, **gate):
         robot = start_robot(plant)
         bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
-        rigs.append(ServoRig(bus, GateConfig(command_timeout_s=0.1, **gate), ids, drive))
+        rigs.append(Rig(DynamixelServos(bus, ids, drive), GateConfig(command_timeout_s=0.1, **gate)))
         if withhold:
             rigs[-1].withhold_torque()
         return rigs[-1], robot
@@ -62,9 +63,9 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
     np.testing.assert_allclose(counts.low, np.min(sent, axis=0))
     np.testing.assert_allclose(counts.high, np.max(sent, axis=0))
     np.testing.assert_allclose(counts.total, np.sum(sent, axis=0))
-    assert rig.bus.withheld >= 20 + 2 * 3
+    assert rig.device.counters.withheld >= 20 + 2 * 3
     rig.stop()
-    assert_untouched(robot, reg.GOAL_POSITION, rig.bus, (1, 2, 3))
+    assert_untouched(robot, reg.GOAL_POSITION, rig.device.bus, (1, 2, 3))
 
 
 def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
@@ -78,7 +79,7 @@ def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
     assert rig.suspects == []
     assert rig.measure().velocity_rad_s[0] == 0.0
     rig.stop()
-    assert_untouched(robot, reg.GOAL_PWM, rig.bus, (1,))
+    assert_untouched(robot, reg.GOAL_PWM, rig.device.bus, (1,))
 
 
 def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
@@ -88,7 +89,7 @@ def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
     time.sleep(0.3)
     assert rig.timeouts >= 1
     rig.stop()
-    assert_untouched(robot, reg.GOAL_PWM, rig.bus, (1,))
+    assert_untouched(robot, reg.GOAL_PWM, rig.device.bus, (1,))
 
 
 def test_the_guardian_watches_as_well(start_robot, open_bus):

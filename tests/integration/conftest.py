@@ -91,7 +91,7 @@ def lone_robot(tmp_path):
     plant = Path(hardware.__file__).with_name("plant.py")
     path = tmp_path / "truth.bin"
     command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", f"{plant}:PendulumPlant"]
-    command += ["--truth", str(path)]
+    command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig", "--truth", str(path)]
     command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(hardware.EMBEDDED).items() if v is not None]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

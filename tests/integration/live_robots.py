@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 
 TINY = [

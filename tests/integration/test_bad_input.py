@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.hardware.port import WaitingPort
+from sim2real.hardware.dynamixel.port import WaitingPort
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import load_pipeline
 

@@ -16,10 +16,10 @@ from live_robots import manifest_of
 from wiretap import Wiretap
 
 from sim2real import cli
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 from sim2real.log.reader import read_log, read_session
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, save_bundle

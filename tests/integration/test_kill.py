@@ -10,7 +10,7 @@ import pytest
 from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor, wait_until_running
 
 from sim2real.errors import SAFETY_STOP
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.hardware.plant import load_plant
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode, load_plant
 
 pytestmark = pytest.mark.realtime
 

@@ -11,7 +11,7 @@ from flax import struct
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.config import GateLimits
-from sim2real.hardware.registers import OperatingMode
+from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import read_log
 from sim2real.robots.hardware import Excitation

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.bus import ServoBus, StateReading
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.registers import OperatingMode, Register
+from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Reading, Transaction
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import ServoBus
+from sim2real.hardware.dynamixel.registers import Register
+from sim2real.hardware.plant import OperatingMode
 
 
 class Drive(Protocol):
@@ -21,28 +21,29 @@ class Drive(Protocol):
 
     Attributes:
         mode: The operating mode that the servos must be in.
+        kind: What the numbers of a command are.
     """
 
     mode: ClassVar[OperatingMode]
+    kind: ClassVar[CommandKind]
 
-    def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Check gate and number of servos before the port is opened; raise UsageError if they do not fit the drive."""
+    def check(self, servos: int) -> None:
+        """Check the number of servos before the port is opened; raise UsageError if the drive is for another one."""
         ...
 
-    def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
-        """Write the servos' settings, with torque off.
+    def prepare(self, bus: ServoBus) -> None:
+        """Write the servos' settings, with torque off; raise HardwareLost if a servo does not keep them."""
+        ...
 
-        Raises:
-            HardwareLost: A servo does not keep its settings.
-            UsageError: The gate allows commands that a servo does not accept.
-        """
+    def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest command that the servos follow, each ``(n,)``."""
         ...
 
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return the command that the servos follow right after torque goes on."""
         ...
 
-    def send(self, bus: ServoBus, command: np.ndarray) -> None:
+    def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write a command to the servos."""
         ...
 
@@ -50,7 +51,7 @@ class Drive(Protocol):
         """Return the fraction of full torque that the servos apply, shape (n,) in [-1, 1], from command and angles."""
         ...
 
-    def reading(self, reading: StateReading) -> StateReading:
+    def reading(self, reading: Reading) -> Reading:
         """Return a measurement with positions in this drive's angles."""
         ...
 
@@ -65,34 +66,37 @@ class VoltageDrive:
 
     supply_v: float
     mode: ClassVar[OperatingMode] = OperatingMode.PWM
+    kind: ClassVar[CommandKind] = VOLTAGE
 
     def __post_init__(self) -> None:
         """Check the supply voltage."""
         if not 0.0 < self.supply_v < math.inf:
             raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
 
-    def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Refuse a gate that repeats the last voltage when commands are stale."""
-        del ids
-        _require_stale(gate, "zero", "volts")
+    def check(self, servos: int) -> None:
+        """Do nothing: any number of servos will do."""
 
-    def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
+    def prepare(self, bus: ServoBus) -> None:
         """Do nothing: PWM mode has no settings."""
+
+    def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
+        """Return infinite limits: `send` refuses more than the supply voltage."""
+        return np.full(len(bus.ids), -np.inf), np.full(len(bus.ids), np.inf)
 
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return zero volts."""
         return np.zeros(len(bus.ids))
 
-    def send(self, bus: ServoBus, command: np.ndarray) -> None:
+    def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write voltages [V]."""
-        bus.write_goal_pwm({i: float(v) / self.supply_v for i, v in zip(bus.ids, command, strict=True)})
+        return bus.write_goal_pwm({i: float(v) / self.supply_v for i, v in zip(bus.ids, command, strict=True)})
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the command as a fraction of the supply voltage."""
         del position_rad
         return np.clip(command / self.supply_v, -1.0, 1.0)
 
-    def reading(self, reading: StateReading) -> StateReading:
+    def reading(self, reading: Reading) -> Reading:
         """Return the measurement unchanged."""
         return reading
 
@@ -117,6 +121,7 @@ class PositionDrive:
     d_gain: int = 0
     zero_count: int | tuple[int, ...] = 2048
     mode: ClassVar[OperatingMode] = OperatingMode.POSITION
+    kind: ClassVar[CommandKind] = POSITION
 
     def __post_init__(self) -> None:
         """Check that the values fit the registers."""
@@ -128,15 +133,13 @@ class PositionDrive:
         if np.any(counts < 0) or np.any(counts >= reg.COUNTS_PER_REVOLUTION):
             raise UsageError(f"position drive: zero_count = {self.zero_count} is outside the encoder's revolution")
 
-    def check(self, gate: GateConfig, ids: Sequence[int]) -> None:
-        """Refuse a gate that moves the joints to 0 when commands are stale, and a wrong number of zero counts."""
-        _require_stale(gate, "hold", "positions")
-        if isinstance(self.zero_count, tuple) and len(self.zero_count) != len(ids):
-            raise UsageError(f"position drive: {len(self.zero_count)} zero counts for {len(ids)} servos")
+    def check(self, servos: int) -> None:
+        """Refuse a wrong number of zero counts."""
+        if isinstance(self.zero_count, tuple) and len(self.zero_count) != servos:
+            raise UsageError(f"position drive: {len(self.zero_count)} zero counts for {servos} servos")
 
-    def prepare(self, bus: ServoBus, gate: GateConfig) -> None:
+    def prepare(self, bus: ServoBus) -> None:
         """Write gains and profile, which a servo loses without power, and read them back."""
-        self._require_reach(bus, gate)
         for servo_id in bus.ids:
             drive_mode = bus.read(servo_id, reg.DRIVE_MODE)
             if drive_mode & ~reg.DRIVE_REVERSED:
@@ -151,22 +154,30 @@ class PositionDrive:
                         hint="is its supply stable?",
                     )
 
+    def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
+        """Return the servos' own position limits, and half a count, which a goal is rounded by [rad].
+
+        A servo ignores a goal beyond them, and does so silently when several are commanded at once.
+        """
+        slack = reg.RAD_PER_COUNT / 2
+        return self._angle(bus, reg.MIN_POSITION_LIMIT) - slack, self._angle(bus, reg.MAX_POSITION_LIMIT) + slack
+
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return the angles that the servos hold [rad]: their positions when torque went on."""
         # Read from the goals, not from the positions: a load pulls the joints off their goals, a little more each time.
         return self._angle(bus, reg.GOAL_POSITION)
 
-    def send(self, bus: ServoBus, command: np.ndarray) -> None:
+    def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write joint angles [rad]."""
         angles = command + self._zero_rad
-        bus.write_goal_position({i: float(a) for i, a in zip(bus.ids, angles, strict=True)})
+        return bus.write_goal_position({i: float(a) for i, a in zip(bus.ids, angles, strict=True)})
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the duty that the P gain computes from the position error, ignoring the profile."""
         error_count = (command - position_rad) / reg.RAD_PER_COUNT
         return np.clip(error_count * self.p_gain / reg.P_GAIN_UNIT / reg.PWM_FULL_SCALE, -1.0, 1.0)
 
-    def reading(self, reading: StateReading) -> StateReading:
+    def reading(self, reading: Reading) -> Reading:
         """Return the measurement with joint angles [rad]."""
         return replace(reading, position_rad=reading.position_rad - self._zero_rad)
 
@@ -177,20 +188,6 @@ class PositionDrive:
     def _angle(self, bus: ServoBus, register: Register) -> np.ndarray:
         """Return a position register of each servo as joint angles, shape (n,) [rad]."""
         return np.array([bus.read(servo_id, register) for servo_id in bus.ids]) * reg.RAD_PER_COUNT - self._zero_rad
-
-    def _require_reach(self, bus: ServoBus, gate: GateConfig) -> None:
-        """Refuse gate limits beyond the servos' own position limits.
-
-        A servo ignores such a goal, and would do so silently when several are commanded at once.
-        """
-        low, high = self._angle(bus, reg.MIN_POSITION_LIMIT), self._angle(bus, reg.MAX_POSITION_LIMIT)
-        slack = reg.RAD_PER_COUNT / 2
-        if np.any(gate.range[0] < low - slack) or np.any(gate.range[1] > high + slack):
-            raise UsageError(
-                f"gate of {gate.node!r}: limit {gate.limit} exceeds what the servos take, "
-                f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} rad",
-                hint="narrow the limit, or set zero_count and the servos' own position limits",
-            )
 
     def _settings(self) -> dict[Register, int]:
         if not self.profile_velocity_rad_s > 0.0:
@@ -207,10 +204,3 @@ class PositionDrive:
             reg.PROFILE_ACCELERATION: 0,
             reg.PROFILE_VELOCITY: velocity,
         }
-
-
-def _require_stale(gate: GateConfig, wanted: Literal["zero", "hold"], what: str) -> None:
-    if gate.stale != wanted:
-        raise UsageError(
-            f"gate of {gate.node!r}: stale = {gate.stale!r} is not safe with {what}", hint=f"stale = {wanted!r} is"
-        )

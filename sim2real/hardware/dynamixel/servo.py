@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from sim2real.hardware import registers as reg
-from sim2real.hardware.models import model
-from sim2real.hardware.protocol import ALERT_BIT, StatusError
-from sim2real.hardware.registers import OperatingMode, Register
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.models import model
+from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
+from sim2real.hardware.dynamixel.registers import Register
+from sim2real.hardware.plant import OperatingMode
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5

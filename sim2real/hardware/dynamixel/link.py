@@ -15,11 +15,12 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
-from sim2real.hardware import registers as reg
+from sim2real.hardware.device import Transaction
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.port import WaitingPort
+from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
+from sim2real.hardware.dynamixel.registers import Register
 from sim2real.hardware.guardian import Guardian
-from sim2real.hardware.port import WaitingPort
-from sim2real.hardware.protocol import ALERT_BIT, StatusError
-from sim2real.hardware.registers import Register
 
 _REASONS: Final[dict[int, str]] = {
     StatusError.RESULT_FAIL: "it failed to carry it out",
@@ -54,7 +55,7 @@ class BusConfig:
             was taken is then uncertain [s].
         watchdog_s: Longest time without an instruction while torque is on [s]; after it the guardian takes the torque
             off and the servos' bus watchdogs, set to a multiple of 20 ms and at most 2.54 s, trip. 0: neither. What a
-            servo does then depends on its model: `sim2real.hardware.models`.
+            servo does then depends on its model: `sim2real.hardware.dynamixel.models`.
         guardian: Whether to start a guardian; False only to test the servos' own watchdogs.
     """
 
@@ -76,25 +77,6 @@ class BusConfig:
     def watchdog_count(self) -> int:
         """Value of the register Bus Watchdog: `watchdog_s` in units of 20 ms, at least 1 unless it is 0 (off)."""
         return max(1, round(self.watchdog_s / reg.WATCHDOG_UNIT_S)) if self.watchdog_s > 0.0 else 0
-
-
-@dataclass(frozen=True)
-class Transaction:
-    """The times of one instruction with its answer and its retries.
-
-    Args:
-        t_sent_ns: When the instruction that was answered was sent, CLOCK_MONOTONIC [ns].
-        lock_wait_ns: How long it waited for another thread's use of the bus [ns].
-        transfer_ns: Time from getting the bus to having the answer, retries included [ns].
-        retries: Number of times that the instruction was sent again.
-        late_ns: How much longer the answer took than its bytes need on the wire [ns].
-    """
-
-    t_sent_ns: int
-    lock_wait_ns: int
-    transfer_ns: int
-    retries: int
-    late_ns: int = 0
 
 
 class BusLink:
@@ -183,7 +165,13 @@ class BusLink:
         return blocks, transaction
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
-        """Write a value in counts to a register, and wait for the servo to confirm it."""
+        """Write a register, and wait for the servo to confirm it.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
         if self._withholds(register, (value,)):
             return self._withhold(register, {servo_id: value})
         data = list(register.encode(value))

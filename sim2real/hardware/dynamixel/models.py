@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
+
+from sim2real.hardware.device import Alone, WithoutHost
 
 _MANUAL: Final = "e-Manual, Bus Watchdog(98); not measured by us"
 _FORUM: Final = "ROBOTIS reproduced it with all 330s: forum.robotis.com/t/4814 (firmware 51)"
@@ -24,18 +27,17 @@ class ServoModel:
     stops_alone: bool
     source: str
 
-    def without_host(self, watchdog_s: float) -> str:
-        """Return in words what the servo does by itself when its host dies.
+    def without_host(self, watchdog_s: float, motors: tuple[str, ...] = ()) -> WithoutHost:
+        """Return what the servo does by itself when its host dies.
 
         Args:
             watchdog_s: The time that its bus watchdog is set to [s]; 0: off.
+            motors: Names of the servos of this model.
         """
         if not watchdog_s:
-            return "goes on as commanded last (its bus watchdog is off)"
-        after = f"after {watchdog_s:g} s"
-        if self.stops_alone:
-            return f"stops {after}, torque stays on"
-        return f"notices {after}, but goes on as commanded last"
+            return WithoutHost(self.name, motors, Alone.GOES_ON, math.inf, self.source, "its bus watchdog is off")
+        does = Alone.STOPS if self.stops_alone else Alone.GOES_ON
+        return WithoutHost(self.name, motors, does, watchdog_s, self.source)
 
 
 MODELS: Final[Mapping[int, ServoModel]] = {
@@ -60,7 +62,7 @@ def model(number: int) -> ServoModel:
 def table() -> str:
     """Return the Markdown table of docs/guides/safety.md: the models, and what they do by themselves."""
     rows = [
-        (m.name, m.without_host(0.1).replace("after 0.1 s", "after `servo_watchdog_s`"), m.source)
+        (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source)
         for m in MODELS.values()
     ]
     lines = [("Servo", "By itself, when the computer dies", "Known from"), ("---",) * 3, *rows]

@@ -9,19 +9,21 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
-from sim2real.hardware import registers as reg
-from sim2real.hardware.guardian import Guardian, torque_off_packet
-from sim2real.hardware.link import BusConfig, BusLink, Transaction, watchdog_message
-from sim2real.hardware.models import model
-from sim2real.hardware.registers import OperatingMode, Register
+from sim2real.hardware.device import Counters, Reading, Transaction, WithoutHost
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.link import BusConfig, BusLink, watchdog_message
+from sim2real.hardware.dynamixel.models import model
+from sim2real.hardware.dynamixel.off import torque_off_packet, torque_queries
+from sim2real.hardware.dynamixel.registers import Register
+from sim2real.hardware.guardian import Guardian
+from sim2real.hardware.plant import OperatingMode
 
-__all__ = ["BusConfig", "ServoBus", "StateReading", "Transaction"]
+__all__ = ["BusConfig", "ServoBus"]
 
 _LOGGER = logging.getLogger(__name__)
 _STATE_ADDRESS: Final = reg.PRESENT_LOAD.address
@@ -29,24 +31,6 @@ _STATE_BYTES: Final = reg.PRESENT_POSITION.end - _STATE_ADDRESS
 _STATE_DTYPE: Final = np.dtype([("load", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
 _SAFE_REPEATS: Final = 5
 _SAFE_PAUSE_S: Final = 0.002
-
-
-@dataclass(frozen=True)
-class StateReading:
-    """Measurements of n servos, in the order of the ids that were asked for.
-
-    Args:
-        position_rad: Shape (n,): angles from each encoder's zero [rad].
-        velocity_rad_s: Shape (n,) [rad/s].
-        load: Shape (n,): fraction of the largest load, in [-1, 1]; for servos that report current instead, the current
-            in units of 1000 counts.
-        transaction: When the measurement was requested, and how long it took.
-    """
-
-    position_rad: np.ndarray
-    velocity_rad_s: np.ndarray
-    load: np.ndarray
-    transaction: Transaction
 
 
 class ServoBus:
@@ -95,29 +79,12 @@ class ServoBus:
         return self._ids
 
     @property
-    def transactions(self) -> int:
-        """Number of instructions that were answered, or needed no answer, so far."""
-        return self._link.transactions
-
-    @property
-    def lost_replies(self) -> int:
-        """Number of missing answers so far."""
-        return self._link.lost_replies
-
-    @property
-    def retries(self) -> int:
-        """Number of instructions that were sent again so far."""
-        return self._link.retries
-
-    @property
-    def late_replies(self) -> int:
-        """Number of answers so far that came too late, or so late that the time of their sample is uncertain."""
-        return self._link.late_replies
-
-    @property
-    def late_s(self) -> np.ndarray:
-        """How much longer each answer so far took than its bytes need on the wire, shape (N,) [s]."""
-        return np.array(self._link.late_us, np.float64) * 1e-6
+    def counters(self) -> Counters:
+        """What went over the bus so far."""
+        link = self._link
+        late_s = np.array(link.late_us, np.float64) * 1e-6
+        counts = link.transactions, link.lost_replies, link.retries, link.late_replies
+        return Counters(*counts, late_s, link.withheld)
 
     @property
     def torque_withheld(self) -> bool:
@@ -125,22 +92,16 @@ class ServoBus:
         return self._link.torque_withheld
 
     @property
-    def withheld(self) -> int:
-        """Instructions so far that were not sent, as they could have moved a motor."""
-        return self._link.withheld
-
-    @property
     def guardian_pid(self) -> int | None:
         """Process id of the guardian; None before it is started."""
         return None if self._link.guardian is None else self._link.guardian.pid
 
-    def without_host(self) -> list[str]:
-        """Return for each model of servo found a sentence on what it does by itself when this process dies."""
-        kinds: dict[int, list[int]] = {}
+    def without_host(self) -> tuple[WithoutHost, ...]:
+        """Return for each model of servo found what it does by itself when this process dies."""
+        kinds: dict[int, list[str]] = {}
         for servo_id, number in zip(self._ids, self._models, strict=True):
-            kinds.setdefault(number, []).append(servo_id)
-        what = {number: model(number).without_host(self.config.watchdog_s) for number in kinds}
-        return [f"{model(n).name} (servo {', '.join(map(str, ids))}) {what[n]}" for n, ids in kinds.items()]
+            kinds.setdefault(number, []).append(f"servo {servo_id}")
+        return tuple(model(n).without_host(self.config.watchdog_s, tuple(motors)) for n, motors in kinds.items())
 
     def handshake(self, expected: Mapping[int, int | None]) -> dict[int, int]:
         """Find the servos; `torque`, `close` and `make_safe` act on these from now on.
@@ -233,7 +194,7 @@ class ServoBus:
         if not on and guardian is not None:
             guardian.disarm()
 
-    def read_state(self, ids: Sequence[int] | None = None) -> StateReading:
+    def read_state(self, ids: Sequence[int] | None = None) -> Reading:
         """Read position, velocity and load of servos in one transaction.
 
         Args:
@@ -242,7 +203,7 @@ class ServoBus:
         ids = self._ids if ids is None else tuple(ids)
         data, transaction = self._read_each(ids, _STATE_ADDRESS, _STATE_BYTES, "read of the state")
         counts = np.frombuffer(data, _STATE_DTYPE)
-        return StateReading(
+        return Reading(
             position_rad=counts["position"] * reg.RAD_PER_COUNT,
             velocity_rad_s=counts["velocity"] * reg.RAD_S_PER_COUNT,
             load=counts["load"] / reg.LOAD_FULL_SCALE,
@@ -352,7 +313,8 @@ class ServoBus:
             return
         link = self._link
         if link.guardian is None:
-            link.guardian = Guardian(link.port.fd, self._ids, self.config.watchdog_s, self.config.reply_timeout_s)
+            packets, config = (torque_off_packet(self._ids), torque_queries(self._ids)), self.config
+            link.guardian = Guardian(link.port.fd, *packets, config.watchdog_s, config.reply_timeout_s)
         link.guardian.arm()
 
     def _ping(self, servo_id: int) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
 COUNTS_PER_REVOLUTION: Final = 4096
@@ -33,16 +32,6 @@ HARDWARE_ERRORS: Final[dict[int, str]] = {
     4: "electrical shock",
     5: "overload",
 }
-
-
-class OperatingMode(IntEnum):
-    """Operating modes. OFF is not a value of the register: it is the mode that a plant gets while torque is off."""
-
-    OFF = 0
-    VELOCITY = 1
-    POSITION = 3
-    EXTENDED_POSITION = 4
-    PWM = 16
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,153 @@
+"""LeRobot's calibration file: which servo moves which joint, where its zero is, and how far it may go.
+
+    {"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1365, "range_min": 746, "range_max": 3477}, ...}
+
+`homing_offset` is kept in the servo, which subtracts it from what its encoder shows; the range is in counts after
+that. LeRobot's angles in degrees are zero in the middle of the range (`motors_bus.py`, MotorNormMode.DEGREES), and so
+are ours. Its `drive_mode` 1 mirrors the joint. LeRobot takes a turn for 4095 counts, we for 4096: 0.02 % of an angle.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sim2real.errors import UsageError
+from sim2real.hardware.feetech import registers as reg
+
+_FIELDS: Final = {
+    "id": (0, 253),
+    "drive_mode": (0, 1),
+    "homing_offset": (reg.HOMING_OFFSET.minimum, reg.HOMING_OFFSET.maximum),
+    "range_min": (0, reg.COUNTS_PER_REVOLUTION - 1),
+    "range_max": (0, reg.COUNTS_PER_REVOLUTION - 1),
+}
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint that a servo moves: angle = direction * gear * (count - zero_count) * (2 pi / 4096).
+
+    Args:
+        name: The joint's name.
+        servo_id: The servo.
+        zero_count: What the servo reads at the joint's zero [counts].
+        direction: 1, or -1 if the joint's angle falls as the count rises.
+        low_count: Lowest count that the joint may have.
+        high_count: Highest count that the joint may have.
+        gear: Turns of the joint per turn of the servo [1].
+        homing_offset: What the servo must subtract from its encoder's count, so that the other counts mean what they
+            say; None: whatever it is set to.
+    """
+
+    name: str
+    servo_id: int
+    zero_count: float = 2048.0
+    direction: int = 1
+    low_count: int = 0
+    high_count: int = reg.COUNTS_PER_REVOLUTION - 1
+    gear: float = 1.0
+    homing_offset: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the values make a joint."""
+        if self.direction not in (1, -1):
+            raise UsageError(f"joint {self.name!r}: direction = {self.direction} is neither 1 nor -1")
+        if not 0.0 < self.gear < math.inf:
+            raise UsageError(f"joint {self.name!r}: gear = {self.gear} must be larger than 0")
+        if not 0 <= self.low_count < self.high_count < reg.COUNTS_PER_REVOLUTION:
+            raise UsageError(
+                f"joint {self.name!r}: {self.low_count} to {self.high_count} counts is no range within 0 to 4095"
+            )
+
+    @property
+    def rad_per_count(self) -> float:
+        """By how much the angle rises with the count [rad]."""
+        return self.direction * self.gear * reg.RAD_PER_COUNT
+
+    @property
+    def range_rad(self) -> tuple[float, float]:
+        """Lowest and highest angle [rad]."""
+        ends = sorted(self.angle(count) for count in (self.low_count, self.high_count))
+        return ends[0], ends[1]
+
+    def angle(self, count: float) -> float:
+        """Return the joint's angle [rad] at a count of its servo."""
+        return (count - self.zero_count) * self.rad_per_count
+
+    def count(self, angle_rad: float) -> int:
+        """Return the servo's count nearest to an angle of the joint [rad]."""
+        return round(self.zero_count + angle_rad / self.rad_per_count)
+
+
+def read_calibration(path: Path | str) -> tuple[Joint, ...]:
+    """Read LeRobot's calibration of an arm: `~/.cache/huggingface/lerobot/calibration/robots/so101_follower/*.json`.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The joints, in the order of the file.
+
+    Raises:
+        UsageError: There is no such file, or it is none; says what is wrong with which motor.
+    """
+    path = Path(path)
+    try:
+        motors = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
+    except OSError as error:
+        raise UsageError(f"calibration file {path} cannot be read: {error.strerror}", hint=_HINT) from error
+    except ValueError as error:
+        raise UsageError(f"calibration file {path} is not valid JSON: {error}", hint=_HINT) from error
+    if not isinstance(motors, dict) or not motors:
+        raise UsageError(f"calibration file {path} holds no motors by name", hint=_HINT)
+    joints = tuple(_joint(path, name, entry) for name, entry in motors.items())
+    by_id: dict[int, str] = {}
+    for joint in joints:
+        other = by_id.setdefault(joint.servo_id, joint.name)
+        if other != joint.name:
+            raise UsageError(
+                f"calibration file {path}: motors {other!r} and {joint.name!r} both have id {joint.servo_id}"
+            )
+    return joints
+
+
+_HINT: Final = "lerobot-calibrate writes one"
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object as a dict; raise ValueError if it has a name twice, of which one would be lost."""
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{twice[0]!r} is there twice")
+    return dict(pairs)
+
+
+def _joint(path: Path, name: str, entry: Any) -> Joint:
+    where = f"calibration file {path}: motor {name!r}"
+    if not isinstance(entry, dict):
+        raise UsageError(f"{where} is no object with {', '.join(_FIELDS)}", hint=_HINT)
+    for problem, keys in (("lacks", _FIELDS.keys() - entry.keys()), ("has an unknown", entry.keys() - _FIELDS.keys())):
+        if keys:
+            raise UsageError(f"{where} {problem} {sorted(keys)[0]!r}. Available: {', '.join(_FIELDS)}", hint=_HINT)
+    for key, (low, high) in _FIELDS.items():
+        value = entry[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise UsageError(f"{where}: {key} = {value!r} is no whole number in [{low}, {high}]", hint=_HINT)
+    if entry["range_min"] >= entry["range_max"]:
+        raise UsageError(
+            f"{where}: range_min = {entry['range_min']} is not below range_max = {entry['range_max']}",
+            hint="was the joint moved while its range was recorded? calibrate again",
+        )
+    return Joint(
+        name=name,
+        servo_id=entry["id"],
+        zero_count=(entry["range_min"] + entry["range_max"]) / 2,
+        direction=-1 if entry["drive_mode"] else 1,
+        low_count=entry["range_min"],
+        high_count=entry["range_max"],
+        homing_offset=entry["homing_offset"],
+    )

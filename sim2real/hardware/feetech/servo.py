@@ -1,0 +1,181 @@
+"""One emulated servo: its registers, and the rules of its firmware."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from sim2real.hardware.feetech import registers as reg
+from sim2real.hardware.feetech.registers import Register
+from sim2real.hardware.plant import OperatingMode
+
+STALL_CURRENT_A: Final = 2.7  # data sheet of the STS3215-C018, 12 V
+_MOVING_COUNTS_PER_S: Final = 50
+_FIXED: Final = (reg.ID, reg.BAUD_RATE)
+_MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS, reg.OPERATING_MODE)
+
+
+class StsServo:
+    """Registers and firmware of one STS3215, without time, bus and physics.
+
+    A value that does not fit is dropped without a word, as its status packets have no way to say so; so are writes to
+    registers that cannot be written. EEPROM registers may be written at any time; what was written while Lock is 1 is
+    forgotten at the next restart. Goals beyond the position limits are cut to them.
+
+    Assumed, as the worse for a driver, and not measured by us: a goal that is written switches the torque on
+    (`goal_wakes`), and after an alarm the motor is off while the torque register still says "on". Not emulated: the
+    torque that is left after an overload (Protective Torque), the step mode, other ids and baud rates.
+
+    Args:
+        servo_id: Its id on the bus.
+        model_number: Its model number.
+        return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
+        encoder_counts: Resolution of the encoder [counts per revolution].
+        goal_wakes: Whether writing a goal switches the torque on.
+        alarms: The alarms that `overload` sets; bits of the error byte.
+    """
+
+    def __init__(
+        self,
+        servo_id: int,
+        model_number: int = 777,
+        return_delay_us: int = 500,
+        encoder_counts: int = reg.COUNTS_PER_REVOLUTION,
+        goal_wakes: bool = True,
+        alarms: int = 1 << 5,
+    ) -> None:
+        self.servo_id = servo_id
+        self.heard_ns = 0
+        self.watchdog_stops = False
+        self._goal_wakes = goal_wakes
+        self._faults = alarms
+        self._encoder_counts = encoder_counts
+        self._memory = bytearray(reg.TABLE_BYTES)
+        self._registered: tuple[int, bytes] | None = None
+        for register in reg.TABLE.values():
+            self.put(register, register.default)
+        self.put(reg.MODEL_NUMBER, model_number)
+        self.put(reg.ID, servo_id)
+        self.put(reg.RETURN_DELAY_TIME, round(return_delay_us * 1e-6 / reg.RETURN_DELAY_UNIT_S))
+        self._saved = bytes(self._memory)
+
+    def get(self, register: Register) -> int:
+        """Return a register's value in counts."""
+        return register.decode(self._memory[register.address : register.end])
+
+    def put(self, register: Register, value: int) -> None:
+        """Set a register, without the checks of a write from the bus."""
+        self._memory[register.address : register.end] = register.encode(value)
+
+    @property
+    def alarms(self) -> int:
+        """The error byte of its status packets."""
+        return self.get(reg.STATUS)
+
+    def command(self) -> tuple[int, float]:
+        """Return what the motor is commanded to do, according to the registers.
+
+        Returns:
+            (mode, goal): PWM and a fraction in [-1, 1], POSITION [rad of the encoder], VELOCITY [rad/s], or OFF and 0.
+        """
+        if not self.get(reg.TORQUE_ENABLE) or self.alarms & self.get(reg.UNLOADING):
+            return OperatingMode.OFF, 0.0
+        mode = self.get(reg.OPERATING_MODE)
+        if mode == reg.Mode.PWM:
+            return OperatingMode.PWM, self.get(reg.GOAL_TIME) / reg.LOAD_FULL_SCALE
+        if mode == reg.Mode.VELOCITY:
+            return OperatingMode.VELOCITY, self.get(reg.GOAL_SPEED) * reg.speed_unit_rad_s(self.get(reg.PHASE))
+        low, high = self.get(reg.MIN_POSITION), self.get(reg.MAX_POSITION)
+        count = self.get(reg.GOAL_POSITION)
+        count = min(max(count, low), high) if (low, high) != (0, 0) else count  # 0 and 0: several turns
+        return OperatingMode.POSITION, (count + self.get(reg.HOMING_OFFSET)) * reg.RAD_PER_COUNT
+
+    def controller(self) -> tuple[int, int, float]:
+        """Return P gain and D gain of the position controller [counts], and the setpoint's top speed [rad/s]."""
+        phase, count = self.get(reg.PHASE), abs(self.get(reg.GOAL_SPEED))
+        unlimited = count == 0 and bool(phase & reg.PHASE_ZERO_IS_FASTEST)
+        speed_rad_s = math.inf if unlimited else count * reg.speed_unit_rad_s(phase)
+        return self.get(reg.P_GAIN), self.get(reg.D_GAIN), speed_rad_s
+
+    def acceleration_rad_s2(self) -> float:
+        """Return how fast the setpoint's speed may change [rad/s^2]."""
+        count = self.get(reg.ACCELERATION)
+        return count * reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT if count else math.inf
+
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int = 0) -> None:
+        """Set the Present registers from a measurement of the plant.
+
+        Args:
+            position_rad: Angle from the encoder's zero [rad].
+            velocity_rad_s: Speed [rad/s].
+            load: Fraction of the largest load, in [-1, 1].
+            tick_ms: Not used: it shows no time.
+        """
+        del tick_ms
+        step_rad = 2.0 * math.pi / self._encoder_counts
+        count = round(round(position_rad / step_rad) * step_rad / reg.RAD_PER_COUNT) - self.get(reg.HOMING_OFFSET)
+        phase = self.get(reg.PHASE)
+        shown = count if phase & reg.PHASE_FULL_ANGLE else count % reg.COUNTS_PER_REVOLUTION
+        load = max(-1.0, min(1.0, load))
+        self.put(reg.PRESENT_POSITION, shown)
+        self.put(reg.PRESENT_SPEED, round(velocity_rad_s / reg.speed_unit_rad_s(phase)))
+        self.put(reg.PRESENT_LOAD, round(load * reg.LOAD_FULL_SCALE))
+        self.put(reg.PRESENT_CURRENT, round(load * STALL_CURRENT_A / reg.CURRENT_UNIT_A))
+        self.put(reg.MOVING, abs(velocity_rad_s / reg.RAD_PER_COUNT) > _MOVING_COUNTS_PER_S)
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return the bytes that a READ is answered with; beyond the table, zeros."""
+        return bytes(self._memory[address : address + length]).ljust(length, b"\0")
+
+    def write(self, address: int, data: bytes) -> bool:
+        """Write registers; return whether `command` may have changed."""
+        torque_was_on, moved = self.get(reg.TORQUE_ENABLE), False
+        for register in sorted(reg.TABLE.values(), key=lambda r: r.address):
+            begin = register.address - address
+            if not 0 <= begin <= len(data) - register.size:
+                continue
+            value = register.decode(data[begin : begin + register.size])
+            if not register.writable or register in _FIXED or not register.minimum <= value <= register.maximum:
+                continue
+            self.put(register, value)
+            moved |= register in _MOTION
+            if register.eeprom and not self.get(reg.LOCK):
+                place = slice(register.address, register.end)
+                self._saved = self._saved[: place.start] + register.encode(value) + self._saved[place.stop :]
+            if register == reg.GOAL_POSITION and self._goal_wakes:
+                self.put(reg.TORQUE_ENABLE, 1)
+        return moved and bool(torque_was_on or self.get(reg.TORQUE_ENABLE))
+
+    def register_write(self, address: int, data: bytes) -> None:
+        """Store a REG_WRITE until the next ACTION."""
+        self._registered = (address, data)
+        self.put(reg.ASYNC_WRITE, 1)
+
+    def action(self) -> bool:
+        """Execute the stored write, if there is one; return whether `command` may have changed."""
+        if self._registered is None:
+            return False
+        address, data = self._registered
+        self._registered = None
+        self.put(reg.ASYNC_WRITE, 0)
+        return self.write(address, data)
+
+    def restart(self) -> None:
+        """Begin again as after a loss of power, torque off: EEPROM registers as saved, all others at their defaults."""
+        self._registered = None
+        self._memory[:] = self._saved
+        for register in reg.TABLE.values():
+            if not register.eeprom:
+                self.put(register, register.default)
+        self.put(reg.TORQUE_LIMIT, self.get(reg.MAX_TORQUE))
+
+    def overload(self) -> None:
+        """Report the alarms from now on; the motor is off as long as one of them is among the unloading conditions."""
+        self.put(reg.STATUS, self._faults)
+
+    def watchdog_deadline_ns(self) -> int | None:
+        """Return None: it has no bus watchdog."""
+        return None
+
+    def trip_watchdog(self) -> None:
+        """Do nothing: it has no bus watchdog."""

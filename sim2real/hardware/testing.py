@@ -1,0 +1,286 @@
+"""A conformance suite for devices: what every device does, on its emulator, in a few seconds.
+
+Fill in `make_device` in a test module of your own; pytest runs the rest:
+
+    from sim2real.hardware.testing import DeviceConformance
+
+    class TestMyServos(DeviceConformance):
+        emulation = MyEmulation
+        plant = "my_robot/plant.py:Plant"
+
+        def make_device(self, port):
+            return MyServos(port, ids=(1, 2))
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.device import Device, Reading
+from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation import Emulation
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.rig import Rig
+from sim2real.hardware.truth import Kind
+
+Started = Callable[..., tuple[EmbeddedRobot, Device]]
+
+_HOST = """
+import sys, time
+import numpy as np
+from sim2real.hardware.plant import load_named
+device = load_named({suite!r}, "suite")().make_device({port!r})
+device.open()
+device.enable()
+rest = device.rest()
+print("on", flush=True)
+while True:
+    device.command(rest)
+    device.measure()
+    time.sleep(0.01)
+"""
+
+
+class DeviceConformance(ABC):
+    """What the rig relies on in a device, on its emulator; a subclass says which device and emulator.
+
+    Attributes:
+        emulation: The class of the emulator's settings.
+        plant: ``module:Name`` or ``file.py:Name`` of a plant with the device's motors; see ``load_plant``.
+        plant_args: Keyword arguments of the plant.
+        settings: Settings of the emulator that the device needs, e.g. a model.
+        patience_s: Time in which a motor's torque must be off, on a busy machine too [s].
+    """
+
+    emulation: ClassVar[type[Emulation]]
+    plant: ClassVar[str]
+    plant_args: ClassVar[Mapping[str, Any]] = {}
+    settings: ClassVar[Mapping[str, Any]] = {}
+    patience_s: ClassVar[float] = 1.0
+
+    @abstractmethod
+    def make_device(self, port: str) -> Device:
+        """Return the device on a port, not opened yet, with a `silence_s` of 0.3 s to 1 s."""
+
+    @pytest.fixture
+    def start(self, tmp_path: Path) -> Iterator[Started]:
+        """Start an emulator with some settings, and return it with its device, not opened yet."""
+        robots, devices = [], []
+
+        def begin(**settings: Any) -> tuple[EmbeddedRobot, Device]:
+            config = self.emulation(**{**self.settings, **settings})
+            truth = tmp_path / f"truth{len(robots)}.bin"
+            robots.append(EmbeddedRobot(self.plant, config, self.plant_args, truth))
+            devices.append(self.make_device(robots[-1].port))
+            return robots[-1], devices[-1]
+
+        yield begin
+        for device in devices:
+            device.close()
+        for robot in robots:
+            robot.stop()
+
+    def play(self, device: Device, steps: int) -> list[Reading]:
+        """Command rest and measure, as a control loop does."""
+        rest, readings = device.rest(), []
+        for _ in range(steps):
+            device.command(rest)
+            readings.append(device.measure())
+        return readings
+
+    def require_off(self, robot: EmbeddedRobot, device: Device) -> None:
+        """Check on the emulator that every motor was driven, and that the last each was told is "torque off"."""
+        robot.stop()
+        rows = robot.truth().of(Kind.EFFECT)
+        last = {int(row["servo_id"]): int(row["values"][0]) for row in rows}
+        assert len(last) == len(device.motors), f"only {len(last)} of {len(device.motors)} motors were driven"
+        assert set(last.values()) == {OperatingMode.OFF}, f"the motors end in the modes {last}"
+
+    def test_a_closed_device_touches_nothing(self) -> None:
+        """It says what it is, and that nothing has happened, before its port is opened; its ways out do nothing."""
+        device = self.make_device("/dev/no-such-port")
+        assert device.motors
+        assert device.commanded.stale in ("zero", "hold")
+        assert {"position": "rad", "velocity": "rad/s"}.items() <= device.measures.items()
+        assert device.counters.transactions == 0
+        assert not device.torque_withheld
+        device.make_safe()
+        device.close()
+        with pytest.raises(HardwareLost):
+            device.open()
+
+    def test_it_opens_without_torque_and_says_what_it_does_alone(self, start: Started) -> None:
+        """Opening drives no motor; each is accounted for when the host dies; limits and rest have one entry each."""
+        robot, device = start()
+        with device:
+            alone = device.without_host()
+            assert sorted(name for kind in alone for name in kind.motors) == sorted(device.motors)
+            assert all(kind.after_s > 0.0 and kind.source and kind.model in str(kind) for kind in alone)
+            assert all(limit.shape == (len(device.motors),) for limit in device.reach())
+            device.measure()
+        robot.stop()
+        modes = robot.truth().of(Kind.EFFECT)["values"][:, 0]
+        assert set(modes.tolist()) <= {OperatingMode.OFF}
+
+    def test_a_reading_says_when_it_was_asked_for(self, start: Started) -> None:
+        """The stamp lies within the call, and is when the emulator got the instruction; the counters count it."""
+        robot, device = start(sensing_latency_s=0.004)
+        with device:
+            before, begin_ns = device.counters, time.monotonic_ns()
+            readings = [device.measure() for _ in range(20)]
+            end_ns = time.monotonic_ns()
+            done = device.counters
+        stamps = np.array([r.transaction.t_sent_ns for r in readings])
+        assert begin_ns <= stamps[0]
+        assert stamps[-1] <= end_ns
+        assert np.all(np.diff(stamps) > 0)
+        n = len(device.motors)
+        assert all(r.position_rad.shape == r.velocity_rad_s.shape == r.load.shape == (n,) for r in readings)
+        assert done.transactions - before.transactions >= 20
+        assert done.late_s.size >= 20
+        robot.stop()
+        samples = robot.truth().of(Kind.SAMPLE)
+        nearest = np.array([np.min(np.abs(samples["t_host_ns"] - t)) for t in stamps])
+        assert np.median(nearest) < 5e6
+        taken = np.median(samples["t_host_ns"] - samples["t_ns"]) * 1e-9
+        assert 0.002 < taken < 0.005
+
+    def test_torque_goes_on_at_rest_and_off_again(self, start: Started) -> None:
+        """Right after `enable` the motors stay where they are; `disable` ends it, and it can begin anew."""
+        robot, device = start()
+        with device:
+            still = device.measure().position_rad
+            for _ in range(2):
+                device.enable()
+                readings = self.play(device, 5)
+                device.disable()
+            np.testing.assert_allclose(readings[-1].position_rad, still, atol=0.05)
+            effort = device.effort(device.rest(), still)
+            assert effort.shape == still.shape
+            assert np.all(np.abs(effort) <= 1.0)
+        self.require_off(robot, device)
+
+    @pytest.mark.parametrize("fault", [{"reply_loss": 0.15}, {"corrupt": 0.15}, {"late": 0.15, "late_s": 0.012}])
+    def test_faults_are_survived_and_counted(self, start: Started, fault: Mapping[str, float]) -> None:
+        """Answers that are lost, corrupted or late cost retries, and never a wrong reading."""
+        _, device = start(seed=3, **fault)
+        with device:
+            readings = [device.measure() for _ in range(60)]
+            counters = device.counters
+        spread = np.ptp([r.position_rad for r in readings], axis=0)
+        assert np.all(spread < 0.05), f"the motors stand still, but their readings differ by {spread} rad"
+        assert counters.retries <= counters.lost_replies
+        assert (counters.late_replies if "late" in fault else counters.lost_replies) >= 2
+        if "late" not in fault:
+            assert max(r.transaction.retries for r in readings) >= 1
+
+    def test_silence_is_hardware_lost(self, start: Started) -> None:
+        """A device that no longer answers says so, to every call; its ways out still end, and raise nothing."""
+        _, device = start(silent_after_s=0.6)
+        with device:
+            device.enable()
+            with pytest.raises(HardwareLost):
+                self.play(device, 100_000)
+            device.make_safe()
+
+    @pytest.mark.parametrize("way", ["close", "exception", "make_safe", "another thread", "rig"])
+    def test_every_way_out_takes_the_torque_off(self, start: Started, way: str) -> None:
+        """Also while another thread is in the middle of an instruction; `make_safe` holds until it is opened anew."""
+        robot, device = start()
+        if way in ("rig", "exception"):
+            with pytest.raises(ZeroDivisionError):
+                (self._fail_in_a_rig if way == "rig" else self._fail)(device)
+        else:
+            device.open()
+            device.enable()
+            self.play(device, 3)
+            if way == "another thread":
+                self._stop_from_a_thread(device)
+            elif way == "make_safe":
+                device.make_safe()
+                with pytest.raises(SafetyStop):
+                    device.enable()
+            device.close()
+            device.close()
+        self.require_off(robot, device)
+
+    def test_a_host_that_is_killed_leaves_no_torque(self, start: Started) -> None:
+        """Something outside the process takes it off: nothing in it can any more."""
+        robot, device = start()
+        suite = f"{sys.modules[type(self).__module__].__file__}:{type(self).__name__}"
+        code = _HOST.format(suite=suite, port=robot.port)
+        host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert host.stdout is not None
+        assert host.stdout.readline() == "on\n"
+        time.sleep(0.1)
+        killed_ns = time.monotonic_ns()
+        host.kill()
+        host.communicate()
+        time.sleep(self.patience_s)
+        self.require_off(robot, device)
+        rows = robot.truth().of(Kind.EFFECT)
+        assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < self.patience_s
+
+    def test_a_dry_run_moves_nothing(self, start: Started) -> None:
+        """All goes on as it would, but no motor is driven; it is for good, and for before torque."""
+        robot, device = start()
+        with device:
+            device.withhold_torque()
+            assert device.torque_withheld
+            device.enable()
+            self.play(device, 5)
+            device.check()
+            assert device.counters.withheld >= 5
+            device.disable()
+            assert device.torque_withheld
+        robot.stop()
+        assert robot.truth().of(Kind.EFFECT).size == 0
+
+    def test_torque_that_is_on_cannot_be_withheld(self, start: Started) -> None:
+        """A dry run is decided before anything moves."""
+        _, device = start()
+        with device:
+            device.enable()
+            with pytest.raises(UsageError):
+                device.withhold_torque()
+
+    def _fail(self, device: Device) -> None:
+        with device:
+            device.enable()
+            self.play(device, 3)
+            raise ZeroDivisionError
+
+    def _fail_in_a_rig(self, device: Device) -> None:
+        with Rig(device, GateConfig(0.5, stale=device.commanded.stale)) as rig:
+            rig.start()
+            rig.measure()
+            raise ZeroDivisionError
+
+    def _stop_from_a_thread(self, device: Device) -> None:
+        def loop() -> None:
+            try:
+                while True:
+                    self.play(device, 1)
+            except (HardwareLost, SafetyStop):
+                return
+
+        busy = threading.Thread(target=loop, daemon=True)
+        busy.start()
+        time.sleep(0.05)
+        threading.Thread(target=device.make_safe).start()
+        time.sleep(0.05)
+        device.close()
+        busy.join(5.0)
+        assert not busy.is_alive(), "a loop that went on was not told that the torque is off"

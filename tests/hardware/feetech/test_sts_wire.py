@@ -1,0 +1,252 @@
+"""The emulated bus and its servos in virtual time, where every instant can be told exactly."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.hardware.feetech import registers as reg
+from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.feetech.profile import ProfiledPlant
+from sim2real.hardware.feetech.protocol import BROADCAST_ID, Instruction, build, sync_write
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.truth import Kind
+
+MS = 1_000_000
+READ_STATE = build(1, Instruction.READ, b"\x38\x06")
+OK = bytes.fromhex("FFFF010200FC")
+
+
+def write(register, value, servo_id=1):
+    return build(servo_id, Instruction.WRITE, bytes((register.address,)) + register.encode(value))
+
+
+def read(bench, register, servo_id=1):
+    answer = bench.ask(build(servo_id, Instruction.READ, bytes((register.address, register.size))))
+    return register.decode(answer[5:-1])
+
+
+def stiffen(bench):
+    """Let the plant follow its goals fast."""
+    bench.ask(write(reg.P_GAIN, 254))
+
+
+def at(*counts):
+    """Where the joints of the plant must be for their servos to read these counts [rad]."""
+    return [count * reg.RAD_PER_COUNT - math.pi for count in counts]
+
+
+def test_answers_are_those_of_the_manuals_examples(make_bench):
+    bench = make_bench(ids=[1, 2], start_rad=at(2048, 2047))
+    for servo_id, voltage, temperature in ((1, 0x79, 0x1E), (2, 0x77, 0x23)):
+        bench.servos[servo_id].put(reg.PRESENT_VOLTAGE, voltage)
+        bench.servos[servo_id].put(reg.PRESENT_TEMPERATURE, temperature)
+    assert bench.ask(bytes.fromhex("FFFF010201FB")) == OK
+    assert bench.ask(bytes.fromhex("FFFF0109032A00080000E803D5")) == OK
+    assert bench.ask(bytes.fromhex("FFFF0109042A00080000E803D4")) == OK
+    assert bench.ask(bytes.fromhex("FFFFFE0205FA")) == b""
+    assert bench.ask(bytes.fromhex("FFFFFE0682380801 0236")) == bytes.fromhex(
+        "FFFF010A0000080000 0000791E55 FFFF020A00FF070000 0000772353"
+    )
+
+
+def test_a_position_as_in_the_manuals_example(make_bench):
+    bench = make_bench(ids=[1], start_rad=at(1304))
+    assert bench.ask(bytes.fromhex("FFFF0104023802BE")) == bytes.fromhex("FFFF0104001805DD")
+
+
+@pytest.mark.parametrize("baud_rate", [1_000_000, 57_600])
+def test_an_answer_takes_the_time_of_its_bytes_and_the_return_delay(make_bench, baud_rate):
+    bench = make_bench("Ramp", StsEmulation(return_delay_us=100, baud_rate=baud_rate))
+    bench.send(50 * MS, READ_STATE)
+    bench.run_until(80 * MS)
+    ((t_ns, answer),) = bench.sent
+    assert (len(READ_STATE), len(answer)) == (8, 12)
+    assert t_ns == pytest.approx(50 * MS + (8 + 12) * 1e10 / baud_rate + 100_000, abs=2)
+
+
+def test_several_servos_answer_one_after_the_other_in_the_order_asked(make_bench):
+    bench = make_bench()
+    packet = build(BROADCAST_ID, Instruction.SYNC_READ, b"\x38\x02" + bytes([3, 9, 1]))
+    bench.send(50 * MS, packet)
+    bench.run_until(60 * MS)
+    begin_ns = 50 * MS + len(packet) * 10_000
+    assert [(t_ns, answer[2]) for t_ns, answer in bench.sent] == [(begin_ns + 80_000, 3), (begin_ns + 160_000, 1)]
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.0037])
+def test_a_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
+    bench = make_bench("Ramp", StsEmulation(return_delay_us=0, sensing_latency_s=latency_s))
+    bench.send(3_000 * MS + 123_457, READ_STATE)
+    bench.run_until(3_010 * MS)
+    shown = reg.PRESENT_POSITION.decode(bench.sent[0][1][5:7])
+    (sample,) = bench.truth().of(Kind.SAMPLE)
+    assert sample["t_ns"] == 3_000 * MS + 123_457 + 80_000 - round(latency_s * 1e9)
+    assert shown == round(0.4 * sample["t_ns"] * 1e-9 / reg.RAD_PER_COUNT)
+
+
+def test_a_goal_takes_effect_after_the_actuation_latency_at_all_servos_at_once(make_bench):
+    bench = make_bench(config=StsEmulation(actuation_latency_s=0.006))
+    goal = sync_write(reg.GOAL_POSITION.address, {i: reg.GOAL_POSITION.encode(2000 + i) for i in (1, 2, 3)})
+    bench.send(50 * MS, goal)
+    bench.run_until(100 * MS)
+    effects = bench.truth().of(Kind.EFFECT)
+    assert np.all(effects["t_ns"] - effects["late_ns"] == 50 * MS + len(goal) * 10_000 + 6 * MS)
+    assert effects["values"][:, 0].tolist() == [OperatingMode.POSITION] * 3
+    assert effects["values"][:, 1] / reg.RAD_PER_COUNT == pytest.approx([2001, 2002, 2003])
+
+
+@pytest.mark.parametrize("wakes", [True, False])
+def test_torque_and_goals(make_bench, wakes):
+    bench = make_bench("Joints", StsEmulation(goal_wakes=wakes), ids=[1], start_rad=at(2000))
+    stiffen(bench)
+    bench.ask(write(reg.GOAL_POSITION, 2100))
+    assert read(bench, reg.TORQUE_ENABLE) == wakes
+    bench.ask(write(reg.TORQUE_ENABLE, 1))
+    bench.run_until(1_500 * MS)
+    assert read(bench, reg.PRESENT_POSITION) == pytest.approx(2100, abs=1)
+    bench.ask(write(reg.TORQUE_ENABLE, 0))
+    assert bench.truth().of(Kind.EFFECT)[-1]["values"][0] == OperatingMode.OFF
+
+
+def test_what_is_written_while_the_lock_is_on_is_forgotten_without_power(make_bench):
+    bench = make_bench(ids=[1], start_rad=at(2000))
+    for lock, p_gain in ((0, 20), (1, 40)):
+        bench.ask(write(reg.LOCK, lock))
+        bench.ask(write(reg.P_GAIN, p_gain))
+        assert read(bench, reg.P_GAIN) == p_gain
+    bench.ask(write(reg.GOAL_POSITION, 2000))
+    bench.ask(build(1, Instruction.RESTART))
+    assert read(bench, reg.P_GAIN) == 20
+    assert read(bench, reg.LOCK) == 1
+    assert read(bench, reg.TORQUE_ENABLE) == 0
+    assert bench.plant.told[-1][2:4] == (20, 32)
+
+
+def test_the_offset_moves_what_is_read_and_where_goals_are(make_bench):
+    bench = make_bench("Joints", StsEmulation(homing_offset=-500), ids=[1], start_rad=at(1500))
+    assert read(bench, reg.PRESENT_POSITION) == 2000
+    stiffen(bench)
+    bench.ask(write(reg.GOAL_POSITION, 2048))
+    bench.run_until(2_000 * MS)
+    assert bench.plant.measure(1)[0] / reg.RAD_PER_COUNT == pytest.approx(1548, abs=1)
+    assert read(bench, reg.PRESENT_POSITION) == pytest.approx(2048, abs=1)
+
+
+def test_positions_wrap_unless_turns_are_counted(make_bench):
+    bench = make_bench("Joints", StsEmulation(homing_offset=300), ids=[1], start_rad=at(200))
+    assert read(bench, reg.PRESENT_POSITION) == 3996
+    bench.ask(write(reg.PHASE, reg.PHASE.default | reg.PHASE_FULL_ANGLE))
+    assert read(bench, reg.PRESENT_POSITION) == -100
+
+
+def test_goals_are_cut_to_the_limits_and_bad_values_dropped_without_a_word(make_bench):
+    bench = make_bench(ids=[1], start_rad=at(2000))
+    stiffen(bench)
+    bench.ask(write(reg.MAX_POSITION, 2050))
+    assert bench.ask(write(reg.GOAL_POSITION, 3000)) == OK
+    for register, value in ((reg.OPERATING_MODE, 9), (reg.PRESENT_POSITION, 5), (reg.ID, 7)):
+        assert bench.ask(write(register, value)) == OK
+    assert (read(bench, reg.OPERATING_MODE), read(bench, reg.ID)) == (0, 1)
+    bench.run_until(2_000 * MS)
+    assert read(bench, reg.PRESENT_POSITION) == pytest.approx(2050, abs=1)
+
+
+def test_other_modes(make_bench):
+    bench = make_bench("FirstOrder")
+    for mode, register, value in ((reg.Mode.PWM, reg.GOAL_TIME, -500), (1, reg.GOAL_SPEED, 1000)):
+        bench.ask(write(reg.OPERATING_MODE, mode))
+        bench.ask(write(register, value))
+        bench.ask(write(reg.TORQUE_ENABLE, 1))
+        bench.run_until(bench.now_ns + 400 * MS)
+        expected = -0.5 * 6.0 if register is reg.GOAL_TIME else 1000 * reg.RAD_PER_COUNT
+        assert read(bench, reg.PRESENT_SPEED) * reg.RAD_PER_COUNT == pytest.approx(expected, rel=0.01)
+        if register is reg.GOAL_TIME:
+            assert read(bench, reg.PRESENT_LOAD) == -500
+            assert read(bench, reg.PRESENT_CURRENT) * reg.CURRENT_UNIT_A == pytest.approx(-1.35, abs=0.01)
+            assert read(bench, reg.MOVING) == 1
+
+
+def test_the_response_level_and_broken_or_strange_instructions(make_bench):
+    bench = make_bench()
+    bench.ask(write(reg.RESPONSE_LEVEL, 0))
+    assert bench.ask(write(reg.ACCELERATION, 3)) == b""
+    assert read(bench, reg.ACCELERATION) == 3
+    broken = bytearray(build(2, Instruction.PING))
+    broken[-1] ^= 1
+    assert bench.ask(bytes(broken)) == b""
+    assert bench.ask(build(2, 0x77)) == b""
+    assert bench.ask(build(BROADCAST_ID, Instruction.PING)) == b""  # three at once
+    assert bench.ask(build(2, Instruction.PING)) == bytes.fromhex("FFFF020200FB")
+
+
+def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(make_bench):
+    bench = make_bench("Joints", StsEmulation(overload_after_s=0.1, alarms=0x21), ids=[1], start_rad=at(2000))
+    bench.ask(write(reg.GOAL_POSITION, 2048))
+    bench.run_until(120 * MS)
+    answer = bench.ask(READ_STATE)
+    assert answer[4] == 0x21
+    assert read(bench, reg.TORQUE_ENABLE) == 1
+    bench.ask(write(reg.GOAL_POSITION, 2060))
+    bench.ask(build(1, Instruction.RESTART))
+    assert bench.ask(READ_STATE)[4] == 0
+    modes = bench.truth().of(Kind.EFFECT)["values"][:, 0]
+    assert modes.tolist() == [OperatingMode.POSITION] + [OperatingMode.OFF] * 3
+
+
+def test_wrong_ids_and_cut_answers(make_bench):
+    bench = make_bench("Ramp", StsEmulation(wrong_id=0.3, cut=0.3, seed=1))
+    answers = [bench.ask(READ_STATE) for _ in range(60)]
+    assert 10 < sum(len(answer) == 4 for answer in answers) < 30
+    assert 10 < sum(answer[2] == 0x41 for answer in answers) < 30
+
+
+@pytest.mark.parametrize("bad", [{"wrong_id": 2.0}, {"alarms": 0}, {"homing_offset": 3000}, {"corrupt": -1.0}])
+def test_configurations_that_make_no_sense(bad):
+    with pytest.raises(UsageError, match=next(iter(bad))):
+        StsEmulation(**bad)
+
+
+class Follower:
+    """A plant that is where its setpoint is."""
+
+    servo_ids = (1,)
+
+    def __init__(self):
+        self.at = 0.0
+
+    def advance(self, t_s):
+        pass
+
+    def command(self, servo_id, mode, goal):
+        self.at = goal if mode == OperatingMode.POSITION else self.at
+
+    def measure(self, servo_id):
+        return self.at, 0.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "took_s"),
+    [(2.0, math.inf, 0.5), (2.0, 8.0, 0.5 + 0.25), (100.0, 4.0, 1.0), (math.inf, math.inf, 0.0)],
+)
+def test_a_setpoint_reaches_its_goal_as_a_trapezoid_does(speed, acceleration, took_s):
+    plant = ProfiledPlant(Follower())
+    plant.configure(1, 32, 32, speed)
+    plant.accelerate(1, acceleration)
+    plant.command(1, OperatingMode.POSITION, 1.0)
+    path = []
+    for k in range(1, 3000):
+        plant.advance(k * 0.0005)
+        path.append(plant.measure(1)[0])
+    speeds = np.diff([0.0, *path]) / 0.0005
+    assert path[-1] == pytest.approx(1.0, abs=1e-12)
+    assert max(path) <= 1.0 + 1e-9
+    assert np.argmax(np.array(path) > 1.0 - 1e-6) * 0.0005 == pytest.approx(took_s, abs=0.004)
+    if took_s:
+        assert speeds.max() <= speed * (1 + 1e-9)
+        assert np.abs(np.diff(speeds)).max() <= acceleration * 0.0005 * 1.01
+    plant.command(1, OperatingMode.POSITION, 0.4)
+    for k in range(3000, 6000):
+        plant.advance(k * 0.0005)
+    assert plant.measure(1)[0] == pytest.approx(0.4, abs=1e-12)
