@@ -104,7 +104,8 @@ def test_what_is_imported_is_declared(imported):
     declared = {package_of(r) for r in sum(EXTRAS.values(), PROJECT["dependencies"])}
     known = {*sys.stdlib_module_names, "sim2real", "pipelines", *(name.partition(".")[0] for name in declared)}
     strangers = {(m, name) for m, names in imported.items() for name in names if name.partition(".")[0] not in known}
-    assert not strangers
+    # Suites that plug-ins run in their own tests: who calls them has pytest.
+    assert {(m, name) for m, name in strangers if not (m.endswith(".testing") and name == "pytest")} == set()
 
 
 def test_every_extra_says_who_imports_it():

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any, Final, Self, cast
 
 from sim2real.errors import HardwareLost
-from sim2real.hardware.emulation import Emulation
+from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.truth import Truth, read_truth
 
 _LOGGER = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ class EmbeddedRobot:
     def __init__(
         self,
         plant: str,
-        config: Emulation,
+        config: BusEmulation,
         plant_args: Mapping[str, Any] | None = None,
         truth_path: Path | str | None = None,
     ) -> None:

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from sim2real.errors import UsageError
 
-if TYPE_CHECKING:
-    from sim2real.hardware.planned import PlannedBus
-    from sim2real.hardware.plant import Plant
-    from sim2real.hardware.truth import TruthLog
-
 
 @dataclass(frozen=True)
-class Emulation(ABC):
+class Emulation:
     """Settings of the emulated bus and servos; times of faults count from the emulator's start.
 
     Args:
@@ -77,14 +69,3 @@ class Emulation(ABC):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
-
-    @abstractmethod
-    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
-        """Return the emulated bus with these settings.
-
-        Args:
-            plant: The mechanism.
-            truth: Log of true states and latencies.
-            send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
-            start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
-        """

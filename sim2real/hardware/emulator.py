@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.hardware.emulation import Emulation
-from sim2real.hardware.planned import PlannedBus, truth_header
+from sim2real.hardware.planned import BusEmulation, PlannedBus, truth_header
 from sim2real.hardware.plant import load_named, load_plant
 from sim2real.hardware.truth import TruthLog
 
@@ -116,7 +115,7 @@ def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     parser.add_argument("--emulation", required=True, metavar=place, help="the settings, which say what bus it is")
     named = parser.parse_known_args(arguments)[0]
     settings = load_named(named.emulation, "emulation")
-    if not (isinstance(settings, type) and issubclass(settings, Emulation)):
+    if not (isinstance(settings, type) and issubclass(settings, BusEmulation)):
         raise UsageError(f"emulation {named.emulation!r} is no class of settings of an emulated bus")
     parser.set_defaults(settings=settings)
     parser.add_argument("-h", "--help", action="help")

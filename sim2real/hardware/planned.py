@@ -286,6 +286,22 @@ class PlannedBus(ABC):
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
 
 
+@dataclass(frozen=True)
+class BusEmulation(Emulation, ABC):
+    """Settings that know which bus they are for; see `Emulation` for what they are."""
+
+    @abstractmethod
+    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
+        """Return the emulated bus with these settings.
+
+        Args:
+            plant: The mechanism.
+            truth: Log of true states and latencies.
+            send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+            start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
+        """
+
+
 def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, Any]:
     """Return the header of a truth file.
 

@@ -4,8 +4,7 @@ import pytest
 
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.dynamixel.wire import EmulatedBus
+from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.planned import truth_header
 from sim2real.hardware.plant import OperatingMode, load_plant

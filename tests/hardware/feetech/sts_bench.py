@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sim2real.hardware import emulator
-from sim2real.hardware.feetech.wire import StsBus
+from sim2real.hardware.feetech.emulation import StsBus
 from sim2real.hardware.planned import truth_header
 from sim2real.hardware.plant import load_plant
 from sim2real.hardware.truth import TruthLog, read_truth
