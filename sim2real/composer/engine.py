@@ -219,7 +219,7 @@ class Camera:
             model, data, self._option, aspect, *cursor_position, self._scene, position, geom, flex, skin
         )
         found = [None if i == -1 else int(i) for i in (body, geom[0], flex[0], skin[0])]
-        return Selected(*found, None if all(i is None for i in found) else position)
+        return Selected(*found, world_position=None if all(i is None for i in found) else position)
 
 
 class MovableCamera(Camera):
