@@ -1,7 +1,7 @@
 """Draw the pictures of timing.md: `python docs/draw_timing.py` writes docs/timing/*.svg.
 
-What they show is computed by `sim2real.graph.schedule`, and stands in each file's description as well: a test compares
-it with what the code computes now.
+What they show is computed by `sim2real.graph.rules` and `schedule`, and stands in each file's description as well: a
+test compares it with what the code computes now.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sim2real.graph.node import BaseNode, Jitter, Scheduling, to_ticks
-from sim2real.graph.schedule import derive, eligible, slot
-from sim2real.graph.timeline import NEVER, Timeline
+from sim2real.graph.rules import eligible, slot
+from sim2real.graph.schedule import derive
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import NEVER
 
 FOLDER = Path(__file__).resolve().parent / "timing"
 INK, MUTED, GRID = "#1b2430", "#5c6875", "#d9dfe6"

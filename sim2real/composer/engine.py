@@ -218,9 +218,8 @@ class Camera:
         body = mj.mjv_select(
             model, data, self._option, aspect, *cursor_position, self._scene, position, geom, flex, skin
         )
-        body, geom, flex, skin = (None if i == -1 else int(i) for i in (body, geom[0], flex[0], skin[0]))
-        nothing = body is None and geom is None and flex is None and skin is None
-        return Selected(body, geom, flex, skin, None if nothing else position)
+        found = [None if i == -1 else int(i) for i in (body, geom[0], flex[0], skin[0])]
+        return Selected(*found, world_position=None if all(i is None for i in found) else position)
 
 
 class MovableCamera(Camera):

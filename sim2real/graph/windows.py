@@ -9,7 +9,8 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, to_ticks
-from sim2real.graph.timeline import NEVER, Edge, Timeline, Vertex, search_rows
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
 
 _ROUNDING = 2
 """Each slot is rounded to whole ticks, so the distance of two may be this much smaller than the period [ticks]."""

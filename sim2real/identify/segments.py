@@ -12,7 +12,8 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
-from sim2real.graph.timeline import Timeline, Vertex
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Vertex
 from sim2real.identify.model import IdentifiableModel
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.graph.episode import MessageRecord
 from sim2real.graph.node import Connection
-from sim2real.graph.schedule import eligible, quota
+from sim2real.graph.rules import eligible, quota
 from sim2real.runtime.clock import MonotonicClock
 from sim2real.runtime.data import Message
 from sim2real.runtime.failure import Stopped

@@ -11,7 +11,8 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.node import BaseNode
-from sim2real.graph.timeline import NEVER, Timeline
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import NEVER
 
 
 def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timeline) -> dict[str, BaseNode]:

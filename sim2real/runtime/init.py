@@ -14,7 +14,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, phase_ticks
-from sim2real.graph.schedule import waits_for_schedule
+from sim2real.graph.rules import waits_for_schedule
 
 OUTPUTS = "outputs"
 """Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""

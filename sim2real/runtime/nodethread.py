@@ -11,7 +11,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Recorder, StepRecord
 from sim2real.graph.node import phase_ticks
-from sim2real.graph.schedule import next_drift, slot, start, waits_for_schedule
+from sim2real.graph.rules import next_drift, slot, start, waits_for_schedule
 from sim2real.runtime.channel import Channel, Table
 from sim2real.runtime.clock import MonotonicClock
 from sim2real.runtime.data import NodeData

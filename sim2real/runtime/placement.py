@@ -16,7 +16,8 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.graph.schedule import topological
-from sim2real.graph.timeline import Edge, Timeline, search_rows
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Edge, search_rows
 from sim2real.graph.windows import newest_message
 from sim2real.runtime.slots import Heard, Steps, arrange
 

@@ -13,8 +13,10 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
-from sim2real.graph.schedule import at_delay, next_drift, slot, topological
-from sim2real.graph.timeline import Edge, Timeline
+from sim2real.graph.rules import at_delay, next_drift, slot
+from sim2real.graph.schedule import topological
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Edge
 from sim2real.runtime.data import Message, NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout, named
 from sim2real.runtime.handover import Reply

@@ -14,7 +14,8 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode
-from sim2real.graph.timeline import NEVER, Timeline, Vertex, search_rows
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import NEVER, Vertex, search_rows
 from sim2real.graph.windows import check_bursts, longest_burst
 from sim2real.runtime.placement import Placement, Placer
 

@@ -19,7 +19,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps, named_leaves
 from sim2real.graph.node import TICKS_PER_S, to_ticks
 from sim2real.graph.schedule import draw
-from sim2real.graph.timeline import Vertex
+from sim2real.graph.times import Vertex
 from sim2real.identify import excitation, identifiability, uncertainty
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable

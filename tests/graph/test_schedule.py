@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, Timeline, TrainableDist
-from sim2real.graph.schedule import NEVER, derive, draw, eligible, quota, slot
+from sim2real.graph.rules import eligible, quota, slot
+from sim2real.graph.schedule import derive, draw
 from sim2real.graph.testing import Reference, random_graph
-from sim2real.graph.timeline import Vertex
+from sim2real.graph.times import NEVER, Vertex
 
 MS = 1000
 

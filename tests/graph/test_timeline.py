@@ -10,7 +10,7 @@ from sim2real.graph import BaseNode, Timeline
 from sim2real.graph.episode import MemoryRecorder, MessageRecord, StepRecord
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import random_graph
-from sim2real.graph.timeline import NEVER, search_rows
+from sim2real.graph.times import NEVER, search_rows
 
 
 def same(a: Timeline, b: Timeline):

@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Timeline, TrainableDist
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import HashInPython, Value, contracting_node, hash_node, jax_hash_node
-from sim2real.graph.timeline import Vertex
+from sim2real.graph.times import Vertex
 from sim2real.graph.windows import bursty_episodes
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
