@@ -52,7 +52,7 @@ def load_device(name: str) -> DeviceFactory:
     if isinstance(source, str):
         return load_named(source, "device")
     try:
-        factory = source.load()
+        factory: Any = source.load()
     except (ImportError, AttributeError) as error:
         raise UsageError(f"device {name!r} ({source.value}) cannot be imported: {error}") from error
     if not callable(factory):
