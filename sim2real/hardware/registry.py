@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import metadata
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, cast
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import Device
@@ -52,7 +52,7 @@ def load_device(name: str) -> DeviceFactory:
     if isinstance(source, str):
         return load_named(source, "device")
     try:
-        factory: Any = source.load()
+        factory = source.load()
     except (ImportError, AttributeError) as error:
         raise UsageError(f"device {name!r} ({source.value}) cannot be imported: {error}") from error
     if not callable(factory):
@@ -60,4 +60,4 @@ def load_device(name: str) -> DeviceFactory:
             f"device {name!r} ({source.value}) is {type(factory).__name__}, not a callable that makes a Device",
             hint="see sim2real.hardware.registry.DeviceFactory",
         )
-    return factory
+    return cast(DeviceFactory, factory)
