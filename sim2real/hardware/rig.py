@@ -122,8 +122,9 @@ class Rig:
         sent = self._sent
         reading = self.device.measure()
         position, asked = reading.position_rad, reading.transaction
-        withheld = self.torque_withheld
-        effort = np.zeros(len(position)) if sent is None or withheld else self.device.effort(sent, position)
+        effort = np.zeros(len(position))
+        if sent is not None and not self.torque_withheld:
+            effort = self.device.effort(sent, position)
         self._plausibility.check(position, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
         self._speed_rad_s = reading.velocity_rad_s
         return reading
