@@ -102,18 +102,20 @@ def test_every_kind_of_import_is_seen(source, rooms):
 Documented = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def is_setter(node: Documented) -> bool:
-    return any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list)
+def is_more_of_another(node: Documented) -> bool:
+    """Return whether a definition is the setter of a property, or another signature of a function."""
+    setter = any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list)
+    return setter or any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list)
 
 
 def public(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, Documented, str]]:
     """Yield dotted name, definition and docstring of the public classes, functions and methods in a body.
 
-    A constructor has the docstring of its class. Nested functions, members of private classes and the setters of
-    properties do not count.
+    A constructor has the docstring of its class. Nested functions, members of private classes, the setters of
+    properties and overloads do not count.
     """
     for node in body:
-        if isinstance(node, Documented) and not node.name.startswith("_") and not is_setter(node):
+        if isinstance(node, Documented) and not node.name.startswith("_") and not is_more_of_another(node):
             yield prefix + node.name, node, ast.get_docstring(node) or ""
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from public(node.body, f"{prefix}{node.name}.")

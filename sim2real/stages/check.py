@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
+from sim2real.robots.base import Robot
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
@@ -34,7 +35,7 @@ from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording
-from sim2real.stages.robot import Identifiable
+from sim2real.stages.robot import moving_robot
 
 PLANNED = "planned excitation"
 _LEAST_S = 0.3
@@ -61,13 +62,13 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
-    robot = cast(Identifiable, pipeline.load())
+    robot = pipeline.load()
     # A robust loss would let what is wrong with the nominal model hide what the data tells.
     fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)
     parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     source = find_source(pipeline, config, model, parameters, fitting)
-    found = judge(model, source, fitting, parameters, dict(robot.UNITS))
+    found = judge(model, source, fitting, parameters, dict(robot.units))
     found = {"pipeline": pipeline.name, **found}
     found["recommendation"] = advice.recommend(found, pipeline.name)
     if config.json:
@@ -110,8 +111,7 @@ def find_source(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",
         )
-    robot: Any = pipeline.load()
-    return Source([PLANNED], [simulate(model, robot, config.record, parameters, fitting)], True)
+    return Source([PLANNED], [simulate(model, moving_robot(pipeline), config.record, parameters, fitting)], True)
 
 
 def judge(
@@ -215,12 +215,12 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
 
 
 def simulate(
-    model: IdentifiableModel, robot: Any, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
+    model: IdentifiableModel, robot: Robot, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
 ) -> Episode:
     """Return what the model at its nominal values would be recorded to do under the planned excitation."""
     nodes = model.nodes(config.max_delay_s)
-    node, field = robot.COMMAND
-    signal = command_signal(record, robot.RATE_HZ, len(robot.ACTION))
+    node, field = robot.roles.actuator, robot.command
+    signal = command_signal(record, robot.rate_hz, len(robot.action))
     timeline = draw(nodes, record.duration_s, rng=record.seed)
     given, outputs = {}, {}
     for name in model.given:
@@ -370,5 +370,4 @@ def _steps(vertex: Vertex, count: int, early: int) -> Steps:
 
 def _plannable(pipeline: Pipeline) -> bool:
     """Return whether the robot can be excited by us: one that is only known from recordings cannot."""
-    robot = pipeline.load()
-    return hasattr(robot, "COMMAND") and hasattr(robot, "RATE_HZ")
+    return isinstance(pipeline.load(), Robot)
