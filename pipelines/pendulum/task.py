@@ -24,7 +24,7 @@ def upright(th: Any, thdot: Any) -> Any:
 
 
 class SwingUp:
-    """The task of the pendulum; see ``sim2real.train.env.Task``.
+    """The task of the pendulum; see ``sim2real.train.env.TrainingTask``.
 
     Args:
         agent: The agent's node of the graph.

@@ -23,13 +23,13 @@ from sim2real.hardware.config import GateLimits
 from sim2real.identify.model import IdentifiableModel
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.roles import ROLES, Roles
-from sim2real.train.env import Task
+from sim2real.train.env import TrainingTask
 
 if TYPE_CHECKING:
     from sim2real.hardware.embedded import EmbeddedRobot
     from sim2real.hardware.rig import ServoRig
 
-Kind = tuple[str, Callable[[Any], bool]]
+_Kind = tuple[str, Callable[[Any], bool]]
 """What a robot's datum must be, in words, and the test for it."""
 
 
@@ -66,7 +66,7 @@ class RecordedRobot(ABC):
     units: Mapping[str, str]
     roles: Roles = ROLES
 
-    _DATA: ClassVar[Mapping[str, Kind]] = {
+    _DATA: ClassVar[Mapping[str, _Kind]] = {
         "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),
         "roles": ("sim2real.robots.roles.Roles with four different names", _roles),
     }
@@ -120,7 +120,7 @@ class Robot(RecordedRobot):
     observation: tuple[ObservationTerm, ...]
     action: tuple[ActionTerm, ...]
 
-    _DATA: ClassVar[Mapping[str, Kind]] = {
+    _DATA: ClassVar[Mapping[str, _Kind]] = {
         **RecordedRobot._DATA,
         "rate_hz": ("a number above 0 [Hz]", _rate),
         "command": ("the name of a field", lambda value: isinstance(value, str) and bool(value)),
@@ -181,7 +181,7 @@ class Robot(RecordedRobot):
         draws: Mapping[str, np.ndarray],
         computation: Mapping[str, DelayDistribution],
         delays: bool,
-    ) -> tuple[dict[str, BaseNode], Task]:
+    ) -> tuple[dict[str, BaseNode], TrainingTask]:
         """Return the graph in simulation, and the training task.
 
         Args:

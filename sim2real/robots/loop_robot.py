@@ -22,7 +22,7 @@ from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, in_a_loop, simulated_loop
-from sim2real.train.env import Task
+from sim2real.train.env import TrainingTask
 
 
 class LoopRobot(Robot):
@@ -73,7 +73,7 @@ class LoopRobot(Robot):
     @abstractmethod
     def training_task(
         self, agent: BaseNode, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> Task:
+    ) -> TrainingTask:
         """Return the task of a policy.
 
         Args:
@@ -169,7 +169,7 @@ class LoopRobot(Robot):
         draws: Mapping[str, np.ndarray],
         computation: Mapping[str, DelayDistribution],
         delays: bool,
-    ) -> tuple[dict[str, BaseNode], Task]:
+    ) -> tuple[dict[str, BaseNode], TrainingTask]:
         """Return the loop in simulation and the task.
 
         Args:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ServoTask:
-    """The training task of a servo robot; see ``sim2real.train.env.Task``.
+    """The training task of a servo robot; see ``sim2real.train.env.TrainingTask``.
 
     Args:
         robot: The robot.

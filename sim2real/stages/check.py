@@ -44,7 +44,7 @@ _MOST_SEGMENTS = 120
 
 
 @dataclass(frozen=True)
-class Source:
+class JudgedLogs:
     """What is judged: recordings, or one that was simulated."""
 
     names: list[str]
@@ -84,7 +84,7 @@ def find_source(
     model: IdentifiableModel,
     parameters: ParameterTable,
     fitting: IdentifyConfig,
-) -> Source:
+) -> JudgedLogs:
     """Return the logs that were named, the newest recording, or what recording would give.
 
     Raises:
@@ -105,18 +105,18 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return Source([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
+        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
     if not _plannable(pipeline):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",
         )
-    return Source([PLANNED], [simulate(model, moving_robot(pipeline), config.record, parameters, fitting)], True)
+    return JudgedLogs([PLANNED], [simulate(model, moving_robot(pipeline), config.record, parameters, fitting)], True)
 
 
 def judge(
     model: IdentifiableModel,
-    source: Source,
+    source: JudgedLogs,
     config: IdentifyConfig,
     parameters: ParameterTable,
     units: dict[str, str],
@@ -358,7 +358,7 @@ def _motion_rows(joints: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
     return rows, ["joint", "time in motion", "of it upwards", "reversals"]
 
 
-def _as_json(found: excitation.Spread) -> dict[str, Any]:
+def _as_json(found: excitation.Histogram) -> dict[str, Any]:
     return {**asdict(found), "covered": found.covered}
 
 

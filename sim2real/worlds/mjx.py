@@ -33,7 +33,7 @@ class MjxParams(Base):
 
 
 @struct.dataclass
-class JointState(Base):
+class MjxState(Base):
     """The world's output.
 
     Attributes:
@@ -100,12 +100,12 @@ class MjxWorld(BaseWorld):
         data = mjx.make_data(self.model).replace(qpos=params.qpos, qvel=params.qvel)
         return mjx.forward(params.model, data)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxState:
         """Return positions and velocities at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return JointState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
+        return MjxState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
 
-    def step(self, step_state: StepState) -> tuple[StepState, JointState]:
+    def step(self, step_state: StepState) -> tuple[StepState, MjxState]:
         """Integrate over one tick under the newest control."""
         model = step_state.params.model
         control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
@@ -115,4 +115,4 @@ class MjxWorld(BaseWorld):
         else:
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=self.substeps)
         new = step_state.replace(state=data)  # pyright: ignore[reportAttributeAccessIssue]
-        return new, JointState(data.qpos, data.qvel)
+        return new, MjxState(data.qpos, data.qvel)

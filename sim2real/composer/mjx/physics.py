@@ -15,7 +15,7 @@ from sim2real.composer import layout
 from sim2real.composer.element import as_elements
 from sim2real.composer.mjx import constants, stepping, warp
 from sim2real.composer.mjx.random import JaxRandomState
-from sim2real.composer.mjx.views import DataView, MjxBinding, ModelView, constant
+from sim2real.composer.mjx.views import MjxBinding, MjxDataView, MjxModelView, constant
 from sim2real.composer.named import Named
 from sim2real.composer.translate import mj
 from sim2real.errors import UsageError
@@ -67,7 +67,7 @@ class MjxPhysics:
         self.dry = False
         self._where: Any = None
         self._compiled = model
-        self.data, self.model = DataView(self), ModelView(self)
+        self.data, self.model = MjxDataView(self), MjxModelView(self)
         self.named = Named(host, self.model, self.data)
 
     def read(self, field: layout.Field) -> Any:
