@@ -19,6 +19,7 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.hardware import Embedded, ServoSession
+from sim2real.robots.joints import Joint
 from sim2real.robots.loop_robot import LoopRobot
 
 from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, Measurement, dynamics, node_params
@@ -27,8 +28,8 @@ from .task import LIMIT_V, SwingUp, upright
 
 SERVO_ID = 1
 WORLD_HZ = 100.0
-UPRIGHT_RAD = 0.0
-"""What the encoder shows when the pendulum is upright [rad]."""
+HINGE = Joint("hinge", zero_rad=0.0)
+"""Angle 0 is upright."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 
 
@@ -39,7 +40,7 @@ class PendulumRobot(LoopRobot):
     units = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V", "command": "V"}
     command = "action"
     message = Command
-    joints = {"hinge": {"position": "th", "velocity": "thdot"}}
+    joints = {HINGE.name: {"position": "th", "velocity": "thdot"}}
     observation = (
         ObservationTerm("cos(th), sin(th), thdot / 10", ("1", "1", "rad/s")),
         ObservationTerm("past cos(th), sin(th), thdot / 10", ("1", "1", "rad/s"), HISTORY),
@@ -102,14 +103,14 @@ class PendulumRobot(LoopRobot):
             limits.slew_per_s,
             limits.command_timeout_s,
             limits.max_speed_rad_s,
-            joints=("hinge",),
+            joints=(HINGE.name,),
             stuck_effort=limits.stuck_effort,
         )
         return [SERVO_ID], VoltageDrive(SUPPLY_V), gate
 
     def read(self, reading: StateReading) -> Measurement:
         """Return the sensor's message of a reading."""
-        return Measurement(th=reading.position_rad[0] - UPRIGHT_RAD, thdot=reading.velocity_rad_s[0])
+        return Measurement(HINGE.angle(reading.position_rad[0]), HINGE.speed(reading.velocity_rad_s[0]))
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
@@ -120,7 +121,7 @@ class PendulumRobot(LoopRobot):
         """
         rig = session.rig
         for _ in range(_PUSHES):
-            angle = rig.wait_until_still(settle_s).position_rad[0] - UPRIGHT_RAD
+            angle = HINGE.angle(rig.wait_until_still(settle_s).position_rad[0])
             if np.cos(angle) < -0.95:
                 return
             rig.start()
