@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from sim2real.hardware.embedded import EmbeddedRobot
     from sim2real.hardware.rig import ServoRig
 
-_Kind = tuple[str, Callable[[Any], bool]]
+Datum = tuple[str, Callable[[Any], bool]]
 """What a robot's datum must be, in words, and the test for it."""
 
 
-def _terms(kind: type) -> Callable[[Any], bool]:
+def tuple_of(kind: type) -> Callable[[Any], bool]:
+    """Return the test for a tuple of some objects of a kind."""
     return lambda value: isinstance(value, tuple) and bool(value) and all(isinstance(t, kind) for t in value)
 
 
@@ -41,7 +42,8 @@ def _texts(value: Any) -> bool:
     return isinstance(value, Mapping) and all(isinstance(t, str) for pair in value.items() for t in pair)
 
 
-def _rate(value: Any) -> bool:
+def positive(value: Any) -> bool:
+    """Return whether a value is a finite number above 0."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
 
 
@@ -66,7 +68,7 @@ class RecordedRobot(ABC):
     units: Mapping[str, str]
     roles: Roles = ROLES
 
-    _DATA: ClassVar[Mapping[str, _Kind]] = {
+    _DATA: ClassVar[Mapping[str, Datum]] = {
         "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),
         "roles": ("sim2real.robots.roles.Roles with four different names", _roles),
     }
@@ -120,13 +122,13 @@ class Robot(RecordedRobot):
     observation: tuple[ObservationTerm, ...]
     action: tuple[ActionTerm, ...]
 
-    _DATA: ClassVar[Mapping[str, _Kind]] = {
+    _DATA: ClassVar[Mapping[str, Datum]] = {
         **RecordedRobot._DATA,
-        "rate_hz": ("a number above 0 [Hz]", _rate),
+        "rate_hz": ("a number above 0 [Hz]", positive),
         "command": ("the name of a field", lambda value: isinstance(value, str) and bool(value)),
         "joints": ("joint -> quantity -> field, e.g. {'hinge': {'position': 'th'}}", _joints),
-        "observation": ("a tuple of sim2real.policy.ObservationTerm", _terms(ObservationTerm)),
-        "action": ("a tuple of sim2real.policy.ActionTerm", _terms(ActionTerm)),
+        "observation": ("a tuple of sim2real.policy.ObservationTerm", tuple_of(ObservationTerm)),
+        "action": ("a tuple of sim2real.policy.ActionTerm", tuple_of(ActionTerm)),
     }
 
     @property
@@ -249,7 +251,7 @@ def _refuse(kind: type[RecordedRobot], owner: Any) -> None:
             said.append(f"has no {name}: {what}")
         elif not holds(value := getattr(owner, name)):
             said.append(f"has {name} = {value!r}, which is not {what}")
-    said += [] if owner is kind else _misfits(kind, owner)
+    said += [] if owner is kind else _misfits(owner)
     if said:
         base = Robot if issubclass(kind, Robot) else RecordedRobot
         raise UsageError(
@@ -258,11 +260,11 @@ def _refuse(kind: type[RecordedRobot], owner: Any) -> None:
         )
 
 
-def _misfits(kind: type[RecordedRobot], robot: RecordedRobot) -> list[str]:
+def _misfits(robot: Any) -> list[str]:
     """Return which methods are none, or do not take what the stages call them with."""
     said = []
     for base in (RecordedRobot, Robot):
-        for name, wanted in vars(base).items() if issubclass(kind, base) else ():
+        for name, wanted in vars(base).items() if isinstance(robot, base) else ():
             if name.startswith("_") or not inspect.isfunction(wanted):
                 continue
             given, expected = getattr(robot, name), list(inspect.signature(wanted).parameters)[1:]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from sim2real.hardware.drive import Drive
 from sim2real.hardware.gate import GateConfig
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.base import Robot
+from sim2real.robots.base import Datum, Robot, positive, tuple_of
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
@@ -29,6 +29,10 @@ class LoopRobot(Robot):
     """What robots of servos have in common, however they are driven.
 
     Attributes:
+        tick_s: The world's period [s].
+        channels: What is measured of each joint.
+        at_rest: The sensor's message of a robot at rest.
+        embedded: The robot inside the computer, for the port ``embedded``; None: there is none.
         message: Makes the actuator's message from a command, shape ``(actions,)``.
         expected_delay_s: Computation delays of sensor, supervisor and actuator that phases allow for: a bus
             transaction, and a policy with its thread's wake-up [s].
@@ -37,26 +41,23 @@ class LoopRobot(Robot):
         baud_rate: Of the bus.
     """
 
+    tick_s: float
+    channels: tuple[Channel, ...]
+    at_rest: Any
+    embedded: Embedded | None = None
     message: Callable[[Any], Any]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     delay_spread_s: float = 0.002
     lead_s: float = 0.0
     baud_rate: int = 1_000_000
 
-    @property
-    def embedded(self) -> Embedded | None:
-        """The robot inside the computer, for the port ``embedded``."""
-        return None
-
-    @property
-    @abstractmethod
-    def tick_s(self) -> float:
-        """The world's period [s]."""
-
-    @property
-    @abstractmethod
-    def channels(self) -> tuple[Channel, ...]:
-        """What is measured of each joint."""
+    _DATA: ClassVar[Mapping[str, Datum]] = {
+        **Robot._DATA,
+        "tick_s": ("a number above 0 [s]", positive),
+        "channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel)),
+        "at_rest": ("a message of the sensor", lambda value: value is not None),
+        "message": ("the type of the actuator's message", callable),
+    }
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -119,11 +120,6 @@ class LoopRobot(Robot):
     @abstractmethod
     def read(self, reading: StateReading) -> Any:
         """Return the sensor's message of a reading."""
-
-    @property
-    @abstractmethod
-    def at_rest(self) -> Any:
-        """The sensor's message of a robot at rest."""
 
     # -- what the stages ask
 

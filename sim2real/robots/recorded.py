@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 
@@ -14,7 +14,7 @@ from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.base import RecordedRobot
+from sim2real.robots.base import Datum, RecordedRobot, tuple_of
 from sim2real.worlds.recorded import RecordedActuator
 
 
@@ -33,6 +33,11 @@ class LoggedRobot(RecordedRobot):
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
+
+    _DATA: ClassVar[Mapping[str, Datum]] = {
+        **RecordedRobot._DATA,
+        "channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel)),
+    }
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:

@@ -94,7 +94,7 @@ def check_simulation(robot: Robot) -> None:
         bears = np.array([getattr(term, sign) for term in robot.action], np.float32)
         _hold(np.shape(own) == bears.shape, f"the task has {np.shape(own)} actions, the robot {bears.shape}")
         excess = (own - bears) * (1 if sign == "high" else -1)
-        _hold((excess <= 0).all(), f"the task's actions go beyond what the robot bears: {own} and {bears}")
+        _hold(bool((excess <= 0).all()), f"the task's actions go beyond what the robot bears: {own} and {bears}")
     graph = CompiledGraph(nodes, roles.supervisor, draw(nodes, _EPISODE_S))
     recorded = (roles.sensor, roles.supervisor, roles.actuator)
 
@@ -134,7 +134,7 @@ def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
     effects = read_truth(truth).of(Kind.EFFECT)
     modes = effects["values"][:, 0] if len(effects) else np.empty(0)
     _hold(bool((modes != OperatingMode.OFF).any()), "torque never came on")
-    _hold(modes[-1] == OperatingMode.OFF, "the session ended with torque on")
+    _hold(bool(modes[-1] == OperatingMode.OFF), "the session ended with torque on")
 
 
 def _check_start(model: IdentifiableModel, nodes: Mapping[str, Any]) -> None:
