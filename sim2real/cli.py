@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 from sim2real.stages import ending
-from sim2real.stages.interruption import Signals
+from sim2real.stages.interruption import SignalHandling
 
 if TYPE_CHECKING:
     from sim2real.artifacts.run_folder import StageFolder
@@ -66,14 +66,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name; None takes the process's own.
     """
-    with Signals() as signals:
+    with SignalHandling() as signals:
         code = _run_command(list(sys.argv[1:] if argv is None else argv), signals)
         if argv is None and code != OK:
             ending.leave(code)
     return code
 
 
-def _run_command(arguments: list[str], signals: Signals) -> int:
+def _run_command(arguments: list[str], signals: SignalHandling) -> int:
     """Run a command; say what went wrong, and return the exit code that stands for it."""
     try:
         _dispatch(arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -10,8 +11,8 @@ from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.robots import devices
-from sim2real.robots.loop import delay_of
+from sim2real.identify.parameters import Parameter
+from sim2real.robots.loop import DelayParams, delay_of
 from sim2real.worlds.ode import OdeWorld
 
 GRAVITY = 9.81  # [m/s^2]
@@ -79,6 +80,62 @@ def nominal_params() -> PendulumParams:
     )
 
 
+def groups(p: PendulumParams) -> dict[str, Any]:
+    """Return the identifiable groups of a parameter set."""
+    return {
+        "gain": p.K / p.R / p.J,
+        "gravity": p.mass * GRAVITY * p.length / p.J,
+        "damping": (p.b + p.K**2 / p.R) / p.J,
+        "friction": p.c / p.J,
+    }
+
+
+def from_groups(values: Mapping[str, Any], start: Any) -> PendulumParams:
+    """Return model parameters with these groups: J, R and length stay nominal, b takes what K leaves of the damping.
+
+    Args:
+        values: ``gain`` [rad/s^2/V], ``gravity`` [rad/s^2], ``damping`` [1/s], ``friction`` [rad/s^2].
+        start: Shape ``(2,)``: initial angle [rad] and velocity [rad/s].
+    """
+    p = nominal_params()
+    K = values["gain"] * p.R * p.J
+    return p.replace(
+        K=K,
+        mass=values["gravity"] * p.J / (GRAVITY * p.length),
+        b=values["damping"] * p.J - K**2 / p.R,
+        c=values["friction"] * p.J,
+        start=jnp.asarray(start),
+    )
+
+
+def dynamics() -> list[Parameter]:
+    """Return the parameters to identify, within a factor of 4 of nominal.
+
+    th'' = gain * V + gravity * sin(th) - damping * th' - friction * sign(th'). A log determines these four groups; J,
+    K, R and the rest appear only in them: the model keeps its nominal J, R and length and takes the groups through
+    the others.
+    """
+    about = {
+        "gain": ("rad/s^2/V", "acceleration per volt, K / (R J)"),
+        "gravity": ("rad/s^2", "m g l / J"),
+        "damping": ("1/s", "viscous friction and back-EMF, (b + K^2/R) / J"),
+        "friction": ("rad/s^2", "Coulomb friction, c / J"),
+    }
+    return [
+        Parameter(name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1])
+        for name, value in groups(nominal_params()).items()
+    ]
+
+
+def node_params(values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+    """Return the parameters of the model's nodes for identified values; delays are in [s]."""
+    return {
+        "world": from_groups(values, start),
+        "sensor": DelayParams(delay=values.get("sensor_delay")),
+        "actuator": DelayParams(delay=values.get("actuator_delay")),
+    }
+
+
 class PendulumWorld(OdeWorld):
     """The pendulum as an ordinary differential equation, driven by the ``actuator`` input."""
 
@@ -119,19 +176,6 @@ class DelayedWorld(PendulumWorld):
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the actuation delay, where the actuator's parameters set one."""
         return delay_of("actuator", "actuator", graph_state)
-
-
-class SimActuator(devices.SimActuator):
-    """The motor driver in simulation: passes the command on.
-
-    Args:
-        name: Unique in the graph.
-        rate: Steps per second [Hz].
-        **options: As of ``BaseNode``.
-    """
-
-    def __init__(self, name: str, rate: float, **options: Any) -> None:
-        super().__init__(name, rate, 1, "action", Command, **options)
 
 
 @struct.dataclass

@@ -12,8 +12,7 @@ import numpy as np
 from sim2real.graph.base import GraphState, StepState
 from sim2real.robots.loop import draw_values
 
-from . import parameters
-from .model import HISTORY, Agent
+from .model import HISTORY, Agent, node_params
 
 LIMIT_V = 2.0
 """Largest voltage that the policy may ask for [V]."""
@@ -25,7 +24,7 @@ def upright(th: Any, thdot: Any) -> Any:
 
 
 class SwingUp:
-    """The task of the pendulum; see ``sim2real.train.env.Task``.
+    """The task of the pendulum; see ``sim2real.train.env.TrainingTask``.
 
     Args:
         agent: The agent's node of the graph.
@@ -54,7 +53,7 @@ class SwingUp:
         anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)
-        return parameters.node_params(drawn, start)
+        return node_params(drawn, start)
 
     def observe(self, step_state: StepState) -> jax.Array:
         """Return what the agent's node shows the policy, shape ``(19,)``."""

@@ -2,95 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode
 from sim2real.identify.leaves import get_leaf
 from sim2real.identify.model import Channel
-from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.worlds.recorded import CommandDelay, RecordedActuator
+from sim2real.identify.parameters import Parameter
+from sim2real.robots.recorded import LoggedRobot
+from sim2real.worlds.recorded import RecordedActuator
 
 from .model import JOINTS, ArmWorld, Goal, Sensor, nominal
 
 RATE_HZ, WORLD_HZ = 1 / 0.02006, 4 / 0.02006
-_TICK_S = 1 / WORLD_HZ
-UNITS = {"position": "rad", "goal": "rad"}
 _SATURATES = ("rotation", "wrist_roll", "jaw")
 """The other servos never came to their limit in the recordings."""
 
 
-def table(max_delay_s: float) -> ParameterTable:
-    """Return what may be identified, with a delay of up to ``max_delay_s`` [s]."""
-    linear: Any = "linear"
-    rows = []
-    for i, joint in enumerate(JOINTS):
-        about = {
-            "stiffness": ("1/s^2", 20.0, 10000.0, "log", "firmware's gain over inertia"),
-            "damping": ("1/s", 1.0, 800.0, "log", "damping over inertia"),
-            "friction.static": ("rad", 0.0005, 0.1, "log", "dry friction at rest, over the stiffness"),
-            "friction.stribeck_rad_s": ("rad/s", 0.02, 20.0, "log", "speed over which friction wears off"),
-            "bias": ("rad", -0.06, 0.06, linear, "goal to encoder"),
-        }
-        if joint in _SATURATES:
-            about["saturation"] = ("rad", 0.02, 3.0, "log", "error at which the servo pushes hardest")
-        for leaf, (unit, low, high, transform, text) in about.items():
-            value = float(np.asarray(get_leaf(nominal(), leaf))[i])
-            name = f"{joint}_{leaf.rpartition('.')[2].removesuffix('_rad_s')}"
-            rows.append(Parameter(name, unit, value, low, high, transform, about=text, leaf=f"world.{leaf}[{i}]"))
-    rows += [
-        # Read off single_joint_wrist_roll, where the joint stops short of its goal.
-        Parameter("wrist_roll_low", "rad", -1.034, -3.0, -0.5, linear, leaf="world.low[4]", about="stop"),
-        Parameter("weight_upper", "rad", 0.005, -0.1, 0.2, linear, leaf="world.gravity.shoulder", about="upper arm"),
-        Parameter("weight_forearm", "rad", 0.01, -0.1, 0.2, linear, leaf="world.gravity.forearm", about="forearm"),
-        Parameter("weight_hand", "rad", 0.001, -0.1, 0.2, linear, leaf="world.gravity.hand", about="hand"),
-        Parameter("table_height", "rad", 0.95, 0.6, 1.6, linear, leaf="world.table.height", about="contact"),
-        Parameter("table_ratio", "1", 0.85, 0.1, 2.6, leaf="world.table.ratio", about="pitch's share of the contact"),
-        Parameter("table_stiffness", "1", 0.8, 0.05, 4.0, leaf="world.table.stiffness", about="contact over servo"),
-        Parameter(
-            *("sensor_delay", "s", _TICK_S, 0.0, 2 * _TICK_S, linear, "delay", "the sensor's interpolation"),
-            free=False,
-            side="measurement",
-        ),
-        Parameter(
-            "delay", "s", 0.0, 0.0, max_delay_s, linear, "delay", "goal to position", "actuator.delay", side="command"
-        ),
-    ]
-    return ParameterTable(rows)
+class SO101(LoggedRobot):
+    """Six position servos."""
 
-
-class IdentifiableArm:
-    """What the identify stage needs to know: see ``sim2real.identify.model.IdentifiableModel``."""
-
-    sensor = "sensor"
-    ahead_s = 0.0
+    units = {"position": "rad", "goal": "rad"}
     channels = tuple(Channel("position", None, 0.002, 0.1, i, joint, "goal") for i, joint in enumerate(JOINTS))
+    delayed = "goal to position"
+    tick_s = 1 / WORLD_HZ
+    burst = 1
 
-    def __init__(self, max_delay_s: float = 0.04) -> None:
-        self.parameters = table(max_delay_s)
-        self.given: Mapping[str, Any] = {"actuator": Goal(goal="goal")}
+    def dynamics(self) -> list[Parameter]:
+        """Return what may be identified."""
+        linear: Any = "linear"
+        rows = []
+        for i, joint in enumerate(JOINTS):
+            about = {
+                "stiffness": ("1/s^2", 20.0, 10000.0, "log", "firmware's gain over inertia"),
+                "damping": ("1/s", 1.0, 800.0, "log", "damping over inertia"),
+                "friction.static": ("rad", 0.0005, 0.1, "log", "dry friction at rest, over the stiffness"),
+                "friction.stribeck_rad_s": ("rad/s", 0.02, 20.0, "log", "speed over which friction wears off"),
+                "bias": ("rad", -0.06, 0.06, linear, "goal to encoder"),
+            }
+            if joint in _SATURATES:
+                about["saturation"] = ("rad", 0.02, 3.0, "log", "error at which the servo pushes hardest")
+            for leaf, (unit, low, high, transform, text) in about.items():
+                value = float(np.asarray(get_leaf(nominal(), leaf))[i])
+                name = f"{joint}_{leaf.rpartition('.')[2].removesuffix('_rad_s')}"
+                rows.append(Parameter(name, unit, value, low, high, transform, about=text, leaf=f"world.{leaf}[{i}]"))
+        rows += [
+            # Read off single_joint_wrist_roll, where the joint stops short of its goal.
+            Parameter("wrist_roll_low", "rad", -1.034, -3.0, -0.5, linear, leaf="world.low[4]", about="stop"),
+            Parameter(
+                "weight_upper", "rad", 0.005, -0.1, 0.2, linear, leaf="world.gravity.shoulder", about="upper arm"
+            ),
+            Parameter("weight_forearm", "rad", 0.01, -0.1, 0.2, linear, leaf="world.gravity.forearm", about="forearm"),
+            Parameter("weight_hand", "rad", 0.001, -0.1, 0.2, linear, leaf="world.gravity.hand", about="hand"),
+            Parameter("table_height", "rad", 0.95, 0.6, 1.6, linear, leaf="world.table.height", about="contact"),
+            Parameter(
+                "table_ratio", "1", 0.85, 0.1, 2.6, leaf="world.table.ratio", about="pitch's share of the contact"
+            ),
+            Parameter("table_stiffness", "1", 0.8, 0.05, 4.0, leaf="world.table.stiffness", about="contact over servo"),
+        ]
+        return rows
 
-    def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
-        """Return sensor, actuator and world; the world hears goals up to ``max_delay_s`` [s] late."""
-        sensor, actuator = Sensor("sensor", RATE_HZ), RecordedActuator("actuator", RATE_HZ, Goal(goal=jnp.zeros(6)))
-        world = ArmWorld("world", WORLD_HZ, substep_s=0.0051)
-        to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=1)
-        world.connect(actuator, skip=True, delay_dist=to_world)
-        # Samples fall between ticks: a tick of delay, for the sensor to interpolate.
-        sensor.connect(world, delay_dist=TrainableDist.create(_TICK_S, 0.0, 2 * _TICK_S, "linear"))
-        return {n.name: n for n in (sensor, actuator, world)}
-
-    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        """Return node parameters for values and initial positions and velocities ``(12,)``."""
-        base = {"world": nominal(), "actuator": CommandDelay()}
-        placed = self.parameters.placed(base, values)
-        return {**placed, "world": placed["world"].replace(start=start)}
+    def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
+        """Return sensor, actuator and world."""
+        actuator = RecordedActuator("actuator", RATE_HZ, Goal(goal=jnp.zeros(6)))
+        return Sensor("sensor", RATE_HZ), actuator, ArmWorld("world", WORLD_HZ, substep_s=0.0051)
 
 
-def identifiable(max_delay_s: float) -> IdentifiableArm:
-    """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
-    return IdentifiableArm(max_delay_s)
+ROBOT = SO101()

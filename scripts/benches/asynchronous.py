@@ -10,7 +10,7 @@ import jax
 
 from benches.figures import row
 from sim2real.graph.node import BaseNode
-from sim2real.robots.devices import SimSensor
+from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.stages.pipeline import load_pipeline
@@ -27,7 +27,7 @@ def loop(rate_hz: float) -> dict[str, BaseNode]:
     world = model.PendulumWorld("world", rate_hz)
     sensor = SimSensor("sensor", rate_hz, world, delay_dist=delay)
     agent = model.Agent("agent", rate_hz, delay_dist=delay)
-    actuator = model.SimActuator("actuator", rate_hz, delay_dist=delay)
+    actuator = SimActuator("actuator", rate_hz, 1, "action", model.Command, delay_dist=delay)
     sensor.connect(world)
     agent.connect(sensor, blocking=True, window=3)
     actuator.connect(agent, blocking=True)

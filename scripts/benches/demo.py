@@ -11,6 +11,7 @@ import numpy as np
 from benches import stages
 from benches.figures import row
 from sim2real.artifacts.recording import Recording
+from sim2real.robots.roles import ROLES
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.stages.truth import true_values
 
@@ -78,7 +79,7 @@ def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, 
         Ratio, RMSE of the identified model, RMSE of the true model [rad].
     """
     recording = Recording.load(log, truth)
-    episode, true = recording.episode, true_values(recording)
+    episode, true = recording.episode, true_values(recording, ROLES)
     samples = np.load(predictions)
     plant_class = load_pipeline("pendulum").load("plant").PendulumPlant
     ours, theirs = [], []

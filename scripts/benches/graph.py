@@ -22,7 +22,7 @@ from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
-from sim2real.robots.devices import SimSensor
+from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.runtime.wiring import wire
 from sim2real.stages.pipeline import load_pipeline
@@ -93,7 +93,7 @@ def nodes(agent_hz: float = 50.0, world_hz: float = 50.0, substep_s: float = 0.0
     world = CostWorld("world", world_hz, substep_s=substep_s)
     sensor = SimSensor("sensor", agent_hz, world, delay_dist=dist(0.0075, 0.003))
     agent = RandomAgent("agent", agent_hz, delay_dist=dist(0.01, 0.003))
-    actuator = MODEL.SimActuator("actuator", agent_hz, delay_dist=dist(0.0075, 0.003))
+    actuator = SimActuator("actuator", agent_hz, 1, "action", MODEL.Command, delay_dist=dist(0.0075, 0.003))
     agent.connect(sensor, blocking=True, window=3, delay_dist=dist(0.002, 0.002))
     actuator.connect(agent, blocking=True, delay_dist=dist(0.002, 0.002))
     world.connect(actuator, skip=True, delay_dist=dist(0.01, 0.002))

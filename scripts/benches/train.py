@@ -44,7 +44,7 @@ def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     jitter = rng.gamma(4.0, 2e-4, 2000)
     computation = {n: EmpiricalDist(jitter) for n in ("sensor", "agent", "actuator")}
     nodes, task = robot.training(values, draws, computation, True)
-    graph = CompiledGraph(nodes, robot.SUPERVISOR, draw(nodes, episode_s, timelines, 0))
+    graph = CompiledGraph(nodes, robot.roles.supervisor, draw(nodes, episode_s, timelines, 0))
     return GraphEnvironment(graph, task)
 
 

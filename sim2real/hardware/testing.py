@@ -29,8 +29,8 @@ import pytest
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import Rig
 from sim2real.hardware.truth import Kind
@@ -64,7 +64,7 @@ class DeviceConformance(ABC):
         patience_s: Time in which a motor's torque must be off, on a busy machine too [s].
     """
 
-    emulation: ClassVar[type[Emulation]]
+    emulation: ClassVar[type[BusEmulation]]
     plant: ClassVar[str]
     plant_args: ClassVar[Mapping[str, Any]] = {}
     settings: ClassVar[Mapping[str, Any]] = {}

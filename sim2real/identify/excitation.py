@@ -35,7 +35,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Spread:
+class Histogram:
     """Which values a signal takes.
 
     Attributes:
@@ -93,14 +93,14 @@ def sampling(t_s: np.ndarray) -> Sampling:
     return Sampling(len(t_s), float(t_s[-1] - t_s[0]), rate_hz, int(gaps.size), float(gaps.max(initial=0.0)))
 
 
-def spread(values: np.ndarray) -> Spread:
+def spread(values: np.ndarray) -> Histogram:
     """Return how values ``(N,)`` spread over their own range."""
     values = np.asarray(values, np.float64)
     low, high = float(values.min()), float(values.max())
     if not high > low:
-        return Spread(low, high, (1.0, *([0.0] * (BINS - 1))))
+        return Histogram(low, high, (1.0, *([0.0] * (BINS - 1))))
     counts, _ = np.histogram(values, BINS, (low, high))
-    return Spread(low, high, tuple((counts / values.size).tolist()))
+    return Histogram(low, high, tuple((counts / values.size).tolist()))
 
 
 def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:

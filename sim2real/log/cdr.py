@@ -24,7 +24,7 @@ _CODES = dict(zip(("b1", "f4", "f8", *(f"{k}{s}" for k in "iu" for s in (1, 2, 4
 
 
 @dataclass(frozen=True)
-class Constant:
+class CdrConstant:
     """Bytes that are the same in every message.
 
     Attributes:
@@ -37,7 +37,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Field:
+class CdrField:
     """A value that differs between messages: a scalar, or an array of fixed shape in row-major order.
 
     Attributes:
@@ -70,15 +70,15 @@ class Field:
         return int(np.prod(self.shape, dtype=np.int64))
 
 
-def text(value: str) -> Constant:
+def text(value: str) -> CdrConstant:
     """Return a constant string as a part of a message."""
     data = value.encode() + b"\0"
-    return Constant(struct.pack("<I", len(data)) + data, 4)
+    return CdrConstant(struct.pack("<I", len(data)) + data, 4)
 
 
-def length(count: int) -> Constant:
+def length(count: int) -> CdrConstant:
     """Return the element count of a sequence; its elements must follow as further parts."""
-    return Constant(struct.pack("<I", count), 4)
+    return CdrConstant(struct.pack("<I", count), 4)
 
 
 def read_text(data: bytes, position: int) -> tuple[str, int]:
@@ -103,16 +103,16 @@ class Layout:
         size: Size of a message [bytes].
     """
 
-    def __init__(self, parts: Iterable[Constant | Field]) -> None:
-        self.fields: list[Field] = []
+    def __init__(self, parts: Iterable[CdrConstant | CdrField]) -> None:
+        self.fields: list[CdrField] = []
         self._template: list[Any] = [ENCAPSULATION]
         self._slots: list[int] = []
         formats, offsets, position = ["<4s"], [], 0
         for part in parts:
-            padding = -position % (part.alignment if isinstance(part, Constant) else part.dtype.itemsize)
+            padding = -position % (part.alignment if isinstance(part, CdrConstant) else part.dtype.itemsize)
             position += padding
             formats.append(f"{padding}x")
-            if isinstance(part, Constant):
+            if isinstance(part, CdrConstant):
                 formats.append(f"{len(part.data)}s")
                 self._template.append(part.data)
                 position += len(part.data)
@@ -170,7 +170,7 @@ class Layout:
         return "a message cannot be encoded"
 
 
-def _array_bytes(part: Field, value: Any) -> bytes:
+def _array_bytes(part: CdrField, value: Any) -> bytes:
     array = np.asarray(value)
     if array.shape != part.shape:
         raise Sim2RealError(f"field {part.name!r} has shape {array.shape}, expected {part.shape}")

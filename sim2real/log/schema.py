@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import named_leaves
-from sim2real.log.cdr import ROS_TYPES, Constant, Field, Layout, length, text
+from sim2real.log.cdr import ROS_TYPES, CdrConstant, CdrField, Layout, length, text
 
 STEP_FIELDS = ("seq", "scheduled", "start", "woken", "ts_overwrite", "end", "drift")
 MESSAGE_FIELDS = ("seq_out", "seq_in")
@@ -148,7 +148,11 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
                 f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
             )
     picks = []
-    parts: list[Constant | Field] = [Field("sec", np.dtype("<i4")), Field("nanosec", np.dtype("<u4")), text("")]
+    parts: list[CdrConstant | CdrField] = [
+        CdrField("sec", np.dtype("<i4")),
+        CdrField("nanosec", np.dtype("<u4")),
+        text(""),
+    ]
     parts += [length(len(joints)), *(text(joint) for joint in joints)]
     for quantity in quantities:
         given = any(quantity in sources for sources in joints.values())
@@ -156,7 +160,7 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
         picks.append(tuple(chosen))
         parts.append(length(len(chosen)))
         if chosen:
-            parts.append(Field(quantity, np.dtype("<f8"), (len(chosen),)))
+            parts.append(CdrField(quantity, np.dtype("<f8"), (len(chosen),)))
     metadata = {"role": "joint_states"}
     topic = Topic("/joint_states", "sensor_msgs/msg/JointState", _JOINT_STATE_TEXT, Layout(parts), metadata)
     return JointSource(topic, tuple(picks))
@@ -185,8 +189,8 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
     return {original: name for name, original in taken.items()}
 
 
-def _field(entry: Mapping[str, Any]) -> Field:
-    return Field(entry["original"], np.dtype(entry["dtype"]), tuple(entry["shape"]))
+def _field(entry: Mapping[str, Any]) -> CdrField:
+    return CdrField(entry["original"], np.dtype(entry["dtype"]), tuple(entry["shape"]))
 
 
 def _pick(node: str, joint: str, source: str | None, leaves: Mapping[str, np.ndarray]) -> tuple[int, int]:
@@ -216,5 +220,5 @@ def _int64_text(names: Sequence[str]) -> str:
     return "".join(f"int64 {name}\n" for name in names)
 
 
-STEP_LAYOUT = Layout(Field(name, _INT64) for name in STEP_FIELDS)
-MESSAGE_LAYOUT = Layout(Field(name, _INT64) for name in MESSAGE_FIELDS)
+STEP_LAYOUT = Layout(CdrField(name, _INT64) for name in STEP_FIELDS)
+MESSAGE_LAYOUT = Layout(CdrField(name, _INT64) for name in MESSAGE_FIELDS)

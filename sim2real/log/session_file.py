@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
 from sim2real.log import document
-from sim2real.log.cdr import Field, Layout, text
+from sim2real.log.cdr import CdrField, Layout, text
 from sim2real.log.schema import (
     EVENTS_SCHEMA,
     EVENTS_TEXT,
@@ -194,9 +194,13 @@ class SessionFile:
             return
         passed_ns = monotonic_ns - self._start_monotonic_ns if ticks is None else 1000 * ticks
         time_ns = self._epoch_ns + passed_ns
-        stamp = [Field("sec", np.dtype("<i4")), Field("nanosec", np.dtype("<u4")), Field("level", np.dtype("u1"))]
+        stamp = [
+            CdrField("sec", np.dtype("<i4")),
+            CdrField("nanosec", np.dtype("<u4")),
+            CdrField("level", np.dtype("u1")),
+        ]
         texts = [text(kind), text(message), text(""), text("")]
-        layout = Layout([*stamp, *texts, Field("line", np.dtype("<u4"))])
+        layout = Layout([*stamp, *texts, CdrField("line", np.dtype("<u4"))])
         payload = layout.pack((time_ns // 1_000_000_000, time_ns % 1_000_000_000, level, 0))
         self._add(topic, payload, self.counts.get(topic.name, 0), time_ns, time_ns)
 

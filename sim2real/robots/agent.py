@@ -12,6 +12,7 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.robots.messages import Decision, JointReading
+from sim2real.robots.roles import ROLES
 
 Features = Callable[[JointReading, Any, Any], jax.Array]
 """Returns the part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``."""
@@ -59,6 +60,7 @@ class GoalAgent(BaseNode):
         features: Part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``.
         history: Number of past steps in the observation.
         aims: Number of entries of an aim.
+        sensor: Name of the sensor.
         **options: Options of ``BaseNode``.
     """
 
@@ -71,11 +73,12 @@ class GoalAgent(BaseNode):
         features: Features,
         history: int,
         aims: int,
+        sensor: str = ROLES.sensor,
         **options: Any,
     ) -> None:
         super().__init__(name, rate, **options)
         self._low, self._high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
-        self._features, self._history, self._aims = features, history, aims
+        self._features, self._history, self._aims, self._sensor = features, history, aims, sensor
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
         """Return parameters without a policy, and zeros for aim and start."""
@@ -95,13 +98,13 @@ class GoalAgent(BaseNode):
 
     def observe(self, step_state: StepState) -> jax.Array:
         """Return the policy's observation: the features, then the history, newest first."""
-        reading, state = step_state.inputs["sensor"][-1].data, step_state.state
+        reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
         now = self._features(reading, state.goal, step_state.params.aim)
         return jnp.concatenate([now, state.past.ravel()]).astype(jnp.float32)
 
     def act(self, step_state: StepState, action: Any) -> tuple[StepState, Decision]:
         """Return the new step state and the message for an action ``(joints,)``: speeds of the goals [rad/s]."""
-        reading, state = step_state.inputs["sensor"][-1].data, step_state.state
+        reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
         goal = jnp.clip(state.goal + jnp.asarray(action, jnp.float32) / self.rate, self._low, self._high)
         row = jnp.concatenate([reading.position, reading.velocity, goal]).astype(jnp.float32)
         new = AgentState(goal=goal, past=jnp.concatenate([row[None], state.past])[: self._history])

@@ -11,6 +11,7 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.robots.loop import DelayParams, delay_of
 from sim2real.robots.messages import Goals
+from sim2real.robots.roles import ROLES
 
 
 class SimSensor(BaseNode):
@@ -57,6 +58,7 @@ class SimActuator(BaseNode):
         joints: Number of joints.
         field: Field of the agent's message that is the command, shape ``(joints,)``.
         message: Makes the node's message from a command.
+        agent: Name of the agent.
         **options: Options of ``BaseNode``.
     """
 
@@ -67,10 +69,11 @@ class SimActuator(BaseNode):
         joints: int,
         field: str = "goal",
         message: Callable[[Any], Any] = Goals,
+        agent: str = ROLES.supervisor,
         **options: Any,
     ) -> None:
         super().__init__(name, rate, **options)
-        self._joints, self._field, self._message = joints, field, message
+        self._joints, self._field, self._message, self._agent = joints, field, message, agent
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
@@ -80,9 +83,9 @@ class SimActuator(BaseNode):
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a message with the agent's start, or with zeros."""
         del rng
-        start = getattr((graph_state or GraphState()).params.get("agent"), "start", None)
+        start = getattr((graph_state or GraphState()).params.get(self._agent), "start", None)
         return self._message(jnp.zeros(self._joints) if start is None else jnp.asarray(start, jnp.float32))
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Return the newest command."""
-        return step_state, self._message(getattr(step_state.inputs["agent"][-1].data, self._field))
+        return step_state, self._message(getattr(step_state.inputs[self._agent][-1].data, self._field))

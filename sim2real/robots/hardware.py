@@ -16,9 +16,10 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.rig import Rig
+from sim2real.robots.roles import ROLES
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Embedded:
     """
 
     plant: str
-    emulator: Emulation
+    emulator: BusEmulation
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -133,16 +134,24 @@ class ServoActuator(BaseNode):
         rig: The servos.
         field: Field of the agent's message that is the command, shape ``(servos,)``.
         message: Makes the node's message from the command that was sent.
+        agent: Name of the agent.
         **options: Options of ``BaseNode``.
     """
 
     jittable = False
 
     def __init__(
-        self, name: str, rate: float, rig: Rig, field: str, message: Callable[[np.ndarray], Any], **options: Any
+        self,
+        name: str,
+        rate: float,
+        rig: Rig,
+        field: str,
+        message: Callable[[np.ndarray], Any],
+        agent: str = ROLES.supervisor,
+        **options: Any,
     ) -> None:
         super().__init__(name, rate, **options)
-        self._rig, self._field, self._message = rig, field, message
+        self._rig, self._field, self._message, self._agent = rig, field, message, agent
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a message with zeros."""
@@ -163,7 +172,7 @@ class ServoActuator(BaseNode):
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Send the newest command."""
-        message = step_state.inputs["agent"]
+        message = step_state.inputs[self._agent]
         now_s = self.now()
         age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
         wanted = np.asarray(getattr(message.data, self._field)[-1], np.float64)

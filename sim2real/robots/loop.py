@@ -14,6 +14,7 @@ from sim2real.graph.base import Base, GraphState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identify.parameters import Parameter
+from sim2real.robots.roles import ROLES, Roles
 
 BURST = 3
 """Extra messages in the world's window of commands. After a hiccup, the actuator makes its missed steps one right after
@@ -48,17 +49,18 @@ def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict
     return {} if delay is None else {input_name: delay}
 
 
-def delay_parameters(max_delay_s: float) -> list[Parameter]:
+def delay_parameters(max_delay_s: float, roles: Roles = ROLES) -> list[Parameter]:
     """Return the delays as parameters to identify: from the world to the sensor, and from the actuator to the world.
 
     Args:
         max_delay_s: Upper bound of each delay [s].
+        roles: Names of sensor and actuator.
     """
     delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     about = "from motion to measurement's time stamp", "from command's departure to the motor"
     return [
-        replace(delay, name=DELAYS[0], about=about[0], leaf="sensor.delay", side="measurement"),
-        replace(delay, name=DELAYS[1], about=about[1], leaf="actuator.delay", side="command"),
+        replace(delay, name=DELAYS[0], about=about[0], leaf=f"{roles.sensor}.delay", side="measurement"),
+        replace(delay, name=DELAYS[1], about=about[1], leaf=f"{roles.actuator}.delay", side="command"),
     ]
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,28 +14,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
-from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.registry import load_device
+from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
+from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.datasheet import DataSheet
-from sim2real.robots.devices import SimActuator, SimSensor
-from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
-from sim2real.robots.identifiable import IdentifiableServos
-from sim2real.robots.loop import DelayParams, control_nodes, delay_bounds, in_a_loop, simulated_loop
+from sim2real.robots.hardware import Embedded, ServoSession
+from sim2real.robots.loop import DelayParams
+from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import GoalTask
 from sim2real.robots.simulated import ServoWorld
 from sim2real.robots.training import ServoTask
-
-EXPECTED_DELAY_S = {"sensor": 0.004, "agent": 0.003, "actuator": 0.002}
-"""Computation delay that phases allow for: a bus transaction, and a policy with its thread's wake-up [s]."""
 
 _AT_HOME_RAD, _HOME_RAD_S, _HOLD_S = 0.1, 1.0, 0.5
 
@@ -75,8 +71,8 @@ class Servos:
         return np.asarray(self.rest or np.zeros(len(self.joints)), np.float64)
 
 
-class ServoRobot(ABC):
-    """Fulfils ``sim2real.stages.robot.Robot``; ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py`` is a robot.
+class ServoRobot(LoopRobot):
+    """A robot of position-controlled servos.
 
     Attributes:
         servos: The servos.
@@ -85,12 +81,12 @@ class ServoRobot(ABC):
         history: Past steps that the policy sees.
         position_sigma_rad: Deviation of a measured position.
         velocity_sigma_rad_s: Deviation of a measured velocity.
-        delay_spread_s: By how much delays vary between episodes of training, either way [s].
     """
 
-    RATE_HZ = 50.0
-    SUPERVISOR = "agent"
-    COMMAND = ("actuator", "goal")
+    rate_hz = 50.0
+    command = "goal"
+    message = Goals
+    expected_delay_s = (0.004, 0.003, 0.002)
 
     servos: Servos
     aim: tuple[tuple[str, str], ...] = ()
@@ -98,14 +94,8 @@ class ServoRobot(ABC):
     history: int = 3
     position_sigma_rad: float = 0.002
     velocity_sigma_rad_s: float = 0.05
-    delay_spread_s: float = 0.002
 
     # -- what a robot says about itself
-
-    @property
-    def embedded(self) -> Embedded | None:
-        """The robot inside the computer, for the port ``embedded``; see ``twin``."""
-        return None
 
     @abstractmethod
     def make_task(self) -> GoalTask:
@@ -114,16 +104,6 @@ class ServoRobot(ABC):
     @abstractmethod
     def draw_aim(self, key: jax.Array) -> jax.Array:
         """Return the aim of an episode, ``(k,)``."""
-
-    @abstractmethod
-    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return how well an episode went, ``success`` in [0, 1] among it.
-
-        Args:
-            t_s: Times ``(N,)`` [s].
-            states: ``position[i]``, ``velocity[i]`` ``(N,)`` [rad, rad/s]; ``command[i]`` and ``aim[i]``, once a step.
-                A robot of one joint, or an aim of one entry, has no ``[i]``.
-        """
 
     @abstractmethod
     def success(self, state: Any) -> jax.Array:
@@ -153,7 +133,7 @@ class ServoRobot(ABC):
         own = standard.place(values, s.sheet, s.joints, self.task.physics_timestep)
         return {**own, **self.place_aim(aim)}
 
-    def twin(self, emulator: Emulation, **factors: float) -> Embedded:
+    def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return a robot inside the computer that is made of this one's model.
 
         Args:
@@ -182,19 +162,19 @@ class ServoRobot(ABC):
     # -- what the stages ask
 
     @property
-    def UNITS(self) -> dict[str, str]:
+    def units(self) -> dict[str, str]:
         """Field of a message -> its unit."""
         of_aim = {f"aim[{i}]": unit for i, (_, unit) in enumerate(self.aim)}
         return {"position": "rad", "velocity": "rad/s", "goal": "rad", **of_aim}
 
     @property
-    def JOINTS(self) -> dict[str, Any]:
+    def joints(self) -> dict[str, dict[str, str]]:
         """For the log: which fields are which joint's."""
         rows = enumerate(self.servos.joints)
-        return {"sensor": {j: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, j in rows}}
+        return {j: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, j in rows}
 
     @property
-    def OBSERVATION(self) -> list[tuple[str, tuple[str, ...], int]]:
+    def observation(self) -> tuple[ObservationTerm, ...]:
         """Terms of the policy's observation."""
         n = len(self.servos.joints)
         default = (
@@ -203,19 +183,23 @@ class ServoRobot(ABC):
             ("goal", ("rad",) * n),
             ("aim", tuple(unit for _, unit in self.aim)),
         )
-        past = ("past position, velocity, goal", ("rad",) * n + ("rad/s",) * n + ("rad",) * n, self.history)
-        present = [(name, units, 1) for name, units in self.features or default if units]
-        return [*present, past] if self.history else present
+        present = tuple(ObservationTerm(name, units) for name, units in self.features or default if units)
+        units = ("rad",) * n + ("rad/s",) * n + ("rad",) * n
+        past = (ObservationTerm("past position, velocity, goal", units, self.history),) if self.history else ()
+        return present + past
 
     @property
-    def ACTION(self) -> list[tuple[str, str]]:
-        """Names and units of the policy's actions."""
-        return [(f"speed of {joint}'s goal", "rad/s") for joint in self.servos.joints]
+    def action(self) -> tuple[ActionTerm, ...]:
+        """The policy's actions, as fast as goals may go, either way [rad/s]."""
+        speed = self.servos.speed
+        return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.joints)
 
     @property
-    def ACTION_BOUNDS(self) -> list[tuple[float, float]]:
-        """Fastest the goals may go, either way [rad/s]."""
-        return [(-self.servos.speed, self.servos.speed)] * len(self.servos.joints)
+    def channels(self) -> tuple[Channel, ...]:
+        """Position and velocity of each joint."""
+        sigmas = self.position_sigma_rad, self.velocity_sigma_rad_s
+        rows = enumerate(self.servos.joints)
+        return tuple(Channel("position", "velocity", *sigmas, index=i, label=j, goal="goal") for i, j in rows)
 
     @cached_property
     def task(self) -> GoalTask:
@@ -227,9 +211,27 @@ class ServoRobot(ABC):
         """The world's period [s]."""
         return float(self.task.control_timestep)
 
+    @property
+    def lead_s(self) -> float:
+        """Half a step of the physics, which the world adds to the actuator's delay [s]."""
+        return 0.5 * float(self.task.physics_timestep)
+
     def make_world(self, resumed: bool = False) -> ServoWorld:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
-        return ServoWorld("world", self.task, self.fields(self.task), resumed)
+        return ServoWorld(self.roles.world, self.task, self.fields(self.task), resumed, self.roles.actuator)
+
+    def make_agent(self, **options: Any) -> GoalAgent:
+        """Return the policy's node, with options of ``BaseNode``."""
+        s, roles, aims = self.servos, self.roles, len(self.aim)
+        return GoalAgent(
+            roles.supervisor, self.rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
+        )
+
+    def training_task(
+        self, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
+    ) -> ServoTask:
+        """Return the task of a policy, see ``LoopRobot``."""
+        return ServoTask(self, agent, values, draws, spread_s)
 
     def node_params(
         self, values: Mapping[str, Any], position: Any, velocity: Any, aim: Any, policy: Any = None
@@ -246,31 +248,57 @@ class ServoRobot(ABC):
         start, speed = jnp.asarray(position, jnp.float32), jnp.asarray(velocity, jnp.float32)
         params = self._world_params.replace(values=self.place(values, aim), qpos=start, qvel=speed)
         return {
-            "world": params,
-            "sensor": DelayParams(delay=values.get("sensor_delay")),
-            "actuator": DelayParams(delay=values.get("actuator_delay")),
-            "agent": AgentParams(policy=policy, aim=aim, start=start),
+            self.roles.world: params,
+            self.roles.sensor: DelayParams(delay=values.get("sensor_delay")),
+            self.roles.actuator: DelayParams(delay=values.get("actuator_delay")),
+            self.roles.supervisor: AgentParams(policy=policy, aim=aim, start=start),
         }
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
-        """Open the robot on a port, or the embedded one, with torque off."""
+    def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+        """Return parameters for an episode in the middle of a recording, from positions, then velocities."""
+        n, start = len(self.servos.joints), jnp.asarray(start)
+        params = self.node_params(values, start[:n], start[n:], jnp.zeros(len(self.aim)))
+        del params[self.roles.supervisor]
+        return params
+
+    def rest_params(self, values: Mapping[str, Any], policy: Any, trial: int) -> dict[str, Any]:
+        """Return parameters for an episode from rest, with a policy and a trial's aim."""
+        rest = self.servos.at_rest
+        return self.node_params(values, rest, np.zeros_like(rest), self.draw_aim(jax.random.key(trial)), policy)
+
+    def agent_params(self, session: ServoSession, policy: Any, trial: int) -> AgentParams:
+        """Return the agent's parameters on hardware: goals start where the joints are."""
+        start = jnp.asarray(session.rig.measure().position_rad, jnp.float32)
+        return AgentParams(policy=policy, aim=self.draw_aim(jax.random.key(trial)), start=start)
+
+    def make_device(self, port: str, silence_s: float) -> Device:
+        """Return the servos on a port, not opened yet."""
+        s = self.servos
+        return load_device(s.device)(port, s.ids, s.sheet.drive, baud_rate=s.baud_rate, silence_s=silence_s)
+
+    def gate(self, limits: GateLimits) -> GateConfig:
+        """Return a gate that holds the last goals when commands are stale."""
         s = self.servos
         low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
-        gate = GateConfig(
+        return GateConfig(
             (tuple(low), tuple(high)),
             limits.slew_per_s,
             limits.command_timeout_s,
             limits.max_speed_rad_s,
             stale="hold",
+            node=self.roles.actuator,
             joints=s.joints,
             stuck_effort=limits.stuck_effort,
         )
-        make, silence_s = load_device(s.device), limits.servo_watchdog_s
 
-        def device(port: str) -> Device:
-            return make(port, s.ids, s.sheet.drive, baud_rate=s.baud_rate, silence_s=silence_s)
+    def read(self, reading: Reading) -> JointReading:
+        """Return the sensor's message of a reading."""
+        return JointReading(reading.position_rad, reading.velocity_rad_s)
 
-        return ServoSession(port, device, gate, self.embedded, truth_path, seed)
+    @property
+    def at_rest(self) -> JointReading:
+        """The sensor's message of a robot at rest."""
+        return JointReading(self.servos.at_rest, np.zeros(len(self.servos.joints)))
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the robot to where it rests, slowly; torque is off before and afterwards.
@@ -299,49 +327,9 @@ class ServoRobot(ABC):
         """
         signal = np.asarray(signal, np.float64).reshape(-1, len(self.servos.joints))
         away = session.rig.measure().position_rad - signal[0]
-        gone = np.arange(len(signal))[:, None] * _HOME_RAD_S / self.RATE_HZ
+        gone = np.arange(len(signal))[:, None] * _HOME_RAD_S / self.rate_hz
         signal = signal + np.sign(away) * np.maximum(np.abs(away) - gone, 0.0)
-        agent = Excitation("agent", self.RATE_HZ, signal, Goals, delay=EXPECTED_DELAY_S["agent"])
-        return self._on_hardware(session, agent)
-
-    def deployment_nodes(
-        self, session: ServoSession, policy: Any, trial: int = 0
-    ) -> tuple[dict[str, BaseNode], dict[str, Any]]:
-        """Return the graph on hardware that runs a policy from where the robot is, and the agent's parameters."""
-        start = jnp.asarray(session.rig.measure().position_rad, jnp.float32)
-        params = AgentParams(policy=policy, aim=self.draw_aim(jax.random.key(trial)), start=start)
-        return self._on_hardware(session, self._agent(delay=EXPECTED_DELAY_S["agent"])), {"agent": params}
-
-    def identifiable(self, max_delay_s: float) -> IdentifiableServos:
-        """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
-        return IdentifiableServos(self, max_delay_s)
-
-    def training(
-        self,
-        values: Mapping[str, float],
-        draws: Mapping[str, np.ndarray],
-        computation: Mapping[str, DelayDistribution],
-        delays: bool,
-    ) -> tuple[dict[str, BaseNode], ServoTask]:
-        """Return the loop in simulation and the task; see ``sim2real.stages.robot.Robot``."""
-        world = self.make_world()
-        values = in_a_loop(values, self.tick_s, self.delay_spread_s)
-        bounds = delay_bounds(values, self.tick_s, self.delay_spread_s, world.lead_s) if delays else None
-
-        def options(name: str) -> dict[str, Any]:
-            return {"delay": EXPECTED_DELAY_S[name] if delays else 0.0, "delay_dist": computation.get(name)}
-
-        agent = self._agent(**options("agent"))
-        sensor = SimSensor("sensor", self.RATE_HZ, world, **options("sensor"))
-        actuator = SimActuator("actuator", self.RATE_HZ, len(self.servos.joints), **options("actuator"))
-        nodes = simulated_loop(sensor, agent, actuator, world, bounds)
-        return nodes, ServoTask(self, agent, values, draws, self.delay_spread_s if delays else 0.0)
-
-    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
-        """Return node parameters of the loop in simulation, from rest, with a policy and a trial's aim."""
-        rest = self.servos.at_rest
-        values = in_a_loop(values, self.tick_s, self.delay_spread_s)
-        return self.node_params(values, rest, np.zeros_like(rest), self.draw_aim(jax.random.key(trial)), policy)
+        return super().recording_nodes(session, signal)
 
     def identified_mjcf(self, values: Mapping[str, Any]) -> str:
         """Return the robot's model with what was found, as MJCF."""
@@ -349,19 +337,15 @@ class ServoRobot(ABC):
         text = task.root_entity.mjcf_model.root_model.to_xml_string()
         return standard.identified_mjcf(text, task.robot, values, s.sheet, s.joints)
 
-    def nominal(self) -> dict[str, float]:
-        """Return the data sheet's values, without delays."""
-        return {p.name: p.nominal for p in self.dynamics()}
-
     def _bring_home(self, session: ServoSession, position: np.ndarray) -> None:
         rig, way = session.rig, self.servos.at_rest - position
-        steps = int(np.ceil(np.max(np.abs(way)) / _HOME_RAD_S * self.RATE_HZ))
+        steps = int(np.ceil(np.max(np.abs(way)) / _HOME_RAD_S * self.rate_hz))
         rig.start()
         try:
-            for step in range(1, steps + round(_HOLD_S * self.RATE_HZ)):
+            for step in range(1, steps + round(_HOLD_S * self.rate_hz)):
                 rig.measure()
                 rig.command(position + min(1.0, step / steps) * way, 0.0, time.monotonic())
-                time.sleep(1 / self.RATE_HZ)
+                time.sleep(1 / self.rate_hz)
         except BaseException:
             rig.stop_quietly()  # the reason must not be lost to what else fails
             raise
@@ -370,17 +354,3 @@ class ServoRobot(ABC):
     @cached_property
     def _world_params(self) -> Any:
         return self.make_world().init_params()
-
-    def _agent(self, **options: Any) -> GoalAgent:
-        s = self.servos
-        return GoalAgent("agent", self.RATE_HZ, s.low, s.high, self.observe, self.history, len(self.aim), **options)
-
-    def _on_hardware(self, session: ServoSession, agent: BaseNode) -> dict[str, BaseNode]:
-        def read(reading: Reading) -> JointReading:
-            return JointReading(reading.position_rad, reading.velocity_rad_s)
-
-        n, rate = len(self.servos.joints), self.RATE_HZ
-        rest = JointReading(self.servos.at_rest, np.zeros(n))
-        sensor = ServoSensor("sensor", rate, session.rig, read, rest, delay=EXPECTED_DELAY_S["sensor"])
-        actuator = ServoActuator("actuator", rate, session.rig, "goal", Goals, delay=EXPECTED_DELAY_S["actuator"])
-        return control_nodes(sensor, agent, actuator)

@@ -12,12 +12,13 @@ from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import JointReading
 from sim2real.robots.parts import REFERENCE, GoalTask
+from sim2real.robots.roles import ROLES
 
 __all__ = ["ServoWorld", "SimActuator", "SimSensor"]
 
 
 class ServoWorld(ComposedWorld):
-    """A composed task as a world: its input ``actuator`` has the joints' goals, its output their measured motion.
+    """A composed task as a world: its input from the actuator has the joints' goals, its output their measured motion.
 
     Args:
         name: Unique in the graph.
@@ -25,11 +26,20 @@ class ServoWorld(ComposedWorld):
         parameters: Parts of the model that differ between copies: name -> (elements, attribute).
         resumed: Whether episodes begin in the middle of a recording. The servos' setpoints, which are not recorded,
             then start at the goals of that time; otherwise they start at the joints' positions, as when torque goes on.
+        actuator: Name of the actuator.
         **options: Options of ``ComposedWorld``.
     """
 
-    def __init__(self, name: str, task: GoalTask, parameters: Any, resumed: bool = False, **options: Any) -> None:
-        super().__init__(name, task, "actuator", "goal", parameters, **options)
+    def __init__(
+        self,
+        name: str,
+        task: GoalTask,
+        parameters: Any,
+        resumed: bool = False,
+        actuator: str = ROLES.actuator,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, task, actuator, "goal", parameters, **options)
         self._resumed = resumed
         self.lead_s = 0.5 * task.physics_timestep
         model = self.environment.model
@@ -46,7 +56,7 @@ class ServoWorld(ComposedWorld):
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Make a control step with the newest goals."""
         if self._resumed:
-            state, goal = step_state.state, step_state.inputs["actuator"][-1].data.goal
+            state, goal = step_state.state, step_state.inputs[self.input_name][-1].data.goal
             reference = jnp.where(state.steps == 0, goal, state.variables[REFERENCE])
             state = state.replace(variables={**state.variables, REFERENCE: reference})
             step_state = step_state.replace(state=state)
@@ -59,5 +69,5 @@ class ServoWorld(ComposedWorld):
         step is therefore added to the delay, so that an identified delay is that of the real robot.
         """
         del rng
-        found = delay_of("actuator", "actuator", graph_state)
+        found = delay_of(self.input_name, self.input_name, graph_state)
         return {name: delay + self.lead_s for name, delay in found.items()}

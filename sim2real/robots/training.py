@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ServoTask:
-    """The training task of a servo robot; see ``sim2real.train.env.Task``.
+    """The training task of a servo robot; see ``sim2real.train.env.TrainingTask``.
 
     Args:
         robot: The robot.
@@ -29,8 +29,6 @@ class ServoTask:
         delay_spread_s: Largest deviation of an episode's delay from its value [s].
     """
 
-    supervisor = "agent"
-
     def __init__(
         self,
         robot: ServoRobot,
@@ -40,9 +38,10 @@ class ServoTask:
         delay_spread_s: float,
     ) -> None:
         self.robot, self.agent, self.values = robot, agent, dict(values)
+        self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.delay_spread_s = delay_spread_s
-        self.observation_size = sum(len(units) * history for _, units, history in robot.OBSERVATION)
+        self.observation_size = robot.observation_size
         speed = np.full(len(robot.servos.joints), robot.servos.speed, np.float32)
         self.action_low, self.action_high = -speed, speed
 
@@ -66,8 +65,8 @@ class ServoTask:
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
         """Return the robot's reward of a row."""
-        return self.robot.reward(graph_state.state["world"], action)
+        return self.robot.reward(graph_state.state[self.robot.roles.world], action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
-        return self.robot.success(graph_state.state["world"])
+        return self.robot.success(graph_state.state[self.robot.roles.world])

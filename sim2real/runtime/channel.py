@@ -36,7 +36,7 @@ class Table:
         return self._values[k - self._first]
 
 
-class Channel:
+class MessageChannel:
     """The queue of one connection's messages, between the sender's thread and the reader's.
 
     Args:

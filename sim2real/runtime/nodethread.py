@@ -12,7 +12,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Recorder, StepRecord
 from sim2real.graph.node import phase_ticks
 from sim2real.graph.rules import next_drift, slot, start, waits_for_schedule
-from sim2real.runtime.channel import Channel, Table
+from sim2real.runtime.channel import MessageChannel, Table
 from sim2real.runtime.clock import MonotonicClock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import Stopped, named
@@ -106,8 +106,8 @@ class NodeThread(threading.Thread):
         self,
         stepper: Stepper,
         data: NodeData,
-        inputs: Mapping[str, Channel],
-        outputs: Sequence[Channel],
+        inputs: Mapping[str, MessageChannel],
+        outputs: Sequence[MessageChannel],
         shared: Shared,
         handover: Handover | None,
     ) -> None:

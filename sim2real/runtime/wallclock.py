@@ -12,7 +12,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.episode import Recorder
 from sim2real.graph.node import TICKS_PER_S, BaseNode
-from sim2real.runtime.channel import Channel
+from sim2real.runtime.channel import MessageChannel
 from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.data import NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout
@@ -60,7 +60,7 @@ class WallClockRun:
         self._clock = MonotonicClock()
         self._handover = Handover(own)
         self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
-        self._channels = {(n, c.name): Channel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
+        self._channels = {(n, c.name): MessageChannel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
         self._threads: dict[str, NodeThread] = {}
         for name, node in nodes.items():
             inputs = {i: self._channels[name, i] for i in node.inputs}

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
+from sim2real.robots.base import Robot
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
@@ -34,7 +35,7 @@ from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording
-from sim2real.stages.robot import Identifiable
+from sim2real.stages.robot import moving_robot
 
 PLANNED = "planned excitation"
 _LEAST_S = 0.3
@@ -43,7 +44,7 @@ _MOST_SEGMENTS = 120
 
 
 @dataclass(frozen=True)
-class Source:
+class JudgedLogs:
     """What is judged: recordings, or one that was simulated."""
 
     names: list[str]
@@ -61,13 +62,13 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
-    robot = cast(Identifiable, pipeline.load())
-    # A robust loss would let what is wrong with the nominal model hide what the data tells.
+    robot = pipeline.load()
+    # A robust loss would hide what is wrong with the nominal model.
     fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)
     parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     source = find_source(pipeline, config, model, parameters, fitting)
-    found = judge(model, source, fitting, parameters, dict(robot.UNITS))
+    found = judge(model, source, fitting, parameters, dict(robot.units))
     found = {"pipeline": pipeline.name, **found}
     found["recommendation"] = advice.recommend(found, pipeline.name)
     if config.json:
@@ -83,7 +84,7 @@ def find_source(
     model: IdentifiableModel,
     parameters: ParameterTable,
     fitting: IdentifyConfig,
-) -> Source:
+) -> JudgedLogs:
     """Return the logs that were named, the newest recording, or what recording would give.
 
     Args:
@@ -101,7 +102,7 @@ def find_source(
         try:
             recorded = newest(config.runs, pipeline.name, "record")
         except Sim2RealError as error:
-            if not _plannable(pipeline):
+            if not isinstance(pipeline.load(), Robot):
                 raise UsageError(
                     f"there is no recording of {pipeline.name!r} in {shown(config.runs)}, and the pipeline has no "
                     "excitation to plan one with",
@@ -111,18 +112,21 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return Source([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
-    if not _plannable(pipeline):
+        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
+    if not isinstance(pipeline.load(), Robot):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",
         )
-    robot: Any = pipeline.load()
-    return Source([PLANNED], [simulate(model, robot, config.record, parameters, fitting)], True)
+    return JudgedLogs([PLANNED], [simulate(model, moving_robot(pipeline), config.record, parameters, fitting)], True)
 
 
 def judge(
-    model: IdentifiableModel, source: Source, config: IdentifyConfig, parameters: ParameterTable, units: dict[str, str]
+    model: IdentifiableModel,
+    source: JudgedLogs,
+    config: IdentifyConfig,
+    parameters: ParameterTable,
+    units: dict[str, str],
 ) -> dict[str, Any]:
     """Return what the recordings show, and what they determine at the nominal values, as JSON takes it.
 
@@ -232,7 +236,7 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
 
 
 def simulate(
-    model: IdentifiableModel, robot: Any, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
+    model: IdentifiableModel, robot: Robot, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
 ) -> Episode:
     """Return the log that the planned excitation would give if the robot were the nominal model.
 
@@ -244,8 +248,8 @@ def simulate(
         config: For which delays the model is made.
     """
     nodes = model.nodes(config.max_delay_s)
-    node, field = robot.COMMAND
-    signal = command_signal(record, robot.RATE_HZ, len(robot.ACTION))
+    node, field = robot.roles.actuator, robot.command
+    signal = command_signal(record, robot.rate_hz, len(robot.action))
     timeline = draw(nodes, record.duration_s, rng=record.seed)
     given, outputs = {}, {}
     for name in model.given:
@@ -383,7 +387,7 @@ def _motion_rows(joints: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
     return rows, ["joint", "time in motion", "of it upwards", "reversals"]
 
 
-def _as_json(found: excitation.Spread) -> dict[str, Any]:
+def _as_json(found: excitation.Histogram) -> dict[str, Any]:
     return {**asdict(found), "covered": found.covered}
 
 
@@ -391,9 +395,3 @@ def _steps(vertex: Vertex, count: int, early: int) -> Steps:
     """Return the steps of one drawn node as a log has them, ``early`` ticks before."""
     start, end = (np.maximum(times[0, :count] - early, 0) for times in (vertex.start, vertex.end))
     return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))
-
-
-def _plannable(pipeline: Pipeline) -> bool:
-    """Return whether the robot can be excited by us: one that is only known from recordings cannot."""
-    robot = pipeline.load()
-    return hasattr(robot, "COMMAND") and hasattr(robot, "RATE_HZ")

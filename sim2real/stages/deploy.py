@@ -13,13 +13,14 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, finished, newest, open_stage
 from sim2real.errors import Sim2RealError
+from sim2real.robots.base import Robot, Session
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.gap import compare
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.rig import opened, show_withheld, warn
-from sim2real.stages.robot import Robot, Session, moving_robot
+from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 from sim2real.train.networks import Policy
 
@@ -58,7 +59,7 @@ def deploy(
     if config.dry_run:  # nothing was moved: there is nothing to judge or to compare
         nothing = tuple(Scores({}) for _ in recordings)
         none: tuple[dict[str, np.ndarray], ...] = tuple({} for _ in recordings)
-        return Deployment(nothing, (), dict(robot.UNITS), none, tuple(recordings), dry_run=True), sessions
+        return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
     values = None if identification is None else identification.values
     return compare(robot, recordings, policy, values, config.duration_s), sessions
 
@@ -145,25 +146,24 @@ def _find_bundle(
 def _load_policy(robot: Robot, bundle: Bundle) -> Policy:
     """Return the policy, once it is known that it fits the robot."""
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
-    expected = [(name, tuple(units), history) for name, units, history in robot.OBSERVATION]
-    found = [(t.name, tuple(t.units), t.history) for t in contract.observation]
-    if found != expected or contract.rate_hz != robot.RATE_HZ:
+    expected, found = ([(t.name, tuple(t.units), t.history) for t in c.observation] for c in (robot, contract))
+    if found != expected or contract.rate_hz != robot.rate_hz:
         raise Sim2RealError(
             f"the policy {where} sees {found} at {contract.rate_hz:g} Hz, "
-            f"this robot shows {expected} at {robot.RATE_HZ:g} Hz",
+            f"this robot shows {expected} at {robot.rate_hz:g} Hz",
             hint="train a policy for this pipeline",
         )
-    sends = [(a.name, a.unit) for a in contract.action]
-    if sends != robot.ACTION:
+    takes, sends = ([(a.name, a.unit) for a in c.action] for c in (robot, contract))
+    if sends != takes:
         raise Sim2RealError(
-            f"the policy {where} sends {sends}, this robot takes {robot.ACTION}",
+            f"the policy {where} sends {sends}, this robot takes {takes}",
             hint="train a policy for this pipeline",
         )
-    for action, (low, high) in zip(contract.action, robot.ACTION_BOUNDS, strict=True):
-        if action.low < np.float32(low) or action.high > np.float32(high):  # training rounds them so
+    for action, most in zip(contract.action, robot.action, strict=True):
+        if action.low < np.float32(most.low) or action.high > np.float32(most.high):  # training rounds them so
             raise Sim2RealError(
                 f"the policy {where} sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}, "
-                f"this robot bears {low:g} to {high:g}",
+                f"this robot bears {most.low:g} to {most.high:g}",
                 hint="train a policy for this pipeline",
             )
     return Policy.from_weights(dict(bundle.weights))

@@ -19,11 +19,12 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import newest_message
 from sim2real.log.ages import input_ages
+from sim2real.robots.base import Robot
+from sim2real.robots.states import as_columns, as_sent
 from sim2real.runtime.bursts import make_room
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.console import note, progress
 from sim2real.stages.interruption import patiently
-from sim2real.stages.robot import Robot
 
 _SIMULATIONS = 32
 States = tuple[np.ndarray, dict[str, np.ndarray]]
@@ -45,7 +46,7 @@ def compare(
         duration_s: How long to simulate [s].
     """
     real = [_states(recording, robot) for recording in recordings]
-    seen = "world" if all(r.true_states() is not None for r in recordings) else "sensor"
+    seen = robot.roles.world if all(r.true_states() is not None for r in recordings) else robot.roles.sensor
     with progress(None, "simulate the same"):
         simulated, timeline = patiently(
             lambda: _simulate(robot, policy, values, recordings[0].timing, duration_s, len(recordings), seen)
@@ -54,32 +55,18 @@ def compare(
     gap += _age_rows(robot, [r.episode for r in recordings], timeline)
     columns = [{"t": t, **states} for t, states in (simulated or [])[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
-    return Deployment(episodes, tuple(gap), dict(robot.UNITS), tuple(columns), tuple(recordings))
+    return Deployment(episodes, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings))
 
 
 def _states(recording: Recording, robot: Robot) -> States:
     """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
     episode = recording.episode
-    sent = _sent(robot, episode.outputs[robot.SUPERVISOR], episode.outputs[robot.COMMAND[0]])
+    sent = as_sent(robot, episode.outputs[robot.roles.supervisor], episode.outputs[robot.roles.actuator])
     if (true := recording.true_states()) is not None:
         t_s, states = true
         return t_s, {**sent, **states}
-    return episode.steps["sensor"].begun_s, {**sent, **_columns(episode.outputs["sensor"])}
-
-
-def _columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
-    columns = {}
-    for name, values in fields.items():
-        flat = np.asarray(values).reshape(len(values), -1)
-        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
-    return columns
-
-
-def _sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
-    field = robot.COMMAND[1]
-    return _columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})
+    sensor = robot.roles.sensor
+    return episode.steps[sensor].begun_s, {**sent, **as_columns(episode.outputs[sensor])}
 
 
 def _simulate(
@@ -93,7 +80,7 @@ def _simulate(
 ) -> tuple[list[States] | None, Timeline | None]:
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
 
-    ``seen`` says which states: those of the ``world``, or as the ``sensor`` measures them, as late as on the robot.
+    ``seen`` says which states: those of the world, or as the sensor measures them, as late as on the robot.
     Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
     once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
     None and None where there is nothing to simulate with.
@@ -101,7 +88,7 @@ def _simulate(
     if values is None:
         return None, None
     try:
-        computation, hiccups = timing.computation(1.0 / robot.RATE_HZ)
+        computation, hiccups = timing.computation(1.0 / robot.rate_hz)
     except Sim2RealError as error:  # the robot has run: what it did must not be lost
         note(f"warning: nothing to compare with: {error.args[0]}")
         return None, None
@@ -111,11 +98,11 @@ def _simulate(
     nodes, _ = robot.training(values, {}, computation, True)
     timeline = draw(nodes, duration_s, _SIMULATIONS, 0)
     make_room(nodes, timeline)
-    graph = CompiledGraph(nodes, robot.SUPERVISOR, timeline)
+    graph = CompiledGraph(nodes, robot.roles.supervisor, timeline)
     # Each deployment's own trial in turn: its simulation has the same to do.
     trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
-    recorded = (seen, robot.SUPERVISOR, robot.COMMAND[0])
+    recorded = (seen, robot.roles.supervisor, robot.roles.actuator)
 
     def one(eps: jax.Array, params: Any) -> Any:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
@@ -127,7 +114,7 @@ def _simulate(
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
     """Return rows of the gap table: how old the data were that policy and actuator acted on, on the robot and here."""
     rows = []
-    for reader in (robot.SUPERVISOR, robot.COMMAND[0]):
+    for reader in (robot.roles.supervisor, robot.roles.actuator):
         measured = [input_ages(e, reader) for e in episodes]
         for name in measured[0]:
             ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]
@@ -162,10 +149,10 @@ def _run(graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: int,
     def steps(node: str) -> np.ndarray:
         return records[node].seq[e][records[node].seq[e] >= 0]
 
-    name, vertices = robot.COMMAND[0], graph.timeline.vertices
+    name, vertices = robot.roles.actuator, graph.timeline.vertices
     when = vertices[name].end[e][steps(name)] / TICKS_PER_S
-    columns = {**_sent(robot, sent(robot.SUPERVISOR), sent(name)), **_columns(sent(seen))}
-    if seen == "world":  # a tick's message is its state at the end
+    columns = {**as_sent(robot, sent(robot.roles.supervisor), sent(name)), **as_columns(sent(seen))}
+    if seen == robot.roles.world:  # a tick's message is its state at the end
         t_s = (steps(seen) + 1) / graph.nodes[seen].rate
     else:
         t_s = vertices[seen].start[e][steps(seen)] / TICKS_PER_S

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording
-from sim2real.stages.robot import Identifiable
 from sim2real.stages.truth import true_values
 
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
@@ -65,7 +64,7 @@ def identify(
     fitted = [recording] if isinstance(recording, Recording) else list(recording)
     logs = [*fitted, *hold_out]
     episodes = [log.episode for log in logs]
-    robot = cast(Identifiable, pipeline.load())
+    robot = pipeline.load()
     model = robot.identifiable(config.max_delay_s)
     table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
@@ -74,14 +73,14 @@ def identify(
         found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told))
     with progress(None, "identify: errors, predictions and baselines"):
         findings = patiently(lambda: identified.Findings.of(found))
-        truth = true_values(logs[0]) if config.reveal else {}
+        truth = true_values(logs[0], robot.roles) if config.reveal else {}
         document = identified.document(pipeline.name, findings, truth, time.monotonic() - begin)
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, table, found))
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
-        identified.judged(document, findings, robot.UNITS, config.max_delay_s, outside),
+        identified.judged(document, findings, robot.units, config.max_delay_s, outside),
         logs=tuple(Source(log.path.as_posix(), "") for log in logs),
-        units=dict(robot.UNITS),
+        units=dict(robot.units),
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
     )
@@ -96,7 +95,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    robot = cast(Identifiable, pipeline.load())
+    robot = pipeline.load()
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
     logs = [open_recording(path, pipeline) for path in paths]
     fitted = len(logs) - len(config.hold_out)
@@ -115,8 +114,8 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         found = replace(found, logs=sources, verdict=verdict)
         for name, path in found.save(stage.folder).items():
             stage.output(name, path)
-        if write := getattr(robot, "identified_mjcf", None):
-            stage.output("mjcf", "identified.xml").write_text(write(found.values))
+        if (mjcf := robot.identified_mjcf(found.values)) is not None:
+            stage.output("mjcf", "identified.xml").write_text(mjcf)
         from sim2real.view.page import identify_page  # matplotlib and jinja2 take 0.5 s to import
 
         stage.output("page", identify_page(stage.folder).name)

@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 _LOOK_S = 0.25
 
 
-class Signals:
+class SignalHandling:
     """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
 
     Only the first signal raises an exception: a second Ctrl-C must not interrupt the clean-up that takes the torque
@@ -31,7 +31,7 @@ class Signals:
         self._before: dict[int, Any] = {}
         self._hook = sys.unraisablehook
 
-    def __enter__(self) -> Signals:
+    def __enter__(self) -> SignalHandling:
         if threading.current_thread() is threading.main_thread():
             numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
             # Signals that are ignored at the start, as under nohup and in background jobs, stay ignored.

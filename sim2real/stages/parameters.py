@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 from sim2real.artifacts.identification import Identification
 from sim2real.errors import Sim2RealError
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.robot import Identifiable
 
 
 def open_identification(path: Path, pipeline: Pipeline) -> Identification:
@@ -39,7 +37,7 @@ def check_parameters(found: Identification, pipeline: Pipeline) -> None:
         raise Sim2RealError(
             "this identification was interrupted: it says nothing about how sure its estimates are", hint=hint
         )
-    robot = cast(Identifiable, pipeline.load())
+    robot = pipeline.load()
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
     there = {p.name for p in found.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:

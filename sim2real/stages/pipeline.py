@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 from sim2real.errors import UsageError
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
+
+if TYPE_CHECKING:
+    from sim2real.robots.base import RecordedRobot
 
 ENTRY_POINT_GROUP = "sim2real.pipelines"
 
@@ -28,8 +31,7 @@ class Pipeline:
         name: The folder's name, used on the command line.
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
-        robot: Module in the package that fulfils ``sim2real.stages.robot.Robot`` by its functions, or has an object
-            ``ROBOT`` that does.
+        robot: Module in the package whose ``ROBOT`` is a ``sim2real.robots.base.Robot``, or ``RecordedRobot``.
         scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None: not drawn.
         record: Defaults of the stage; its fields become flags.
         identify: Defaults of the stage.
@@ -52,10 +54,24 @@ class Pipeline:
         """The folder of the pipeline's files."""
         return Path(str(importlib.import_module(self.package).__file__)).parent
 
+    @overload
+    def load(self) -> RecordedRobot: ...
+
+    @overload
+    def load(self, module: str) -> Any: ...
+
     def load(self, module: str | None = None) -> Any:
-        """Import a module of the pipeline's package; default: the robot's, or the ``ROBOT`` in it if there is one."""
+        """Return the robot, checked; or a module of the pipeline's package.
+
+        Raises:
+            UsageError: When the robot misses something, or something about it is of the wrong kind.
+        """
         found = importlib.import_module(f"{self.package}.{module or self.robot}")
-        return found if module else getattr(found, "ROBOT", found)
+        if module:
+            return found
+        from sim2real.robots.base import checked  # imports JAX
+
+        return checked(getattr(found, "ROBOT", None), f"pipeline {self.name!r} ({found.__file__})")
 
 
 def available() -> dict[str, Any]:

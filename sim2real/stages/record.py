@@ -32,7 +32,7 @@ def record(pipeline: Pipeline, folder: Path, config: RecordConfig | None = None)
     """
     config = config or pipeline.record
     robot = moving_robot(pipeline)
-    signal = excitation(config, robot.RATE_HZ, len(robot.ACTION))
+    signal = excitation(config, robot.rate_hz, len(robot.action))
     note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
     log, truth = folder / LOG, folder / TRUTH
     with opened(robot, config, truth) as session:
@@ -51,7 +51,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)
-    excitation(config, robot.RATE_HZ, len(robot.ACTION))  # what cannot be played is refused before a folder is made
+    excitation(config, robot.rate_hz, len(robot.action))  # what cannot be played is refused before a folder is made
     with open_stage(root, pipeline.name, "record", config, run_dir=run_dir, dry_run=config.dry_run) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":

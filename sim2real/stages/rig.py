@@ -12,10 +12,10 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.hardware.gate import SafetyGate
 from sim2real.hardware.rig import Rig
+from sim2real.robots.base import Robot, Session
 from sim2real.runtime.clock import realtime
 from sim2real.stages.config import DeployConfig, RecordConfig
 from sim2real.stages.console import note, table
-from sim2real.stages.robot import Robot, Session
 
 LATE_SHARE = 0.01
 """Share of late answers above which the stage warns."""

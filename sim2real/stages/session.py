@@ -18,12 +18,12 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.log.writer import McapRecorder
+from sim2real.robots.base import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.rig import answer_rows, is_dry, rig_summary, sent_rows
-from sim2real.stages.robot import Robot, Session
 
 LATE_SHARE = 0.01
 """Share of late steps above which ``--strict-timing`` ends with code 5."""
@@ -94,7 +94,7 @@ def run_episode(
     Raises:
         Sim2RealError: What stopped the robot.
     """
-    graph = AsyncGraph(nodes, nodes[robot.SUPERVISOR])
+    graph = AsyncGraph(nodes, nodes[robot.roles.supervisor])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
     recorder = _recorder(pipeline, robot, graph, state, log, config, is_dry(session.rig))
@@ -183,21 +183,22 @@ def _recorder(
         "dry_run": dry,
         "config": plain(asdict(config)),
         "graph": topology,
-        "units": dict(robot.UNITS),
+        "roles": asdict(robot.roles),
+        "units": dict(robot.units),
         "versions": plain(versions()),
         "git": plain(git_state()),
         "seed": config.seed,
         "port": config.port,
     }
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, robot.JOINTS)
+    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, {robot.roles.sensor: robot.joints})
     if dry:
         recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
     return recorder
 
 
 def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
-    rig, command, counters = session.rig, robot.COMMAND[1], session.rig.device.counters
+    rig, command, counters = session.rig, robot.command, session.rig.device.counters
     timing = {
         n: {
             "steps": s.steps,
@@ -217,7 +218,7 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
         "command_timeouts": rig.timeouts,
         **rig_summary(rig),
         "gate": asdict(rig.gate.counts),
-        "sent": sent_rows(rig.gate, command, robot.UNITS.get(command, "")),
+        "sent": sent_rows(rig.gate, command, robot.units.get(command, "")),
     }
 
 

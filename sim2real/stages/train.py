@@ -21,14 +21,15 @@ from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
-from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
+from sim2real.policy.contract import PolicyContract
+from sim2real.robots.base import Robot
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.robot import Robot, moving_robot
+from sim2real.stages.robot import moving_robot
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
@@ -74,8 +75,8 @@ def train(
     values, draws = model_values(robot, identification, config)
     computation, dropped = _computation(robot, identification, timing) if delays else ({}, {})
     nodes, task = robot.training(values, draws, computation, delays)
-    timeline, redrawn = draw_timelines(nodes, robot.SUPERVISOR, config)
-    env = GraphEnvironment(CompiledGraph(nodes, robot.SUPERVISOR, timeline), task)
+    timeline, redrawn = draw_timelines(nodes, robot.roles.supervisor, config)
+    env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
         result = patiently(lambda: learn(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
@@ -159,7 +160,7 @@ def _computation(
     Raises:
         Sim2RealError: When nothing says how long they take, or most of them are hiccups.
     """
-    longest_s = _HICCUP / robot.RATE_HZ
+    longest_s = _HICCUP / robot.rate_hz
     computation, dropped = (timing or _timing_of(identified)).computation(longest_s)
     if dropped:
         steps = ", ".join(f"{count} of {name!r}" for name, count in dropped.items())
@@ -226,12 +227,12 @@ def _find_parameters(
 
 def _contract(robot: Robot, task: Any, values: Mapping[str, float]) -> PolicyContract:
     return PolicyContract(
-        observation=tuple(ObservationTerm(name, units, history) for name, units, history in robot.OBSERVATION),
+        observation=robot.observation,
         action=tuple(
-            ActionTerm(name, unit, float(low), float(high))
-            for (name, unit), low, high in zip(robot.ACTION, task.action_low, task.action_high, strict=True)
+            replace(term, low=float(low), high=float(high))
+            for term, low, high in zip(robot.action, task.action_low, task.action_high, strict=True)
         ),
-        rate_hz=robot.RATE_HZ,
+        rate_hz=robot.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
         hashes={},
     )

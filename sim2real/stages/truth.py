@@ -7,14 +7,15 @@ import math
 import numpy as np
 
 from sim2real.artifacts.recording import Recording
-from sim2real.graph.episode import Episode
+from sim2real.graph.episode import Steps
 from sim2real.hardware.truth import Kind, Truth
+from sim2real.robots.roles import Roles
 from sim2real.stages.console import note
 
 _NEAR_NS = 3_000_000
 
 
-def true_values(recording: Recording) -> dict[str, float]:
+def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
     """Return the true parameters, and the true mean delays in the log's own terms.
 
     ``sensor_delay`` is from the motion to the measurement's time stamp, ``actuator_delay`` from the end of the
@@ -31,20 +32,20 @@ def true_values(recording: Recording) -> dict[str, float]:
     episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
     if origin_ns is None:  # a session that crashed never wrote when it started
         return values
-    sensing, actuation = sensing_delay_s(truth, episode, origin_ns), actuation_delay_s(truth, episode, origin_ns)
+    sensing = sensing_delay_s(truth, episode.steps[roles.sensor], origin_ns)
+    actuation = actuation_delay_s(truth, episode.steps[roles.actuator], origin_ns)
     delays = {"sensor_delay": sensing, "actuator_delay": actuation, "round_trip_delay": sensing + actuation}
     return {**values, **{name: delay for name, delay in delays.items() if math.isfinite(delay)}}
 
 
-def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
+def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any.
 
     Args:
         truth: The embedded robot's account.
-        episode: The log.
+        steps: The sensor's.
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
     """
-    steps = episode.steps["sensor"]
     stamp = steps.begun * 1000 + origin_ns
     samples = truth.of(Kind.SAMPLE)
     if not len(samples):
@@ -54,15 +55,14 @@ def sensing_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
     return _mean_s((stamp - samples["t_ns"][nearest])[matched])
 
 
-def actuation_delay_s(truth: Truth, episode: Episode, origin_ns: int) -> float:
+def actuation_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any.
 
     Args:
         truth: The embedded robot's account.
-        episode: The log.
+        steps: The actuator's.
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
     """
-    steps = episode.steps["actuator"]
     start, end = steps.start * 1000 + origin_ns, steps.end * 1000 + origin_ns
     effects = truth.of(Kind.EFFECT)
     effects = effects[effects["t_host_ns"] > 0]

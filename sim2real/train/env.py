@@ -13,7 +13,7 @@ from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
 
 
-class Task(Protocol):
+class TrainingTask(Protocol):
     """The training task of a pipeline: observation, action, reward and success.
 
     Attributes:
@@ -79,7 +79,7 @@ class GraphEnvironment:
         UsageError: When the supervisor makes several steps in one row of the timelines.
     """
 
-    def __init__(self, graph: CompiledGraph, task: Task) -> None:
+    def __init__(self, graph: CompiledGraph, task: TrainingTask) -> None:
         self.graph, self.task = graph, task
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high

@@ -19,7 +19,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.networks import Policy, init_mlp
-from sim2real.train.protocol import Environment, check_environment
+from sim2real.train.protocol import TrainingEnvironment, check_environment
 from sim2real.train.rollout import Copies, evaluate
 from sim2real.train.update import Normaliser, TrainState, keys, make_optimiser, make_policy, update
 
@@ -71,7 +71,7 @@ class TrainResult:
 
 
 def train(
-    env: Environment, config: PPOConfig, key: jax.Array, on_progress: Callable[[Progress], None] | None = None
+    env: TrainingEnvironment, config: PPOConfig, key: jax.Array, on_progress: Callable[[Progress], None] | None = None
 ) -> TrainResult:
     """Train ``num_seeds`` policies.
 
@@ -119,7 +119,9 @@ def train(
     )
 
 
-def _epoch(env: Environment, config: PPOConfig, state: TrainState) -> tuple[TrainState, Policy, dict[str, jax.Array]]:
+def _epoch(
+    env: TrainingEnvironment, config: PPOConfig, state: TrainState
+) -> tuple[TrainState, Policy, dict[str, jax.Array]]:
     """Train one seed up to its next evaluation, and evaluate it."""
     state, stats = jax.lax.scan(
         lambda state, _: update(env, config, state), state, length=config.updates_per_evaluation
@@ -130,7 +132,7 @@ def _epoch(env: Environment, config: PPOConfig, state: TrainState) -> tuple[Trai
     return state, policy, values | evaluate(env, config, policy, keys(state)[2])
 
 
-def _init(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:
+def _init(env: TrainingEnvironment, config: PPOConfig, key: jax.Array) -> TrainState:
     """Return the states before the first update, with a leading seed axis; compiles nothing.
 
     The environments' states are zeros; the first rollout resets them.

@@ -45,7 +45,7 @@ class Step(NamedTuple):
     metrics: dict[str, jax.Array]
 
 
-class Environment(Protocol):
+class TrainingEnvironment(Protocol):
     """One copy of an environment; ``reset`` and ``step`` are pure and PPO vmaps them."""
 
     @property
@@ -78,7 +78,7 @@ class Environment(Protocol):
         ...
 
 
-def check_environment(env: Environment) -> None:
+def check_environment(env: TrainingEnvironment) -> None:
     """Check shapes and dtypes of everything that ``env`` returns, by tracing it; nothing is compiled or run.
 
     Raises:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import Environment
+from sim2real.train.protocol import TrainingEnvironment
 
 
 class Copies(NamedTuple):
@@ -62,7 +62,7 @@ def select(mask: jax.Array, new: Any, old: Any) -> Any:
 
 
 def collect(
-    env: Environment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
+    env: TrainingEnvironment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
@@ -111,7 +111,7 @@ def collect(
     return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
 
 
-def evaluate(env: Environment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
     """Play one episode per copy without exploration noise, and average over the episodes that ended.
 
     Args:

@@ -11,7 +11,7 @@ import optax
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy, apply_mlp, entropy, log_prob
-from sim2real.train.protocol import Environment
+from sim2real.train.protocol import TrainingEnvironment
 from sim2real.train.rollout import Copies, Rows, collect
 
 
@@ -79,7 +79,7 @@ def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
     return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5)))
 
 
-def make_policy(env: Environment, params: dict[str, Any], normaliser: Normaliser) -> Policy:
+def make_policy(env: TrainingEnvironment, params: dict[str, Any], normaliser: Normaliser) -> Policy:
     """Return the policy with the given parameters and normaliser.
 
     Args:
@@ -221,7 +221,7 @@ def keys(state: TrainState) -> jax.Array:
     return jax.random.split(jax.random.fold_in(state.key, state.update), 3)
 
 
-def update(env: Environment, config: PPOConfig, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
     """Play one rollout and update the networks and the normaliser.
 
     Each minibatch has all rows of some of the copies: shuffling N indices is cheap, and a copy's rows are adjacent in

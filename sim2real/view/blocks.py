@@ -107,7 +107,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """One stage's part of a page."""
 
     id: str

@@ -37,7 +37,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Motion:
+class SceneMotion:
     """A motion of the robot in the 3-D view: a column ``(N,)`` for each field; a ghost is a model's prediction."""
 
     entity: str
@@ -61,7 +61,7 @@ class Tab:
     title: str
     entity: str
     plots: Mapping[str, list[Curve]]
-    motions: list[Motion]
+    motions: list[SceneMotion]
     episode: Episode | None = None
 
 
@@ -131,9 +131,9 @@ def _identify_tab(found: Identification, recording: int, which: str) -> Tab:
             series = Series(quantity, model, *_interrupted(t_s, values, segment))
             curves.append(_curve(f"{entity}/{model}", series, model, model))
         plots[_titled(quantity, found.units)] = curves
-    motions = [Motion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
+    motions = [SceneMotion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
     if "identified" in columns:
-        motions.append(Motion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))
+        motions.append(SceneMotion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))
     return Tab(f"Identify{which}", entity, plots, motions)
 
 
@@ -155,14 +155,14 @@ def _curve(folder: str, series: Series, look: str, label: str) -> Curve:
     return Curve(f"{folder}/{series.name}", label, look, series.t_s, series.values)
 
 
-def _motion(entity: str, states: list[Series], commands: list[Series], ghost: bool) -> Motion:
+def _motion(entity: str, states: list[Series], commands: list[Series], ghost: bool) -> SceneMotion:
     """Return one motion on the times of the first state; everything else holds its last value until the next."""
     t_s = states[0].t_s if states else np.empty(0)
     columns = {}
     for series in [*commands, *states]:
         last = np.searchsorted(series.t_s, t_s, side="right") - 1
         columns[series.name] = series.values[np.maximum(last, 0)]
-    return Motion(entity, t_s, columns, ghost)
+    return SceneMotion(entity, t_s, columns, ghost)
 
 
 def _titled(name: str, units: Mapping[str, str]) -> str:

@@ -16,7 +16,7 @@ from sim2real.view.blocks import (
     Block,
     FigureBlock,
     ListBlock,
-    Section,
+    PageSection,
     TableBlock,
     Tile,
     Tone,
@@ -38,7 +38,7 @@ _TITLES: dict[str, tuple[Tone, str]] = {
 _STRONG = 0.9
 
 
-def identify_section(artifact: StageFolder) -> Section:
+def identify_section(artifact: StageFolder) -> PageSection:
     """Return the verdict, the parameters and how sure they are, and how well the model predicts."""
     found = Identification.load(artifact.folder)
     blocks = [
@@ -58,7 +58,7 @@ def identify_section(artifact: StageFolder) -> Section:
         )
     lead = "Dynamics and delays from the log, with how far each can be trusted."
     tiles = list(_tiles(found))
-    return Section("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
+    return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
 
 
 def _banner(found: Identification) -> Banner | None:

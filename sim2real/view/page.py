@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sim2real.artifacts.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
-from sim2real.view.blocks import NoteBlock, Section
+from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.sections import SECTIONS, headline
 
 PAGE = "report.html"
@@ -59,7 +59,7 @@ def _stage_page(folder: Path, stage: str) -> Path:
 
 
 def _write(
-    path: Path, artifacts: Sequence[StageFolder], sections: Sequence[Section], run: str, notes: list[NoteBlock]
+    path: Path, artifacts: Sequence[StageFolder], sections: Sequence[PageSection], run: str, notes: list[NoteBlock]
 ) -> Path:
     """Render a page and write it; a browser that has the old one open never sees half of the new one."""
     environment = Environment(

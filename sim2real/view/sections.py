@@ -20,7 +20,7 @@ from sim2real.view.blocks import (
     Block,
     FigureBlock,
     NoteBlock,
-    Section,
+    PageSection,
     TableBlock,
     Tile,
     fixed,
@@ -32,7 +32,7 @@ from sim2real.view.servos import DRY, servo_blocks
 from sim2real.view.signals import Signals, signals_of, simulated_series, unit_of
 
 
-def record_section(artifact: StageFolder) -> Section:
+def record_section(artifact: StageFolder) -> PageSection:
     """Return what was recorded, and how well the nodes kept their times."""
     log = signals_of(Recording.load(artifact.folder))
     blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
@@ -50,10 +50,10 @@ def record_section(artifact: StageFolder) -> Section:
     lead = "The robot under an excitation" + (
         ", with torque withheld." if log.dry else "; the log is what everything after it rests on."
     )
-    return Section("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
+    return PageSection("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
 
 
-def train_section(artifact: StageFolder) -> Section:
+def train_section(artifact: StageFolder) -> PageSection:
     """Return the learning curves."""
     curves = History.load(artifact.folder)
     last, seeds = curves.success[-1], curves.returns.shape[1]
@@ -70,10 +70,10 @@ def train_section(artifact: StageFolder) -> Section:
     rows = [[str(seed), number(float(curves.returns[-1, seed])), f"{last[seed]:.1%}"] for seed in range(seeds)]
     table = TableBlock("Each seed at the end", ("seed", "return", "success"), rows)
     lead = "A policy for the identified model, with the timing of the robot."
-    return Section("train", "Train", lead, tiles, [figure, table, *about(artifact)])
+    return PageSection("train", "Train", lead, tiles, [figure, table, *about(artifact)])
 
 
-def deploy_section(artifact: StageFolder) -> Section:
+def deploy_section(artifact: StageFolder) -> PageSection:
     """Return the gap between robot and simulation, and each episode."""
     deployed = Deployment.load(artifact.folder)
     logs = [signals_of(recording) for recording in deployed.recordings]
@@ -108,10 +108,10 @@ def deploy_section(artifact: StageFolder) -> Section:
         tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
     tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in logs])]
     lead = "The policy on the robot, beside the same policy in simulation."
-    return Section("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
 
 
-def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> Section:
+def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
     """Return what a policy would have done; there is no gap, as nothing was moved."""
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     blocks.append(NoteBlock("There is no gap report: a simulation has nothing to be compared with."))
@@ -123,7 +123,7 @@ def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> Section:
         blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
     lead = "The policy on the robot, with torque withheld."
-    return Section("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
 
 
 SECTIONS = {
@@ -134,7 +134,7 @@ SECTIONS = {
 }
 
 
-def headline(sections: Sequence[Section]) -> list[Tile]:
+def headline(sections: Sequence[PageSection]) -> list[Tile]:
     """Return the first number of each stage: what a reader wants to know before anything else."""
     return [Tile(f"{s.title}: {s.tiles[0].label}", s.tiles[0].value, s.tiles[0].note) for s in sections if s.tiles]
 

@@ -33,7 +33,7 @@ class MjxParams(Base):
 
 
 @struct.dataclass
-class JointState(Base):
+class MjxState(Base):
     """The world's output.
 
     Attributes:
@@ -109,12 +109,12 @@ class MjxWorld(BaseWorld):
         start: Any = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
         return self._engine.forward(params.model, start.replace(qpos=params.qpos, qvel=params.qvel))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxState:
         """Return positions and velocities at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return JointState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
+        return MjxState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
 
-    def step(self, step_state: StepState) -> tuple[StepState, JointState]:
+    def step(self, step_state: StepState) -> tuple[StepState, MjxState]:
         """Integrate over one tick under the newest control."""
         model, advance = step_state.params.model, self._engine.advance
         control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
@@ -124,4 +124,4 @@ class MjxWorld(BaseWorld):
         else:
             data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
         new = step_state.replace(state=data)
-        return new, JointState(data.qpos, data.qvel)
+        return new, MjxState(data.qpos, data.qvel)

@@ -4,7 +4,7 @@ import pytest
 
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import StatusError
-from sim2real.hardware.dynamixel.servo import Servo
+from sim2real.hardware.dynamixel.servo import EmulatedServo
 from sim2real.hardware.plant import OperatingMode
 
 
@@ -14,7 +14,7 @@ def write(servo, register, value):
 
 @pytest.fixture
 def servo():
-    servo = Servo(1)
+    servo = EmulatedServo(1)
     servo.refresh(1.0, 0.0, 0.0, 0)
     return servo
 
@@ -114,7 +114,7 @@ def test_homing_offset_shifts_present_and_goal_alike(servo):
 
 
 def test_present_registers():
-    servo = in_mode(Servo(1, encoder_counts=1024), OperatingMode.PWM)
+    servo = in_mode(EmulatedServo(1, encoder_counts=1024), OperatingMode.PWM)
     write(servo, reg.GOAL_PWM, 442)
     servo.refresh(-1.0, 2.0, 3.0, tick_ms=40_000)
     assert servo.get(reg.PRESENT_POSITION) % 4 == 0
@@ -144,7 +144,7 @@ def test_tripped_watchdog_blocks_goals_until_zero_is_written(servo):
 
 @pytest.mark.parametrize(("model", "stops", "goal"), [(1200, None, 300), (1200, True, 0), (1060, False, 300)])
 def test_a_330_that_has_tripped_refuses_goals_but_turns_on_until_torque_is_off(model, stops, goal):
-    servo = Servo(1, model, watchdog_stops=stops)
+    servo = EmulatedServo(1, model, watchdog_stops=stops)
     in_mode(servo, OperatingMode.PWM)
     write(servo, reg.GOAL_PWM, 300)
     write(servo, reg.BUS_WATCHDOG, 5)

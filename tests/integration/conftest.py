@@ -6,7 +6,6 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 from live_robots import PATIENT, TINY
@@ -20,20 +19,28 @@ RECORDING = ["--duration-s", "12", "--seed", "1", *PATIENT]
 FAULTY = """
 import time
 from dataclasses import replace
+import numpy as np
+from sim2real.robots import hardware
+from sim2real.robots.loop import control_nodes
 from sim2real.stages.pipeline import load_pipeline
 
 pendulum = load_pipeline("pendulum")
-robot, hardware = pendulum.load(), pendulum.load("hardware")
+robot = pendulum.load()
 
-def __getattr__(name):
-    return getattr(robot, name)
+def faulty_emulator(**faults):
+    return replace(robot.embedded, emulator=replace(robot.embedded.emulator, **faults))
 
 def nodes(session, signal, sensor=hardware.ServoSensor, agent=hardware.Excitation):
-    return robot.control_nodes(
-        sensor("sensor", 50.0, session.rig, delay=0.002),
-        agent("agent", 50.0, signal, delay=0.002),
-        hardware.ServoActuator("actuator", 50.0, session.rig, delay=0.002),
+    rows, command = np.reshape(signal, (-1, 1)), robot.message
+    return control_nodes(
+        sensor("sensor", 50.0, session.rig, robot.read, robot.at_rest, delay=0.002),
+        agent("agent", 50.0, rows, command, delay=0.002),
+        hardware.ServoActuator("actuator", 50.0, session.rig, "action", command, delay=0.002),
     )
+"""
+FAULTS = """
+faults = {name: value for name, value in globals().items() if hasattr(type(robot), name) and not name.startswith("_")}
+ROBOT = type("Faulty", (type(robot),), {n: staticmethod(f) if callable(f) else f for n, f in faults.items()})()
 """
 
 
@@ -78,7 +85,7 @@ def make_pipeline(tmp_path, monkeypatch):
             "from sim2real.stages.pipeline import Pipeline\n"
             f"PIPELINE = Pipeline(name={name!r}, summary='pendulum with a fault', package=__name__)\n"
         )
-        (folder / "robot.py").write_text(FAULTY + textwrap.dedent(body))
+        (folder / "robot.py").write_text(FAULTY + textwrap.dedent(body) + FAULTS)
         return name
 
     return make
@@ -87,12 +94,11 @@ def make_pipeline(tmp_path, monkeypatch):
 @pytest.fixture
 def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, its truth file, how to stop it."""
-    hardware = load_pipeline("pendulum").load("hardware")
-    plant = Path(hardware.__file__).with_name("plant.py")
+    embedded = load_pipeline("pendulum").load().embedded
     path = tmp_path / "truth.bin"
-    command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", f"{plant}:PendulumPlant"]
+    command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", embedded.plant]
     command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig", "--truth", str(path)]
-    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(hardware.EMBEDDED).items() if v is not None]
+    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(embedded.emulator).items() if v is not None]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     port = json.loads(process.stdout.readline())["port"]

@@ -22,7 +22,7 @@ from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 from sim2real.log.reader import read_log, read_session
-from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, save_bundle
+from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
@@ -34,13 +34,12 @@ PATIENT = ["--gate.servo-watchdog-s", "0.6"]  # a busy machine is not what is te
 @pytest.fixture(scope="module")
 def tapped(tmp_path_factory):
     """Start an emulated pendulum behind a wiretap."""
-    hardware = load_pipeline("pendulum").load("hardware")
-    plant = f"{Path(hardware.__file__).with_name('plant.py')}:PendulumPlant"
+    embedded = load_pipeline("pendulum").load().embedded
     with contextlib.ExitStack() as stack:
 
         def start():
             truth = tmp_path_factory.mktemp("robot") / "truth.bin"
-            robot = stack.enter_context(EmbeddedRobot(plant, hardware.EMBEDDED, None, truth))
+            robot = stack.enter_context(EmbeddedRobot(embedded.plant, embedded.emulator, None, truth))
             tap = Wiretap(robot.port)
             stack.callback(tap.close)
             return tap, robot
@@ -208,10 +207,9 @@ def test_a_deployment_says_what_the_policy_would_have_sent(tapped, tmp_path):
 
 def steady(robot, folder):
     """Write a bundle whose policy always asks for the same."""
-    size = sum(len(units) * history for _, units, history in robot.OBSERVATION)
-    low, high = (np.array(side, np.float32) for side in zip(*robot.ACTION_BOUNDS, strict=True))
-    actions = [ActionTerm(*a, *map(float, b)) for a, b in zip(robot.ACTION, robot.ACTION_BOUNDS, strict=True)]
-    contract = PolicyContract(tuple(ObservationTerm(*t) for t in robot.OBSERVATION), tuple(actions), robot.RATE_HZ)
+    size = robot.observation_size
+    low, high = (np.array([getattr(a, side) for a in robot.action], np.float32) for side in ("low", "high"))
+    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz)
     zeros, n = np.zeros(size, np.float32), len(low)
     weights = {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(n)}
     weights |= {"layers.0.kernel": np.zeros((size, n)), "layers.0.bias": np.full(n, 0.5)}

@@ -34,9 +34,7 @@ def test_a_servo_that_stops_answering(make_pipeline, record):
     name = make_pipeline(
         "silent_servo",
         """
-        def connect(port, limits, truth_path, seed):
-            emulator = replace(hardware.EMBEDDED, silent_after_s=4.0, model_number=1060)
-            return hardware.Session(port, limits, truth_path, seed, emulator)
+        embedded = faulty_emulator(silent_after_s=4.0, model_number=1060)
         """,
     )
     code, said, folder = record(name, duration_s=10)
@@ -59,8 +57,7 @@ def test_a_servo_that_stops_answering(make_pipeline, record):
 
 
 ILL = """
-    def connect(port, limits, truth_path, seed):
-        return hardware.Session(port, limits, truth_path, seed, replace(hardware.EMBEDDED, {fault}))
+    embedded = faulty_emulator({fault})
     """
 
 

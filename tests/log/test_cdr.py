@@ -11,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sim2real.errors import Sim2RealError
-from sim2real.log.cdr import ROS_TYPES, Field, Layout
+from sim2real.log.cdr import ROS_TYPES, CdrField, Layout
 from sim2real.log.schema import joint_source, output_topic
 
 DTYPES = list(ROS_TYPES)
@@ -79,7 +79,9 @@ def test_joint_states_read_alike_in_both(joints):
 
 
 def test_many_messages_decode_at_once():
-    layout = Layout([Field("flag", np.dtype(bool)), Field("q", np.dtype("f8"), (3,)), Field("n", np.dtype("i2"))])
+    layout = Layout(
+        [CdrField("flag", np.dtype(bool)), CdrField("q", np.dtype("f8"), (3,)), CdrField("n", np.dtype("i2"))]
+    )
     rows = np.frombuffer(b"".join(layout.pack([i % 2, np.full(3, i), i]) for i in range(50)), layout.dtype)
     np.testing.assert_array_equal(rows["q"], np.arange(50.0)[:, None] * np.ones(3))
     np.testing.assert_array_equal(rows["n"], np.arange(50))
@@ -97,7 +99,7 @@ def test_many_messages_decode_at_once():
     ],
 )
 def test_what_does_not_fit_is_named(value, message):
-    layout = Layout([Field("n", np.dtype("i1")), Field("q", np.dtype("f4"), (2,))])
+    layout = Layout([CdrField("n", np.dtype("i1")), CdrField("q", np.dtype("f4"), (2,))])
     with pytest.raises(Sim2RealError, match=message):
         layout.pack(value)
 

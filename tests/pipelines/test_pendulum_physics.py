@@ -10,7 +10,7 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.stages.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("pendulum")
-MODEL, PLANT, PARAMETERS = (PIPELINE.load(name) for name in ("model", "plant", "parameters"))
+MODEL, PLANT = (PIPELINE.load(name) for name in ("model", "plant"))
 OFF, PWM = OperatingMode.OFF, OperatingMode.PWM
 
 
@@ -32,7 +32,7 @@ def test_the_model_is_integrated_as_scipy_does(start, voltage):
         return x, x
 
     _, simulated = jax.jit(lambda x: jax.lax.scan(tick, x, length=100))(state)
-    groups = {n: float(v) for n, v in PARAMETERS.groups(params).items()}
+    groups = {n: float(v) for n, v in MODEL.groups(params).items()}
 
     def f(_, x):
         return x[1], acceleration(groups, x[0], x[1], voltage, np.tanh(x[1] / params.smooth_rad_s))
@@ -44,7 +44,7 @@ def test_the_model_is_integrated_as_scipy_does(start, voltage):
 
 def test_groups_and_back():
     values = {"gain": 21.0, "gravity": 110.0, "damping": 0.8, "friction": 8.0}
-    back = PARAMETERS.groups(PARAMETERS.from_groups(values, [np.pi, 0.0]))
+    back = MODEL.groups(MODEL.from_groups(values, [np.pi, 0.0]))
     for name, value in values.items():
         assert float(back[name]) == pytest.approx(value, rel=1e-5)
 
@@ -126,7 +126,7 @@ def test_the_motor_brakes_only_while_torque_is_on():
 def test_the_plant_starts_hanging_and_says_what_it_is():
     plant = PLANT.PendulumPlant()
     assert plant.state() == {"th": np.pi, "thdot": 0.0, "voltage": 0.0}
-    nominal = {n: float(v) for n, v in PARAMETERS.groups(MODEL.nominal_params()).items()}
+    nominal = {n: float(v) for n, v in MODEL.groups(MODEL.nominal_params()).items()}
     truth = plant.truth()
     assert truth["gain"] / nominal["gain"] == pytest.approx(0.9 / 1.15, rel=1e-5)
     assert truth["gravity"] / nominal["gravity"] == pytest.approx(1 / 1.15, rel=1e-5)

@@ -50,28 +50,27 @@ def observation_of(robot):
 def test_an_observation_has_as_many_entries_as_the_robot_announces(kind, arm):
     robot = arm.load() if kind == "arm" else kind()
     task, seen = observation_of(robot)
-    announced = sum(len(units) * history for _, units, history in robot.OBSERVATION)
-    assert seen.shape == (announced,) == (task.observation_size,)
-    assert all(units and history > 0 for _, units, history in robot.OBSERVATION)
+    assert seen.shape == (robot.observation_size,) == (task.observation_size,)
 
 
 def test_it_names_its_units_joints_and_actions(pair):
-    assert pair.UNITS == {"position": "rad", "velocity": "rad/s", "goal": "rad", "aim[0]": "rad"}
-    assert pair.JOINTS == {
-        "sensor": {
-            "left": {"position": "position[0]", "velocity": "velocity[0]"},
-            "right": {"position": "position[1]", "velocity": "velocity[1]"},
-        }
+    assert pair.units == {"position": "rad", "velocity": "rad/s", "goal": "rad", "aim[0]": "rad"}
+    assert pair.joints == {
+        "left": {"position": "position[0]", "velocity": "velocity[0]"},
+        "right": {"position": "position[1]", "velocity": "velocity[1]"},
     }
-    assert pair.ACTION == [("speed of left's goal", "rad/s"), ("speed of right's goal", "rad/s")]
-    assert [(name, len(units), steps) for name, units, steps in pair.OBSERVATION] == [
+    assert [(a.name, a.unit) for a in pair.action] == [
+        ("speed of left's goal", "rad/s"),
+        ("speed of right's goal", "rad/s"),
+    ]
+    assert [(t.name, t.size, t.history) for t in pair.observation] == [
         ("position", 2, 1),
         ("velocity", 2, 1),
         ("goal", 2, 1),
         ("aim", 1, 1),
         ("past position, velocity, goal", 6, 2),
     ]
-    assert pair.COMMAND[1] in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
+    assert pair.command in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
     assert pair.tick_s == 0.01
 
 
@@ -141,6 +140,6 @@ def test_a_recording_begins_where_the_joints_are(pair):
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(100)])
     np.testing.assert_allclose(played[0], reading.position_rad)
     off = np.abs(played - signal)
-    assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.RATE_HZ + 1e-9
+    assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.rate_hz + 1e-9
     np.testing.assert_array_equal(played[51:], signal[51:])
     np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])

@@ -21,7 +21,7 @@ SPEEDS = jnp.array([1.5, -1.0])
 def trained(pair):
     """The loop with delays, and half a second in which the goals move at one speed."""
     nodes, task = pair.training(DELAYED, DRAWS, {}, True)
-    graph = CompiledGraph(nodes, pair.SUPERVISOR, draw(nodes, 0.5))
+    graph = CompiledGraph(nodes, pair.roles.supervisor, draw(nodes, 0.5))
     env = GraphEnvironment(graph, task)
 
     def run(key):

@@ -17,14 +17,19 @@ pytestmark = pytest.mark.realtime
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 
 
+def blocks():
+    """Return the Python on the page: the two files, and a test of them."""
+    found = re.findall(r"^```python\n(.*?)^```", TUTORIAL.read_text(), re.DOTALL | re.MULTILINE)
+    assert len(found) == 3
+    return found
+
+
 @pytest.fixture
 def head(tmp_path, monkeypatch):
     """The pipeline of the tutorial, written down as a reader would."""
-    blocks = re.findall(r"^```python\n(.*?)^```", TUTORIAL.read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 2
     folder = tmp_path / "pipelines" / "head"
     folder.mkdir(parents=True)
-    for name, block in zip(("__init__", "robot"), blocks, strict=True):
+    for name, block in zip(("__init__", "robot"), blocks()[:2], strict=True):
         (folder / f"{name}.py").write_text(block)
     monkeypatch.chdir(tmp_path)
     return load_pipeline("head")
@@ -45,13 +50,19 @@ def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     assert {n: found[n] / nominal[n] for n in found} == pytest.approx(factors, rel=1e-6)
 
 
+def test_it_passes_the_test_that_the_page_has(head, tmp_path):
+    names: dict = {}
+    exec(blocks()[2], names)
+    names["test_the_head_is_a_robot"](tmp_path)
+
+
 def test_its_policy_sees_and_does_what_the_contract_says(head):
     robot = head.load()
     nodes, task = robot.training(robot.nominal(), {}, {}, delays=False)
     assert set(nodes) == {"sensor", "agent", "actuator", "world"}
     params = task.params(jax.random.key(1))
     np.testing.assert_allclose(params["world"].values["told"][:2], params["agent"].aim)
-    assert task.observation_size == sum(len(units) * history for _, units, history in robot.OBSERVATION) == 26
+    assert task.observation_size == robot.observation_size == 26
     t_s, there = np.linspace(0, 3, 300), np.full(300, 0.4)
     states = {"position[0]": there, "position[1]": there, "aim[0]": there[:9], "aim[1]": there[:9]}
     assert robot.score(t_s, states)["success"] == 1.0

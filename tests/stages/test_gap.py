@@ -15,6 +15,8 @@ from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepR
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import control_nodes
+from sim2real.robots.roles import ROLES
+from sim2real.robots.states import as_columns, as_sent
 from sim2real.stages import gap
 from sim2real.stages.pipeline import load_pipeline
 
@@ -65,10 +67,10 @@ def test_the_arms_score_reads_them(states):
 
 
 def test_numbers_keep_their_names():
-    robot = SimpleNamespace(COMMAND=("actuator", "action"))
-    sent = gap._sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
+    robot = SimpleNamespace(command="action")
+    sent = as_sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
     assert {n: v.tolist() for n, v in sent.items()} == {"command": [0.0, 1.0, 2.0, 3.0]}
-    columns = gap._columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})
+    columns = as_columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})
     assert {n: v.tolist() for n, v in columns.items()} == {
         "th": [0, 1, 2],
         **{f"pose[{i}]": [i, 4 + i, 8 + i] for i in range(4)},
@@ -77,7 +79,7 @@ def test_numbers_keep_their_names():
 
 def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
     """One message of the recording is used 80 ms late; simulated timelines have 2 ms everywhere."""
-    robot = SimpleNamespace(SUPERVISOR="agent", COMMAND=("actuator", "action"))
+    robot = SimpleNamespace(roles=ROLES)
     recorder = MemoryRecorder()
     for k in range(50):
         begin = 20_000 * k + (80_000 if k == 30 else 0)

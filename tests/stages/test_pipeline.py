@@ -5,6 +5,17 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline import available, load_pipeline
 
+ROBOT = """
+from sim2real.robots.base import RecordedRobot
+
+class Robot(RecordedRobot):
+    units = {{"about": {about!r}}}
+
+    def identifiable(self, max_delay_s):
+        return None
+
+ROBOT = Robot()
+"""
 INIT = "from sim2real.stages.pipeline import Pipeline\nPIPELINE = Pipeline({name!r}, {about!r}, __name__)\n"
 
 
@@ -12,7 +23,7 @@ def write(folder, name, about="robot", calls_itself=None, text=None, robot=None)
     target = folder / "pipelines" / name
     target.mkdir(parents=True)
     (target / "__init__.py").write_text(text or INIT.format(name=calls_itself or name, about=about))
-    (target / "robot.py").write_text(robot or f"ABOUT = {about!r}\n")
+    (target / "robot.py").write_text(robot or ROBOT.format(about=about))
 
 
 def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
@@ -20,17 +31,32 @@ def test_a_folder_beside_the_user_is_a_pipeline(tmp_path, monkeypatch):
     assert "found_here" not in available()
     monkeypatch.chdir(tmp_path)
     assert {"found_here", "pendulum"} <= set(available())
-    assert load_pipeline("found_here").load().ABOUT == "robot"
+    assert load_pipeline("found_here").load().units == {"about": "robot"}
     assert load_pipeline("found_here") is load_pipeline("found_here")
 
 
-def test_a_robot_may_be_an_object_of_its_module(tmp_path, monkeypatch):
-    write(tmp_path, "one_object", robot="class R:\n    ABOUT = 'object'\n\nROBOT = R()\nABOUT = 'module'\n")
+def test_the_robot_is_an_object_of_its_module(tmp_path, monkeypatch):
+    write(tmp_path, "one_object")
     monkeypatch.chdir(tmp_path)
     pipeline = load_pipeline("one_object")
-    assert pipeline.load().ABOUT == "object"
     assert pipeline.load() is pipeline.load("robot").ROBOT
-    assert pipeline.load("robot").ABOUT == "module", "by its name a module is itself"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("UNITS = {}\ndef identifiable(max_delay_s): ...\n", "is missing"),
+        ("class Mine: ...\nROBOT = Mine()\n", "Mine object"),
+        ("from sim2real.robots.base import RecordedRobot as ROBOT\n", "RecordedRobot"),
+    ],
+)
+def test_a_module_without_a_robot_says_how_to_write_one(tmp_path, monkeypatch, text, said):
+    name = f"no_robot_{len(said)}"
+    write(tmp_path, name, robot=text)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=f"ROBOT of pipeline .*{said}.*sim2real.robots.base.Robot") as caught:
+        load_pipeline(name).load()
+    assert "end with `ROBOT = MyRobot()`" in (caught.value.hint or "")
 
 
 def test_folders_of_one_name_are_told_apart(tmp_path, monkeypatch):
@@ -40,7 +66,7 @@ def test_folders_of_one_name_are_told_apart(tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path / where)
         pipeline = load_pipeline("same_name")
         assert pipeline.summary == where
-        assert where == pipeline.load().ABOUT
+        assert pipeline.load().units == {"about": where}
 
 
 def test_a_pipeline_that_cannot_be_imported_fails_every_time(tmp_path, monkeypatch):

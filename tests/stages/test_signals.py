@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from sim2real.stages.interruption import Signals, patiently
+from sim2real.stages.interruption import SignalHandling, patiently
 
 pytestmark = pytest.mark.realtime
 
@@ -116,7 +116,7 @@ def test_a_signal_does_not_wait_for_a_long_computation():
 
     forever = threading.Event()
     begin = time.monotonic()
-    with Signals(), pytest.raises(KeyboardInterrupt):
+    with SignalHandling(), pytest.raises(KeyboardInterrupt):
         patiently(compile_for_a_minute)
     assert time.monotonic() - begin < 30
     forever.set()

@@ -15,7 +15,7 @@ from sim2real.composer.c.binding import EmptyBinding
 from sim2real.composer.c.named import Named
 from sim2real.composer.mjx import constants, stepping, warp_fields
 from sim2real.composer.mjx.random import JaxRandomState
-from sim2real.composer.mjx.views import DataView, MjxBinding, ModelView, constant
+from sim2real.composer.mjx.views import MjxBinding, MjxDataView, MjxModelView, constant
 from sim2real.composer.models import layout
 from sim2real.composer.models.element import as_elements
 from sim2real.composer.models.translate import mj
@@ -70,7 +70,7 @@ class MjxPhysics:
         self.dry = False
         self._where: Any = None
         self._compiled = model
-        self.data, self.model = DataView(self), ModelView(self)
+        self.data, self.model = MjxDataView(self), MjxModelView(self)
         self.named = Named(host, self.model, self.data)
 
     def read(self, field: layout.Field) -> Any:

@@ -57,7 +57,7 @@ def constant(name: str) -> UsageError:
     )
 
 
-class Constant(np.ndarray):
+class ConstantView(np.ndarray):
     """An array that is the same in all copies: writing into it is refused, by name."""
 
     name: str = ""
@@ -68,7 +68,7 @@ class Constant(np.ndarray):
 
     def __getitem__(self, key: Any) -> Any:
         part = super().__getitem__(key)
-        if isinstance(part, Constant):
+        if isinstance(part, ConstantView):
             part.name = self.name
         return part
 
@@ -95,7 +95,7 @@ class Struct:
 def shown(value: Any, name: str) -> Any:
     """Return a value of the compiled model as hooks may see it."""
     if isinstance(value, np.ndarray):
-        view = value.view(Constant)
+        view = value.view(ConstantView)
         view.flags.writeable = False
         view.name = name
         return view
@@ -116,7 +116,7 @@ class OptionView:
         self._physics.replace("model", f"opt.{name}", value)
 
 
-class ModelView:
+class MjxModelView:
     """``physics.model``: what differs from copy to copy comes from MJX, the rest from ``ptr``, the ``MjModel``."""
 
     def __init__(self, physics: Traced) -> None:
@@ -147,7 +147,7 @@ class ModelView:
         self._physics.replace("model", name, value)
 
 
-class DataView:
+class MjxDataView:
     """``physics.data``: fields of the state, in MuJoCo's shapes."""
 
     def __init__(self, physics: Traced) -> None:

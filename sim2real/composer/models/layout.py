@@ -31,7 +31,7 @@ DISABLED_BY = {
 
 
 @dataclass(frozen=True)
-class Kind:
+class ElementKind:
     """How elements of a kind are stored: object type, first dimensions of their fields, prefixes of field names."""
 
     object_type: Any
@@ -40,23 +40,23 @@ class Kind:
 
 
 KINDS = {
-    "body": Kind(mj.mjtObj.mjOBJ_BODY, ("nbody", "nmocap"), ("body",)),
-    "joint": Kind(mj.mjtObj.mjOBJ_JOINT, ("nq", "nv", "njnt"), ("jnt", "dof")),
-    "geom": Kind(mj.mjtObj.mjOBJ_GEOM, ("ngeom",), ("geom",)),
-    "site": Kind(mj.mjtObj.mjOBJ_SITE, ("nsite",), ("site",)),
-    "camera": Kind(mj.mjtObj.mjOBJ_CAMERA, ("ncam",), ("cam",)),
-    "light": Kind(mj.mjtObj.mjOBJ_LIGHT, ("nlight",), ("light",)),
-    "actuator": Kind(mj.mjtObj.mjOBJ_ACTUATOR, ("na", "nu", "nactuator", "nout"), ("actuator",)),
-    "sensor": Kind(mj.mjtObj.mjOBJ_SENSOR, ("nsensor", "nsensordata"), ("sensor",)),
-    "tendon": Kind(mj.mjtObj.mjOBJ_TENDON, ("ntendon",), ("tendon", "ten")),
-    "equality": Kind(mj.mjtObj.mjOBJ_EQUALITY, ("neq",), ("eq",)),
-    "mesh": Kind(mj.mjtObj.mjOBJ_MESH, ("nmesh",), ("mesh",)),
-    "hfield": Kind(mj.mjtObj.mjOBJ_HFIELD, ("nhfield",), ("hfield",)),
-    "material": Kind(mj.mjtObj.mjOBJ_MATERIAL, ("nmat",), ("mat",)),
-    "texture": Kind(mj.mjtObj.mjOBJ_TEXTURE, ("ntex",), ("tex",)),
-    "numeric": Kind(mj.mjtObj.mjOBJ_NUMERIC, ("nnumeric", "nnumericdata"), ("numeric",)),
-    "text": Kind(mj.mjtObj.mjOBJ_TEXT, ("ntext",), ("text",)),
-    "key": Kind(mj.mjtObj.mjOBJ_KEY, ("nkey",), ("key",)),
+    "body": ElementKind(mj.mjtObj.mjOBJ_BODY, ("nbody", "nmocap"), ("body",)),
+    "joint": ElementKind(mj.mjtObj.mjOBJ_JOINT, ("nq", "nv", "njnt"), ("jnt", "dof")),
+    "geom": ElementKind(mj.mjtObj.mjOBJ_GEOM, ("ngeom",), ("geom",)),
+    "site": ElementKind(mj.mjtObj.mjOBJ_SITE, ("nsite",), ("site",)),
+    "camera": ElementKind(mj.mjtObj.mjOBJ_CAMERA, ("ncam",), ("cam",)),
+    "light": ElementKind(mj.mjtObj.mjOBJ_LIGHT, ("nlight",), ("light",)),
+    "actuator": ElementKind(mj.mjtObj.mjOBJ_ACTUATOR, ("na", "nu", "nactuator", "nout"), ("actuator",)),
+    "sensor": ElementKind(mj.mjtObj.mjOBJ_SENSOR, ("nsensor", "nsensordata"), ("sensor",)),
+    "tendon": ElementKind(mj.mjtObj.mjOBJ_TENDON, ("ntendon",), ("tendon", "ten")),
+    "equality": ElementKind(mj.mjtObj.mjOBJ_EQUALITY, ("neq",), ("eq",)),
+    "mesh": ElementKind(mj.mjtObj.mjOBJ_MESH, ("nmesh",), ("mesh",)),
+    "hfield": ElementKind(mj.mjtObj.mjOBJ_HFIELD, ("nhfield",), ("hfield",)),
+    "material": ElementKind(mj.mjtObj.mjOBJ_MATERIAL, ("nmat",), ("mat",)),
+    "texture": ElementKind(mj.mjtObj.mjOBJ_TEXTURE, ("ntex",), ("tex",)),
+    "numeric": ElementKind(mj.mjtObj.mjOBJ_NUMERIC, ("nnumeric", "nnumericdata"), ("numeric",)),
+    "text": ElementKind(mj.mjtObj.mjOBJ_TEXT, ("ntext",), ("text",)),
+    "key": ElementKind(mj.mjtObj.mjOBJ_KEY, ("nkey",), ("key",)),
 }
 OBJECT_TYPES = {**{name: kind.object_type for name, kind in KINDS.items()}, "pair": mj.mjtObj.mjOBJ_PAIR}
 

@@ -36,7 +36,7 @@ def _order(sample: tuple[int, int, np.ndarray]) -> tuple[int, int]:
     return sample[:2]
 
 
-class Channel:
+class _Channel:
     """One enabled observable: its schedule and the samples that may still be read.
 
     Args:
@@ -205,18 +205,18 @@ class Updater:
         self._strip, self._pad_initial = strip_singleton_buffer_dim, pad_with_initial_value
         self._now = 0
         self._channels: Any = None
-        self._flat: list[Channel] = []
+        self._flat: list[_Channel] = []
 
     def reset(self, physics: Any, random_state: Any) -> None:
         """Start an episode: take the first samples."""
         self._now = 0
 
-        def channels(observables: dict[str, Any]) -> dict[str, Channel]:
+        def channels(observables: dict[str, Any]) -> dict[str, _Channel]:
             made = type(observables)()
             for name, value in observables.items():
                 if value.enabled:
                     options = (self._steps_per_read, self._strip, self._pad_initial)
-                    made[name] = Channel(name, value, physics, random_state, *options)
+                    made[name] = _Channel(name, value, physics, random_state, *options)
             return made
 
         self._channels = self._map(channels, self._observables)
@@ -246,8 +246,8 @@ class Updater:
         self._require_reset()
         return self._each(lambda channel: channel.observation_spec())
 
-    def _each(self, function: Callable[[Channel], Any]) -> Any:
-        def group(channels: dict[str, Channel]) -> dict[str, Any]:
+    def _each(self, function: Callable[[_Channel], Any]) -> Any:
+        def group(channels: dict[str, _Channel]) -> dict[str, Any]:
             return type(channels)((name, function(channel)) for name, channel in channels.items())
 
         return self._map(group, self._channels)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import BROADCAST_ID, Instruction, Parser, StatusError, build_status
-from sim2real.hardware.dynamixel.servo import Servo
+from sim2real.hardware.dynamixel.servo import EmulatedServo
 from sim2real.hardware.planned import BusEmulation, PlannedBus, Request, Sample
 from sim2real.hardware.plant import Plant
 from sim2real.hardware.truth import TruthLog
@@ -37,7 +37,9 @@ class EmulatedBus(PlannedBus):
     ) -> None:
         self._wild = config.wild
         self.servos = {
-            i: Servo(i, config.model_number, config.return_delay_us, config.encoder_counts, config.watchdog_stops)
+            i: EmulatedServo(
+                i, config.model_number, config.return_delay_us, config.encoder_counts, config.watchdog_stops
+            )
             for i in sorted(plant.servo_ids)
         }
         self._handlers: dict[int, Callable[[Request], None]] = {
@@ -72,7 +74,7 @@ class EmulatedBus(PlannedBus):
         if not broadcast:
             self._reply(targets[0], request, error)
 
-    def _targets(self, request: Request) -> list[Servo]:
+    def _targets(self, request: Request) -> list[EmulatedServo]:
         """Return the servos that a request addresses, ordered by id."""
         if request.packet.servo_id == BROADCAST_ID:
             return list(self.servos.values())
@@ -143,7 +145,7 @@ class EmulatedBus(PlannedBus):
             self.configure(servo)
             self.actuate(servo, request)
 
-    def _write_servo(self, servo: Servo, request: Request, address: int, data: bytes) -> StatusError:
+    def _write_servo(self, servo: EmulatedServo, request: Request, address: int, data: bytes) -> StatusError:
         self.measure(servo, request.t_ns)
         error, moves = servo.write(address, data)
         self.configure(servo)
@@ -151,7 +153,7 @@ class EmulatedBus(PlannedBus):
             self.actuate(servo, request)
         return error
 
-    def _answer_read(self, servo: Servo, request: Request, address: int, length: int) -> None:
+    def _answer_read(self, servo: EmulatedServo, request: Request, address: int, length: int) -> None:
         sample = self.measure(servo, request.t_ns)
         if self.happens(self._wild):
             servo.put(reg.PRESENT_POSITION, self.random.randrange(1 << 24, 1 << 31))
@@ -160,12 +162,17 @@ class EmulatedBus(PlannedBus):
             measured = address < reg.PRESENT_POSITION.end and address + length > reg.PRESENT_PWM.address
             self._reply(servo, request, error, data, sample if measured else None)
 
-    def _acknowledge(self, servo: Servo, request: Request, error: StatusError) -> None:
+    def _acknowledge(self, servo: EmulatedServo, request: Request, error: StatusError) -> None:
         if request.packet.servo_id != BROADCAST_ID and servo.get(reg.STATUS_RETURN_LEVEL) >= 2:
             self._reply(servo, request, error)
 
     def _reply(
-        self, servo: Servo, request: Request, error: StatusError, data: bytes = b"", sample: Sample | None = None
+        self,
+        servo: EmulatedServo,
+        request: Request,
+        error: StatusError,
+        data: bytes = b"",
+        sample: Sample | None = None,
     ) -> None:
         answer = build_status(servo.servo_id, error | servo.alert, data)
         self.reply(servo.servo_id, request, answer, servo.get(reg.RETURN_DELAY_TIME) * reg.RETURN_DELAY_UNIT_S, sample)

@@ -17,7 +17,7 @@ _FIXED: Final = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
 _MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS)
 
 
-class Servo:
+class EmulatedServo:
     """Registers and firmware of one DYNAMIXEL X servo, without time, bus and physics.
 
     Args:

@@ -28,7 +28,7 @@ _FIELDS: Final = {
 
 
 @dataclass(frozen=True)
-class Joint:
+class CalibratedJoint:
     """A joint that a servo moves: angle = direction * gear * (count - zero_count) * (2 pi / 4096).
 
     Args:
@@ -83,7 +83,7 @@ class Joint:
         return round(self.zero_count + angle_rad / self.rad_per_count)
 
 
-def read_calibration(path: Path | str) -> tuple[Joint, ...]:
+def read_calibration(path: Path | str) -> tuple[CalibratedJoint, ...]:
     """Read LeRobot's calibration of an arm: `~/.cache/huggingface/lerobot/calibration/robots/so101_follower/*.json`.
 
     Args:
@@ -126,7 +126,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def _joint(path: Path, name: str, entry: Any) -> Joint:
+def _joint(path: Path, name: str, entry: Any) -> CalibratedJoint:
     where = f"calibration file {path}: motor {name!r}"
     if not isinstance(entry, dict):
         raise UsageError(f"{where} is no object with {', '.join(_FIELDS)}", hint=_HINT)
@@ -142,7 +142,7 @@ def _joint(path: Path, name: str, entry: Any) -> Joint:
             f"{where}: range_min = {entry['range_min']} is not below range_max = {entry['range_max']}",
             hint="was the joint moved while its range was recorded? calibrate again",
         )
-    return Joint(
+    return CalibratedJoint(
         name=name,
         servo_id=entry["id"],
         zero_count=(entry["range_min"] + entry["range_max"]) / 2,

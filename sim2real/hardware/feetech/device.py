@@ -16,7 +16,7 @@ import numpy as np
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import POSITION, Alone, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.link import StsConfig, StsLink
 from sim2real.hardware.feetech.off import torque_off_packet, torque_queries
@@ -53,7 +53,7 @@ class StsServos(Device):
         UsageError: There are no joints, or two with one servo.
     """
 
-    def __init__(self, bus: StsConfig, joints: Sequence[Joint], drive: StsDrive | None = None) -> None:
+    def __init__(self, bus: StsConfig, joints: Sequence[CalibratedJoint], drive: StsDrive | None = None) -> None:
         self.config = bus
         self.joints = tuple(joints)
         self._ids = tuple(joint.servo_id for joint in joints)
@@ -291,7 +291,7 @@ class StsServos(Device):
         if self._halted:
             self.make_safe()
 
-    def _find(self, link: StsLink, joint: Joint) -> None:
+    def _find(self, link: StsLink, joint: CalibratedJoint) -> None:
         """Find a joint's servo; raise HardwareLost if it is not there, another model, or calibrated differently."""
         servo_id = joint.servo_id
         where = f"{self.config.port} at {self.config.baud_rate} baud"
@@ -316,7 +316,7 @@ class StsServos(Device):
                 hint="this is another arm's calibration, or the servo was changed: run lerobot-calibrate",
             )
 
-    def _prepare(self, link: StsLink, joint: Joint) -> None:
+    def _prepare(self, link: StsLink, joint: CalibratedJoint) -> None:
         """Write a servo's settings, with torque off, and check that it can go wherever its joint may."""
         servo_id = joint.servo_id
         phase = self._phases[servo_id] = link.read(servo_id, reg.PHASE)
@@ -341,7 +341,7 @@ class StsServos(Device):
         for register, value in self._drive.registers(self._phases[servo_id]).items():
             link.set(servo_id, register, value)
 
-    def _rest_count(self, joint: Joint, count: int) -> int:
+    def _rest_count(self, joint: CalibratedJoint, count: int) -> int:
         """Return the goal at which a joint stays where it is; raise SafetyStop if it is far outside its range."""
         goal = min(max(count, joint.low_count), joint.high_count)
         if abs(goal - count) * abs(joint.rad_per_count) > _BEYOND_RAD:
@@ -368,5 +368,5 @@ def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, si
         silence_s: Longest time without an instruction while torque is on [s].
     """
     joints = {joint.servo_id: joint for joint in drive.joints}
-    chosen = [joints.get(i) or Joint(f"servo {i}", i) for i in ids]
+    chosen = [joints.get(i) or CalibratedJoint(f"servo {i}", i) for i in ids]
     return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), chosen, drive)

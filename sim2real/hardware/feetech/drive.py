@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import Joint
-from sim2real.hardware.feetech.registers import Register
+from sim2real.hardware.feetech.calibration import CalibratedJoint
+from sim2real.hardware.feetech.registers import StsRegister
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class StsDrive:
     speed_rad_s: float = math.inf
     acceleration_rad_s2: float = math.inf
     torque: float = 1.0
-    joints: tuple[Joint, ...] = ()
+    joints: tuple[CalibratedJoint, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the values fit the registers."""
@@ -45,7 +45,7 @@ class StsDrive:
         if not 0.0 < self.torque <= 1.0:
             raise UsageError(f"torque = {self.torque} is no fraction in (0, 1]")
 
-    def registers(self, phase: int) -> dict[Register, int]:
+    def registers(self, phase: int) -> dict[StsRegister, int]:
         """Return the registers' values [counts] for a servo whose register Phase holds `phase`."""
         most = reg.ACCELERATION.maximum
         acceleration = self.acceleration_rad_s2 / (reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.profile import ProfiledPlant
-from sim2real.hardware.feetech.protocol import BROADCAST_ID, Instruction, Parser, build
+from sim2real.hardware.feetech.protocol import BROADCAST_ID, StsInstruction, StsParser, build
 from sim2real.hardware.feetech.servo import StsServo
 from sim2real.hardware.planned import BusEmulation, Firmware, PlannedBus, Request, Sample
 from sim2real.hardware.plant import Plant
@@ -53,16 +53,16 @@ class StsBus(PlannedBus):
         for servo in self.servos.values():
             servo.put(reg.HOMING_OFFSET, config.homing_offset)
         self._handlers: dict[int, Callable[[Request, list[StsServo]], None]] = {
-            Instruction.PING: self._ping,
-            Instruction.READ: self._read,
-            Instruction.WRITE: self._write,
-            Instruction.REG_WRITE: self._reg_write,
-            Instruction.ACTION: self._action,
-            Instruction.RESTART: self._restart,
-            Instruction.SYNC_READ: self._sync_read,
-            Instruction.SYNC_WRITE: self._sync_write,
+            StsInstruction.PING: self._ping,
+            StsInstruction.READ: self._read,
+            StsInstruction.WRITE: self._write,
+            StsInstruction.REG_WRITE: self._reg_write,
+            StsInstruction.ACTION: self._action,
+            StsInstruction.RESTART: self._restart,
+            StsInstruction.SYNC_READ: self._sync_read,
+            StsInstruction.SYNC_WRITE: self._sync_write,
         }
-        super().__init__(self._profiles, config, truth, send, start_ns, now_ns, Parser(), self.servos)
+        super().__init__(self._profiles, config, truth, send, start_ns, now_ns, StsParser(), self.servos)
 
     def execute(self, request: Request) -> None:
         """Carry out an instruction that is complete on the wire, and reply to it."""

@@ -28,14 +28,14 @@ from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.protocol import (
     BROADCAST_ID,
     FRAME_BYTES,
-    Instruction,
-    Packet,
-    Parser,
+    StsInstruction,
+    StsPacket,
+    StsParser,
     build,
     describe_alarms,
     sync_write,
 )
-from sim2real.hardware.feetech.registers import Register
+from sim2real.hardware.feetech.registers import StsRegister
 from sim2real.hardware.guardian import Guardian
 
 _LOCK_TIMEOUT_S: Final = 0.5
@@ -103,10 +103,10 @@ class StsLink:
         self.closed = False
         self.torque_withheld = False
         self.withheld = 0
-        self._withheld_goals: dict[tuple[int, Register], int] = {}
+        self._withheld_goals: dict[tuple[int, StsRegister], int] = {}
         self._lock = threading.Lock()
-        self._parser = Parser()
-        self._waiting: list[Packet] = []
+        self._parser = StsParser()
+        self._waiting: list[StsPacket] = []
         self._pad = 0
         self._sent_ns = 0
         try:
@@ -119,7 +119,7 @@ class StsLink:
             ) from error
         self.fd = cast(int, self._serial.fileno())
 
-    def read(self, servo_id: int, register: Register, despite_alarm: bool = False) -> int:
+    def read(self, servo_id: int, register: StsRegister, despite_alarm: bool = False) -> int:
         """Return a register's value in counts; of a goal that was withheld, that goal.
 
         Args:
@@ -154,14 +154,14 @@ class StsLink:
             asked = length + self._pad % (spare + 1)
             head = bytes((address, asked))
             if len(servo_ids) == 1:
-                return build(servo_ids[0], Instruction.READ, head), asked
-            return build(BROADCAST_ID, Instruction.SYNC_READ, head + bytes(servo_ids)), asked
+                return build(servo_ids[0], StsInstruction.READ, head), asked
+            return build(BROADCAST_ID, StsInstruction.SYNC_READ, head + bytes(servo_ids)), asked
 
         who = f"servo {servo_ids[0]}" if len(servo_ids) == 1 else f"servos {tuple(servo_ids)}"
         packets, transaction = self._exchange(instruction, servo_ids, f"{what} of {who}", despite_alarm)
         return [packet.parameters[:length] for packet in packets], transaction
 
-    def write(self, servo_id: int, register: Register, value: int, despite_alarm: bool = False) -> Transaction:
+    def write(self, servo_id: int, register: StsRegister, value: int, despite_alarm: bool = False) -> Transaction:
         """Write a value in counts to a register, and wait for the servo to confirm that the instruction came.
 
         A servo does not say whether it took the value: `set` reads it back.
@@ -174,11 +174,11 @@ class StsLink:
         """
         if self._withholds(register, (value,)):
             return self._withhold(register, {servo_id: value})
-        packet = build(servo_id, Instruction.WRITE, bytes((register.address,)) + register.encode(value))
+        packet = build(servo_id, StsInstruction.WRITE, bytes((register.address,)) + register.encode(value))
         what = f"write of {value} to {register.name} of servo {servo_id}"
         return self._exchange(lambda: (packet, 0), (servo_id,), what, despite_alarm)[1]
 
-    def set(self, servo_id: int, register: Register, value: int) -> None:
+    def set(self, servo_id: int, register: StsRegister, value: int) -> None:
         """Write a register if it holds another value; raise HardwareLost if the servo does not keep it.
 
         Args:
@@ -196,7 +196,7 @@ class StsLink:
                 hint="is its supply stable, its firmware another one?",
             )
 
-    def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
+    def write_each(self, register: StsRegister, values: Mapping[int, int]) -> Transaction:
         """Write a register of several servos, each a value in counts by id, in one instruction that none confirms."""
         if self._withholds(register, values.values()):
             return self._withhold(register, values)
@@ -205,15 +205,15 @@ class StsLink:
 
     def ping(self, servo_id: int) -> None:
         """Raise HardwareLost if a servo does not answer."""
-        packet = build(servo_id, Instruction.PING)
+        packet = build(servo_id, StsInstruction.PING)
         self._exchange(lambda: (packet, 0), (servo_id,), f"ping of servo {servo_id}", despite_alarm=True)
 
     def answers(self, servo_id: int) -> bool:
         """Return whether a servo answers a single ping."""
         with self.hold():
-            return self._attempt(build(servo_id, Instruction.PING), (servo_id,), 0) is not None
+            return self._attempt(build(servo_id, StsInstruction.PING), (servo_id,), 0) is not None
 
-    def force(self, servo_id: int, register: Register, value: int) -> bool:
+    def force(self, servo_id: int, register: StsRegister, value: int) -> bool:
         """Write a register despite a held lock, missing answers or alarms, until it reads back. Never raises.
 
         Args:
@@ -224,8 +224,8 @@ class StsLink:
         Returns:
             Whether the servo holds the value.
         """
-        write = build(servo_id, Instruction.WRITE, bytes((register.address,)) + register.encode(value))
-        query = build(servo_id, Instruction.READ, bytes((register.address, _CONFIRMING_BYTES)))
+        write = build(servo_id, StsInstruction.WRITE, bytes((register.address,)) + register.encode(value))
+        query = build(servo_id, StsInstruction.READ, bytes((register.address, _CONFIRMING_BYTES)))
         held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
         try:
             for _ in range(_FORCED_ATTEMPTS):
@@ -259,7 +259,7 @@ class StsLink:
         servo_ids: Sequence[int],
         what: str,
         despite_alarm: bool = False,
-    ) -> tuple[list[Packet], Transaction]:
+    ) -> tuple[list[StsPacket], Transaction]:
         """Repeat an instruction until it is answered, or the bus counts as lost.
 
         Args:
@@ -301,7 +301,7 @@ class StsLink:
             _require_no_alarm(answers)
         return answers, Transaction(self._sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
 
-    def _attempt(self, packet: bytes, servo_ids: Sequence[int], length: int) -> list[Packet] | None:
+    def _attempt(self, packet: bytes, servo_ids: Sequence[int], length: int) -> list[StsPacket] | None:
         """Send an instruction once; return the answers of the servos, or None if one is missing."""
         self._drop_input()
         self._sent_ns = time.monotonic_ns()
@@ -325,7 +325,7 @@ class StsLink:
         except termios.error as error:  # raised by pyserial when the adapter is unplugged
             raise OSError(str(error)) from error
 
-    def _receive(self, servo_id: int, length: int, end_ns: int) -> Packet | None:
+    def _receive(self, servo_id: int, length: int, end_ns: int) -> StsPacket | None:
         """Wait for a servo's status packet with `length` bytes of data; drop others, which answer what was earlier."""
         while True:
             while self._waiting:
@@ -356,12 +356,12 @@ class StsLink:
                 hint="check power, cable, ids and baud rate",
             )
 
-    def _withholds(self, register: Register, values: Iterable[int]) -> bool:
+    def _withholds(self, register: StsRegister, values: Iterable[int]) -> bool:
         """Whether a write could move a motor, and nothing may."""
         moves = register in reg.GOALS or (register == reg.TORQUE_ENABLE and any(values))
         return self.torque_withheld and moves
 
-    def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
+    def _withhold(self, register: StsRegister, values: Mapping[int, int]) -> Transaction:
         """Keep a write to oneself, and read the register in its place: the bus is as busy, and its loss is noticed."""
         self.withheld += 1
         if register in reg.GOALS:
@@ -370,7 +370,7 @@ class StsLink:
         return self.read_each((next(iter(values)),), register.address, register.size, what)[1]
 
 
-def _require_no_alarm(answers: Sequence[Packet]) -> None:
+def _require_no_alarm(answers: Sequence[StsPacket]) -> None:
     for answer in answers:
         if answer.code:
             raise SafetyStop(

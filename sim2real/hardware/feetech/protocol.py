@@ -30,7 +30,7 @@ ALARMS: Final[dict[int, str]] = {
 """Bit of the error byte, and of the register Status -> its name. Every status packet carries them."""
 
 
-class Instruction(IntEnum):
+class StsInstruction(IntEnum):
     """Instruction byte of a packet."""
 
     PING = 0x01
@@ -44,12 +44,12 @@ class Instruction(IntEnum):
 
 
 @dataclass(frozen=True)
-class Packet:
+class StsPacket:
     """A packet that was received.
 
     Args:
         servo_id: Receiver, or the sender of a status packet.
-        code: Instruction, not necessarily one of `Instruction`; the error byte of a status packet.
+        code: StsInstruction, not necessarily one of `Instruction`; the error byte of a status packet.
         parameters: Bytes between code and checksum.
         checksum_ok: Whether the checksum matches; if not, the other fields may be wrong.
     """
@@ -86,7 +86,7 @@ def sync_write(address: int, values: dict[int, bytes]) -> bytes:
     """
     size = len(next(iter(values.values())))
     items = b"".join(bytes((servo_id,)) + data for servo_id, data in values.items())
-    return build(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, size)) + items)
+    return build(BROADCAST_ID, StsInstruction.SYNC_WRITE, bytes((address, size)) + items)
 
 
 def describe_alarms(bits: int) -> str:
@@ -94,7 +94,7 @@ def describe_alarms(bits: int) -> str:
     return ", ".join(ALARMS.get(bit, f"bit {bit}") for bit in range(8) if bits >> bit & 1) or "none"
 
 
-class Parser:
+class StsParser:
     """Finds packets in a byte stream that arrives in chunks, and resynchronises after garbage."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class Parser:
         """Forget the beginning of an incomplete packet."""
         self._buffer.clear()
 
-    def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
+    def feed(self, chunk: bytes) -> list[tuple[StsPacket, int]]:
         """Process the next bytes.
 
         Args:
@@ -124,7 +124,7 @@ class Parser:
                 packets.append((packet, max(0, taken_bytes - held_bytes)))
         return packets
 
-    def _next(self) -> tuple[Packet | None, int] | None:
+    def _next(self) -> tuple[StsPacket | None, int] | None:
         """Remove a packet or leading garbage; return it (or None) and its size in bytes, None if more are needed."""
         buffer = self._buffer
         start = buffer.find(HEADER)
@@ -142,7 +142,7 @@ class Parser:
         if len(buffer) < end:
             return None
         ok = checksum(buffer[2 : end - 1]) == buffer[end - 1]
-        packet = Packet(buffer[2], buffer[4], bytes(buffer[5 : end - 1]), ok)
+        packet = StsPacket(buffer[2], buffer[4], bytes(buffer[5 : end - 1]), ok)
         # After a wrong checksum, drop the header only: the length may be wrong too, and include good packets.
         used_bytes = end if ok else len(HEADER)
         del buffer[:used_bytes]

@@ -41,7 +41,7 @@ class Mode(IntEnum):
 
 
 @dataclass(frozen=True)
-class Register:
+class StsRegister:
     """One entry of the memory table.
 
     Args:
@@ -86,15 +86,17 @@ class Register:
         return (magnitude | sign).to_bytes(self.size, "little")
 
 
-def _eeprom(name: str, address: int, size: int, low: int, high: int, default: int, sign: int | None = None) -> Register:
-    return Register(name, address, size, low, high, default, sign, writable=True, eeprom=True)
+def _eeprom(
+    name: str, address: int, size: int, low: int, high: int, default: int, sign: int | None = None
+) -> StsRegister:
+    return StsRegister(name, address, size, low, high, default, sign, writable=True, eeprom=True)
 
 
-def _ram(name: str, address: int, size: int, low: int, high: int, default: int, sign: int | None = None) -> Register:
-    return Register(name, address, size, low, high, default, sign, writable=True)
+def _ram(name: str, address: int, size: int, low: int, high: int, default: int, sign: int | None = None) -> StsRegister:
+    return StsRegister(name, address, size, low, high, default, sign, writable=True)
 
 
-MODEL_NUMBER = Register("model_number", 3, 2, default=777, eeprom=True)
+MODEL_NUMBER = StsRegister("model_number", 3, 2, default=777, eeprom=True)
 ID = _eeprom("id", 5, 1, 0, 253, 1)
 BAUD_RATE = _eeprom("baud_rate", 6, 1, 0, 7, 0)
 # Feetech's newer tables call it reserved, "not functional on STS"; LeRobot finds 250 (0.5 ms) there and writes 0.
@@ -125,17 +127,17 @@ GOAL_TIME = _ram("goal_time", 44, 2, -1000, 1000, 0, sign=10)  # in PWM mode the
 GOAL_SPEED = _ram("goal_speed", 46, 2, -32767, 32767, FASTEST_COUNTS_PER_S, sign=15)
 TORQUE_LIMIT = _ram("torque_limit", 48, 2, 0, 1000, 1000)
 LOCK = _ram("lock", 55, 1, 0, 1, 1)
-PRESENT_POSITION = Register("present_position", 56, 2, sign_bit=15)
-PRESENT_SPEED = Register("present_speed", 58, 2, sign_bit=15)
-PRESENT_LOAD = Register("present_load", 60, 2, sign_bit=10)
-PRESENT_VOLTAGE = Register("present_voltage", 62, 1, default=120)
-PRESENT_TEMPERATURE = Register("present_temperature", 63, 1, default=30)
-ASYNC_WRITE = Register("async_write", 64, 1)
-STATUS = Register("status", 65, 1)
-MOVING = Register("moving", 66, 1)
-PRESENT_CURRENT = Register("present_current", 69, 2, sign_bit=15)
+PRESENT_POSITION = StsRegister("present_position", 56, 2, sign_bit=15)
+PRESENT_SPEED = StsRegister("present_speed", 58, 2, sign_bit=15)
+PRESENT_LOAD = StsRegister("present_load", 60, 2, sign_bit=10)
+PRESENT_VOLTAGE = StsRegister("present_voltage", 62, 1, default=120)
+PRESENT_TEMPERATURE = StsRegister("present_temperature", 63, 1, default=30)
+ASYNC_WRITE = StsRegister("async_write", 64, 1)
+STATUS = StsRegister("status", 65, 1)
+MOVING = StsRegister("moving", 66, 1)
+PRESENT_CURRENT = StsRegister("present_current", 69, 2, sign_bit=15)
 
-TABLE: Final[dict[int, Register]] = {r.address: r for r in list(globals().values()) if isinstance(r, Register)}
+TABLE: Final[dict[int, StsRegister]] = {r.address: r for r in list(globals().values()) if isinstance(r, StsRegister)}
 TABLE_BYTES: Final = 87
 GOALS: Final = (GOAL_POSITION, GOAL_TIME, GOAL_SPEED)
 

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.registers import Register
+from sim2real.hardware.feetech.registers import StsRegister
 from sim2real.hardware.plant import OperatingMode
 
 STALL_CURRENT_A: Final = 2.7  # data sheet of the STS3215-C018, 12 V
@@ -59,11 +59,11 @@ class StsServo:
         self.put(reg.RETURN_DELAY_TIME, round(return_delay_us * 1e-6 / reg.RETURN_DELAY_UNIT_S))
         self._saved = bytes(self._memory)
 
-    def get(self, register: Register) -> int:
+    def get(self, register: StsRegister) -> int:
         """Return a register's value in counts."""
         return register.decode(self._memory[register.address : register.end])
 
-    def put(self, register: Register, value: int) -> None:
+    def put(self, register: StsRegister, value: int) -> None:
         """Set a register, without the checks of a write from the bus."""
         self._memory[register.address : register.end] = register.encode(value)
 

@@ -1,7 +1,7 @@
 import pytest
 from sts_bench import IDS, PLANTS, Bench, Served
 
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import load_plant

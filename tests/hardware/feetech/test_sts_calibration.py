@@ -4,7 +4,8 @@ import math
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.hardware.feetech.calibration import Joint, read_calibration
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
+from sim2real.hardware.feetech.calibration import read_calibration
 
 FOLLOWER = """{
     "shoulder_pan": {

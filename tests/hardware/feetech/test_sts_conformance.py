@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.testing import DeviceConformance

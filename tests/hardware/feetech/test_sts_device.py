@@ -11,7 +11,7 @@ from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.emulation import StsEmulation
@@ -102,7 +102,11 @@ def test_torque_that_is_on_cannot_be_withheld(serve, connect):
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 3.2, -0.6])
 def test_goals_outside_the_range_are_refused(serve, connect, angle):
-    joints = [Joint("pan", 1, low_count=1700, high_count=4000), Joint("lift", 2), Joint("elbow", 3)]
+    joints = [
+        Joint("pan", 1, low_count=1700, high_count=4000),
+        Joint("lift", 2),
+        Joint("elbow", 3),
+    ]
     device = connect(serve(), joints=joints)
     low, high = device.reach()
     assert (low[0], high[0]) == joints[0].range_rad
@@ -112,7 +116,10 @@ def test_goals_outside_the_range_are_refused(serve, connect, angle):
 
 def test_a_joint_outside_its_range_gets_no_torque(serve, connect):
     robot = serve()
-    device = connect(robot, joints=[Joint("pan", 1, high_count=2100), Joint("lift", 2), Joint("elbow", 3)])
+    device = connect(
+        robot,
+        joints=[Joint("pan", 1, high_count=2100), Joint("lift", 2), Joint("elbow", 3)],
+    )
     with pytest.raises(SafetyStop, match=r"joint 'pan' is at 0.5001 rad, outside \[-3.142, 0.07977\]"):
         device.enable()
     device.close()
@@ -130,8 +137,16 @@ def test_what_they_do_without_a_host_is_said(serve, connect):
     ("change", "joint", "said"),
     [
         ((reg.MODEL_NUMBER, 1284), Joint("pan", 1), r"servo 1 is model 1284.*Available: STS3215 \(777\)"),
-        ((reg.HOMING_OFFSET, -7), Joint("pan", 1, homing_offset=5), "homing offset -7, its calibration says 5"),
-        ((reg.MAX_POSITION, 3000), Joint("pan", 1), "goes from 0 to 3000 counts only, its joint from 0 to 4095"),
+        (
+            (reg.HOMING_OFFSET, -7),
+            Joint("pan", 1, homing_offset=5),
+            "homing offset -7, its calibration says 5",
+        ),
+        (
+            (reg.MAX_POSITION, 3000),
+            Joint("pan", 1),
+            "goes from 0 to 3000 counts only, its joint from 0 to 4095",
+        ),
         (
             (reg.ID, 1),
             Joint("pan", 7),

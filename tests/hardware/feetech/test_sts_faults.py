@@ -13,10 +13,10 @@ from sts_bench import IDS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.feetech.protocol import Instruction, build
+from sim2real.hardware.feetech.protocol import StsInstruction, build
 from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import Rig
@@ -147,7 +147,7 @@ def test_a_servo_that_restarts(serve, connect):
     device.enable()
     device.check()
     with device._link.hold():
-        os.write(device._link.fd, build(2, Instruction.RESTART))
+        os.write(device._link.fd, build(2, StsInstruction.RESTART))
         time.sleep(0.02)
     with pytest.raises(SafetyStop, match="servo 2 has lost its settings: torque_enable is 0, not 1"):
         device.check()
@@ -228,7 +228,7 @@ def test_an_unplugged_port_is_lost(serve, connect):
 HOST = """
 import os, signal, sys, time
 import numpy as np
-from sim2real.hardware.feetech.calibration import Joint
+from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 
@@ -337,7 +337,11 @@ def test_the_time_of_a_sample_is_right_or_said_to_be_unsure(serve, connect, faul
 
 def test_a_gear_and_a_direction(serve, connect):
     robot = serve("Joints", ids=[1, 2, 3], start_rad=[0.5, -0.8, 0.3])
-    joints = [Joint("a", 1, direction=-1), Joint("b", 2, gear=0.5), Joint("c", 3, zero_count=2148)]
+    joints = [
+        Joint("a", 1, direction=-1),
+        Joint("b", 2, gear=0.5),
+        Joint("c", 3, zero_count=2148),
+    ]
     device = connect(robot, joints=joints)
     expected = [-0.5, -0.4, 0.3 - 100 * reg.RAD_PER_COUNT]
     assert device.measure().position_rad == pytest.approx(expected, abs=reg.RAD_PER_COUNT)

@@ -1,0 +1,26 @@
+"""Who is who in a robot's graph: the stages go by roles, not by names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Names of the nodes that have a part in the loop of a robot.
+
+    Attributes:
+        sensor: Measures.
+        supervisor: Decides: the policy makes its steps.
+        actuator: Sends the commands to the motors.
+        world: Is the robot and what is around it, in simulation.
+    """
+
+    sensor: str = "sensor"
+    supervisor: str = "agent"
+    actuator: str = "actuator"
+    world: str = "world"
+
+
+ROLES = Roles()
+"""The names that nodes have unless a robot gives them others."""
