@@ -122,7 +122,7 @@ class MjxEnvironment:
         gate.check_model(self.model)
         self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
         if self._warp is None:
-            gate.simplify_cone(self.model)
+            gate.settle_cone(self.model)
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
