@@ -200,3 +200,20 @@ def test_an_episode_ends_where_mujoco_warns():
         )
 
     assert [unstable(v) for v in (1e9, -1e11, np.inf, np.nan)] == [False, True, True, True]
+
+
+def test_an_episode_ends_though_a_hook_hides_that_it_diverged():
+    class Thrown(composer.NullTask):
+        def after_step(self, physics, random_state):
+            physics.set_control(physics.np.zeros(1))
+            physics.set_state(physics.np.zeros(2))
+            physics.mark_as_dirty()
+            physics.forward()
+
+    rod = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+        <actuator><motor joint="j"/></actuator></mujoco>"""
+    task = Thrown(composer.ModelWrapperEntity(mjcf.from_xml_string(rod)))
+    task.set_timesteps(0.002, 0.002)
+    env = composer.MjxEnvironment(task)
+    play = jax.jit(lambda key, action: env.step(env.reset(key), action))
+    assert play(jax.random.key(0), np.array([1e12])).done
