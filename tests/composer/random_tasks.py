@@ -5,6 +5,7 @@ with delays, intervals, buffers, aggregators and corruptors; variations of the M
 task and of its entities that read, write, vary and draw.
 """
 
+import copy
 import importlib
 from types import SimpleNamespace
 
@@ -174,15 +175,18 @@ def _variation(kit, draw, signed=False):
     return draw.pick(made if signed else made[:-3])
 
 
-def _bind(kit, draw, variator, found):
-    """Bind some variations; return whether MuJoCo derives constants from what they vary."""
-    derived = False
+def _bind(kit, draw, variator, found, taken):
+    """Bind some variations, not of what is taken; return whether MuJoCo derives constants from what they vary."""
+    derived, before = False, list(taken)
     for _ in range(draw.kinds.randint(0, 4)):
         kind = draw.pick(sorted(VARIED))
         attribute = draw.pick(VARIED[kind])
         if found[kind]:
-            variation = _variation(kit, draw, attribute == "pos")
-            variator.bind_attributes(draw.pick(found[kind]), **{attribute: variation})
+            variation, element = _variation(kit, draw, attribute == "pos"), draw.pick(found[kind])
+            if any(element is e and attribute == a for e, a in before):
+                continue
+            variator.bind_attributes(element, **{attribute: variation})
+            taken.append((element, attribute))
             derived = derived or attribute in DERIVED
     return derived
 
@@ -226,6 +230,17 @@ def _operations(draw, found, most):
     return made
 
 
+def _count_compensated(model):
+    """Do for dm_control what ours does: have MuJoCo see that bodies are compensated, and keep all that it derives."""
+    before = copy.copy(model)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for holder, old in ((model, before), (model.stat, before.stat)):
+        for name, value in ((n, getattr(old, n)) for n in dir(old)):
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                getattr(holder, name)[...] = value
+    model.stat.meaninertia, model.stat.meanmass = before.stat.meaninertia, before.stat.meanmass
+
+
 class Operator:
     """Does in hooks what was drawn for them."""
 
@@ -258,7 +273,7 @@ class Operator:
             if attribute == "gravcomp" and self.kit.name == "dm_control":  # nor follows, where no body was compensated
                 bound.gravcomp = factor * bound.gravcomp + offset
                 if not physics.model.ngravcomp:
-                    mujoco.mj_setConst(physics.model.ptr, mujoco.MjData(physics.model.ptr))
+                    _count_compensated(physics.model.ptr)
                 continue
             value = xp.asarray(getattr(bound, attribute)) + 0.0
             if factor is None:
@@ -309,6 +324,9 @@ def _world(kit, draw, contacts, operator):
         frame = arena.add_free_entity(entities[-1]) if free else arena.attach(entities[-1])
         height = (0.1, 0.3) if contacts else (0.8, 1.0)
         frame.pos = draw.vector([i, -0.2, height[0]], [i + 0.1, 0.2, height[1]])
+    for geom in [g for m in models for g in m.find_all("geom")]:
+        if contacts == "same" and option.cone == "elliptic" and geom.condim == 1:  # which MJX has no contacts for
+            geom.condim = 3
     kinds = ("joint", "site", "geom", "actuator", "sensor", "body", "tendon")
     found = {kind: [e for m in models for e in m.find_all(kind)] for kind in kinds}
     found["body"] = [b for b in found["body"] if b.name and not b.name.endswith("/")]
@@ -323,7 +341,8 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True):
         kit: The modules that it is made of.
         seed: Seed.
         contacts: None, "same": only those that MJX finds as C does, or "all".
-        varied: Whether delays and intervals of observables vary from sample to sample; dm_control shifts samples then.
+        varied: Whether delays and intervals of observables vary from sample to sample, where dm_control shifts samples,
+            and nothing is varied that is also set otherwise, which MJX starts from another value.
         numbers: Seed of the numbers in the model.
         busy: Whether hooks do more than set the controls.
     """
@@ -341,7 +360,12 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True):
         kit.variation.PhysicsVariator(),
         kit.variation.PhysicsVariator(),
     )
-    operator.once, operator.often = ((v, busy and _bind(kit, draw, v, found)) for v in (once, often))
+    written = [
+        (o[1], o[2]) for made in (*operations, of_task) for done in made.values() for o in done if o[3] is not None
+    ]
+    for name, variator in (("once", once), ("often", often)):  # on MJX what varies starts from the compiled value
+        taken = written if varied else []
+        setattr(operator, name, (variator, busy and _bind(kit, draw, variator, found, taken)))
     before = kit.variation.MJCFVariator()
     if busy and draw.chance(0.4):
         before.bind_attributes(draw.pick(found["geom"]), density=kit.distributions.Uniform(500.0, 2000.0))

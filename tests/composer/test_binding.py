@@ -142,6 +142,19 @@ def test_gravity_is_compensated_where_no_body_was_when_the_model_was_compiled():
     assert abs(physics.data.qacc[2]) < 1e-12
 
 
+def test_compensating_for_gravity_computes_no_other_constants():
+    """Whether masses that were set by hand are seen must not depend on what is set after them."""
+    model = mjcf.from_xml_string(FREE)
+    physics = mjcf.Physics.from_mjcf_model(model)
+    ball = physics.bind(model.find("body", "ball"))
+    before = copy.copy(physics.model.ptr)
+    ball.mass = 100.0
+    ball.gravcomp = 0.5
+    assert physics.model.body_subtreemass[1] == before.body_subtreemass[1]
+    assert physics.model.stat.meanmass == before.stat.meanmass
+    assert (ball.mass, ball.gravcomp) == (100.0, 0.5)
+
+
 def test_constants_are_computed_anew_without_moving_the_state():
     model = mjcf.from_xml_string(FREE)
     physics = mjcf.Physics.from_mjcf_model(model)

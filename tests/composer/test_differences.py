@@ -1,5 +1,6 @@
 """Every row of the page "Differences from dm_control": what they do, where it is cheap to see, and what we do."""
 
+import copy
 import functools
 import re
 import warnings
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from sim2real.composer import engine
+from sim2real.composer import engine, mjcf
+from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer.variation import PhysicsVariator, noises
 from sim2real.errors import UsageError
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "differences.md"
@@ -447,6 +450,22 @@ def test_implicit_steps():
         found = jax.jit(mjx.step)(mjx.put_model(native), mjx.put_data(native, data)).qvel[0]
     mujoco.mj_step(native, data)
     assert 1e-4 < abs(found - data.qvel[0]) < 1e-2
+
+
+def test_starting_values():
+    def friction(physics):
+        variator = PhysicsVariator()
+        variator.bind_attributes(geom, friction=noises.Additive(1.0))
+        physics.bind(geom).friction = [3.0, 0.0, 0.0]
+        variator.apply_variations(physics, None)
+        return float(physics.bind(geom).friction[0])
+
+    world = mjcf.from_xml_string(HINGE.format("", "", "", ""))
+    geom = world.find_all("geom")[0]
+    native = mjcf.Physics.from_mjcf_model(world)
+    host = copy.copy(native.model.ptr)
+    found = MjxPhysics(host, mjx.put_model(host), mjx.put_data(host, native.data.ptr), {})
+    assert (friction(native), friction(found)) == (4.0, 2.0)
 
 
 # -- images

@@ -303,3 +303,17 @@ def test_elliptic_cones_are_no_matter_where_nothing_can_touch():
     environment = composer.MjxEnvironment(task)
     state = jax.jit(environment.reset)(jax.random.key(0))
     assert np.isfinite(jax.jit(environment.step)(state, jnp.zeros(0)).data.qpos).all()
+
+
+def test_elliptic_cones_without_friction_are_refused_by_name():
+    arena = composer.Arena()
+    ball = '<body name="{0}" pos="{1} 0 0"><freejoint/><geom name="{0}" size=".1" condim="1"/></body>'
+    arena.mjcf_model.attach(
+        mjcf.from_xml_string(
+            f'<mujoco model="two"><worldbody>{ball.format("a", 0)}{ball.format("b", 1)}</worldbody></mujoco>'
+        )
+    )
+    task = composer.NullTask(arena)
+    task.set_timesteps(control_timestep=0.02, physics_timestep=0.01)
+    with pytest.raises(UsageError, match=r"(?s)condim 1.*'two/a', 'two/b'.*pyramidal"):
+        composer.MjxEnvironment(task)

@@ -177,6 +177,22 @@ def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
     np.testing.assert_allclose(found.qvel, data.qvel, rtol=1e-12)
 
 
+def test_the_state_at_the_start_of_an_episode_is_that_of_c(double):
+    """MJX normalizes quaternions that a hook left otherwise, and has velocities of actuators that are switched off."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="j" type="ball"/><geom size=".1"/></body></worldbody>
+        <actuator><velocity name="v" joint="j"/></actuator><sensor><actuatorvel actuator="v"/></sensor></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[0] = [1.02, 0.02, 0.02, 0.02], 0.5
+    given = mjx.put_model(model), mjx.put_data(model, data)
+    found = jax.jit(lambda m, d: stepping.forward(m, d, False))(*given)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    mujoco.mj_forward(model, data)
+    assert found.sensordata[0] == data.sensordata[0]
+    np.testing.assert_array_equal(found.qpos, data.qpos)
+
+
 def test_an_episode_ends_where_mujoco_warns():
     def unstable(value):
         return bool(
@@ -184,3 +200,20 @@ def test_an_episode_ends_where_mujoco_warns():
         )
 
     assert [unstable(v) for v in (1e9, -1e11, np.inf, np.nan)] == [False, True, True, True]
+
+
+def test_an_episode_ends_though_a_hook_hides_that_it_diverged():
+    class Thrown(composer.NullTask):
+        def after_step(self, physics, random_state):
+            physics.set_control(physics.np.zeros(1))
+            physics.set_state(physics.np.zeros(2))
+            physics.mark_as_dirty()
+            physics.forward()
+
+    rod = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+        <actuator><motor joint="j"/></actuator></mujoco>"""
+    task = Thrown(composer.ModelWrapperEntity(mjcf.from_xml_string(rod)))
+    task.set_timesteps(0.002, 0.002)
+    env = composer.MjxEnvironment(task)
+    play = jax.jit(lambda key, action: env.step(env.reset(key), action))
+    assert play(jax.random.key(0), np.array([1e12])).done

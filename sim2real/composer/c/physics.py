@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -305,13 +306,18 @@ class Physics:
 
     def recompute_constants(self) -> None:
         """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
-        model = self.model.ptr
-        mj.mj_setConst(model, mj.MjData(model))  # not this state's: it would be left as computed at the reference
+        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # this state would be left as at the reference
         self.mark_as_dirty()
 
     def count_compensated(self) -> None:
-        """Have MuJoCo see that bodies are compensated for gravity, in a model where none was when it was compiled."""
-        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # nothing else sets the number of such bodies
+        """Have MuJoCo see that bodies are compensated for gravity, where none was when the model was compiled."""
+        model, before = self.model.ptr, copy.copy(self.model.ptr)
+        mj.mj_setConst(model, mj.MjData(model))  # nothing else sets the number of such bodies; the rest stays
+        for name, value in ((n, getattr(before, n)) for n in dir(before)):
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                getattr(model, name)[...] = value
+        for name in ("meaninertia", "meanmass", "meansize", "extent", "center"):
+            setattr(model.stat, name, getattr(before.stat, name))
 
     def render(
         self,

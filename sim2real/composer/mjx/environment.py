@@ -122,7 +122,7 @@ class MjxEnvironment:
         gate.check_model(self.model)
         self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
         if self._warp is None:
-            gate.simplify_cone(self.model)
+            gate.settle_cone(self.model)
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
@@ -228,7 +228,7 @@ class MjxEnvironment:
         """
         physics, random_state = self._physics(state, model)
         self._hooks.run("before_step", physics, action, random_state)
-        rings = self._substeps(physics, random_state, state, action)
+        rings, diverged = self._substeps(physics, random_state, state, action)
         self._hooks.run("after_step", physics, random_state)
         steps = state.steps + 1
         now = steps * self.substeps
@@ -242,7 +242,7 @@ class MjxEnvironment:
             self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
-        diverged = is_unstable(data)
+        diverged = diverged | is_unstable(data)
         diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
         reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
         ended = diverged | jnp.asarray(ends, bool)
@@ -251,34 +251,36 @@ class MjxEnvironment:
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def _substeps(self, physics: MjxPhysics, random_state: JaxRandomState, state: State, action: Any) -> Any:
-        """Take all physics steps of a control step; return the rings, without the samples of the last one."""
+        """Take all physics steps; return the rings, without the last samples, and whether a step diverged."""
         buffered = [r for r in self._rings if not r.direct]
 
         entry = physics.is_dirty
 
         def substep(carry: Any, i: Any) -> tuple[Any, None]:
-            tree, rings, dirty = carry
+            tree, rings, dirty, diverged = carry
             physics.load(tree, random_state)
             physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
             self._hooks.run("before_substep", physics, action, random_state)
             physics.step()
+            diverged = diverged | is_unstable(physics.mjx_data)  # now: hooks may write over it
             self._hooks.run("after_substep", physics, random_state)
             now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
             new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
             if self._dry:  # is it known, for every physics step alike, whether something is to be computed anew?
                 self._steady = physics.is_dirty is entry
-            return (physics.tree(random_state), {**rings, **new}, jnp.asarray(physics.is_dirty, bool)), None
+            dirty = jnp.asarray(physics.is_dirty, bool)
+            return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
 
-        carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool))
+        carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool), jnp.zeros((), bool))
         if self.substeps == 1 or self._dry:
             carry, _ = substep(carry, jnp.zeros((), jnp.int32))
-            tree, rings, _ = carry
+            tree, rings, _, diverged = carry
         else:
-            (tree, rings, dirty), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
+            (tree, rings, dirty, diverged), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
             if not isinstance(physics.is_dirty, bool):  # else it is known how every physics step leaves it
                 physics.is_dirty = entry if self._steady else dirty
         physics.load(tree, random_state)
-        return rings
+        return rings, diverged
 
     def action_spec(self) -> Any:
         """Return shape and bounds of an action, as the task says."""

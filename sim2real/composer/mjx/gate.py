@@ -49,14 +49,28 @@ def check_model(model: Any) -> None:
         )
 
 
-def simplify_cone(model: Any) -> None:
-    """Make friction cones pyramidal where nothing can touch, and cones mean nothing.
+def settle_cone(model: Any) -> None:
+    """Make friction cones pyramidal where nothing can touch, and cones mean nothing; refuse those that MJX lacks.
 
     With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
+
+    Raises:
+        UsageError: With the geoms, where contacts without friction are asked for beside elliptic cones.
     """
+    if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
+        return
+    model.opt.cone = mj.mjtCone.mjCONE_PYRAMIDAL
     data: Any = mjx.make_data(model, impl="jax")
-    if model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC and data._impl.ncon == 0:
-        model.opt.cone = mj.mjtCone.mjCONE_PYRAMIDAL
+    if data._impl.ncon == 0:
+        return
+    if (data._impl.contact.dim == 1).any():
+        smooth = (model.geom_condim == 1) & ((model.geom_contype | model.geom_conaffinity) != 0)
+        names = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) for i in smooth.nonzero()[0]]
+        raise UsageError(
+            f"MJX has no contacts of condim 1 beside elliptic friction cones: geoms {', '.join(map(repr, names))}",
+            hint='give them condim 3, or set option cone to "pyramidal"',
+        )
+    model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
 
 
 def check_observables(observables: Mapping[str, Observable]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 from mujoco import mjx
 
 
@@ -51,8 +52,16 @@ def forward(model: Any, data: Any, actuation: bool = True) -> Any:
 
 
 def _positions(model: Any, data: Any) -> Any:
+    """Compute what follows from positions and velocities, and leave the state as MuJoCo does.
+
+    MJX writes quaternions back normalized, and has velocities of actuators that are switched off; MuJoCo has zeros.
+    """
+    qpos = data.qpos
     data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
-    return mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+    data = mjx.fwd_velocity(model, data)
+    if model.opt.disableflags & mjx.DisableBit.ACTUATION:
+        data = data.tree_replace({"_impl.actuator_velocity": jnp.zeros_like(data._impl.actuator_velocity)})
+    return mjx.sensor_vel(model, data).replace(qpos=qpos)
 
 
 def _accelerate(model: Any, data: Any) -> Any:
