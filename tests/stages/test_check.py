@@ -132,9 +132,8 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
     assert check.coverage(episode, model, {})["joints"][0]["moving"] > 0.1
 
 
-def test_without_recording_and_plan_there_is_nothing_to_judge(monkeypatch, tmp_path):
-    monkeypatch.setattr(check, "_plannable", lambda _: False)
-    pipeline = load_pipeline("pendulum")
+def test_without_recording_and_plan_there_is_nothing_to_judge(tmp_path):
+    pipeline = load_pipeline("disk")  # of recordings alone
     model = pipeline.load().identifiable(0.06)
     for config in (CheckConfig(runs=tmp_path), CheckConfig(plan=True)):
         with pytest.raises(UsageError) as caught:
