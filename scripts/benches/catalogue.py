@@ -51,7 +51,7 @@ BENCHES = {
         "recordings of real motors, fitted on one part and judged on another",
         (
             *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
-            *("sim2real/log", "pipelines/{case}"),
+            *("sim2real/artifacts", "sim2real/log", "pipelines/{case}"),
             *("scripts/benches/recordings.py", "scripts/benches/sysid.py", "scripts/benches/sysid_rows.py"),
         ),
     ),
