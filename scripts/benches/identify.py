@@ -247,14 +247,18 @@ def _so101_rows(
 def half_step(case: Case, found: Sequence[Fit], test: Mapping[str, Episode]) -> list[dict[str, Any]]:
     """Return the errors with half the step of integration: stick-slip must not decide."""
 
-    class Halved(type(case.model)):
-        def nodes(self, max_delay_s: float) -> dict[str, Any]:
-            """Return the nodes, the world with two substeps a tick."""
-            nodes = super().nodes(max_delay_s)
-            nodes["world"].substeps *= 2
+    servo: Any = type(load_pipeline("xl330").load())
+
+    class Halved(servo):
+        """The servo, in a world with two substeps a tick."""
+
+        def make_nodes(self) -> Any:
+            """Return sensor, actuator and world."""
+            nodes = super().make_nodes()
+            nodes[2].substeps *= 2
             return nodes
 
-    own = replace(case, model=Halved(case.config.max_delay_s))
+    own = replace(case, model=Halved().identifiable(case.config.max_delay_s))
     maes = []
     for f in found:
         columns = predict(own, {"identified": f.values}, test)
