@@ -246,7 +246,6 @@ def _so101_rows(
 
 def half_step(case: Case, found: Sequence[Fit], test: Mapping[str, Episode]) -> list[dict[str, Any]]:
     """Return the errors with half the step of integration: stick-slip must not decide."""
-
     servo: Any = type(load_pipeline("xl330").load())
 
     class Halved(servo):
