@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.identification import FreeRun, Identification, Quantity
+from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import Source, StageFolder, newest, open_stage
 from sim2real.graph.episode import Episode
@@ -79,7 +80,7 @@ def identify(
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
         identified.judged(document, findings, robot.units, config.max_delay_s, outside),
-        logs=tuple(Source(log.path.as_posix(), "") for log in logs),
+        logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
         units=dict(robot.units),
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,

@@ -97,6 +97,8 @@ def test_the_stages_are_functions_of_what_others_left(completed, tmp_path):
     found = sim2real.identify(recording, pendulum, brief)
     assert found.values.keys() == sim2real.Identification.load(completed / "identify").values.keys()
     assert found.timing.nodes["sensor"].steps == len(recording.episode.steps["sensor"])
+    recorded = manifest_of(completed / "record")["outputs"]["log"]
+    assert [vars(log) for log in found.logs] == [{"path": "session.mcap", "sha256": recorded["sha256"]}]
     small = replace(pendulum.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1, eval_envs=4)
     config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=small)
     bundle, _ = sim2real.train(pendulum, config, found)
