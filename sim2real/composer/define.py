@@ -19,7 +19,8 @@ class cached_property(property):  # noqa: N801 - a decorator, called like dm_con
     def __init__(self, func: Callable[..., Any]) -> None:
         super().__init__(fget=func)
         self._lock = threading.RLock()
-        functools.update_wrapper(self, func)  # pyright: ignore[reportArgumentType]
+        wrapper: Any = self
+        functools.update_wrapper(wrapper, func)
 
     def __get__(self, obj: Any, owner: type | None = None) -> Any:
         if obj is None:
@@ -33,7 +34,8 @@ class cached_property(property):  # noqa: N801 - a decorator, called like dm_con
         return values[name]
 
     def __set__(self, obj: Any, value: Any) -> None:
-        raise AttributeError(f"{self.fget.__name__!r} is computed, it cannot be set")  # pyright: ignore[reportOptionalMemberAccess]
+        getter: Any = self.fget
+        raise AttributeError(f"{getter.__name__!r} is computed, it cannot be set")
 
 
 class observable(cached_property):  # noqa: N801

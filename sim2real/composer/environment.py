@@ -85,7 +85,7 @@ class Environment(dm_env.Environment):
                 f"got {delayed_observation_padding}"
             )
         if arena is not None:
-            task._root_entity = arena  # pyright: ignore[reportAttributeAccessIssue]
+            task._root_entity = arena
         if n_sub_steps is not None:
             warnings.warn("`n_sub_steps` is deprecated: set the task's time steps", DeprecationWarning, stacklevel=2)
         self._task, self._time_limit, self._n_sub_steps_given = task, time_limit, n_sub_steps

@@ -40,13 +40,14 @@ def _steps(control_timestep: float, physics_timestep: float) -> int:
 class Task(ABC):
     """Reward, termination and the initial state of an episode, in a world of entities."""
 
+    _root_entity: Entity | None = None
+
     @property
     def root_entity(self) -> Entity:
         """The entity that holds all others; subclasses override it, or the environment sets it."""
-        entity = self.__dict__.get("_root_entity")
-        if entity is None:
+        if self._root_entity is None:
             raise NotImplementedError(f"{type(self).__name__} has no root_entity: define it, or pass an arena")
-        return entity
+        return self._root_entity
 
     def iter_entities(self) -> Iterator[Entity]:
         """Yield all entities, depth first."""
@@ -202,14 +203,7 @@ class NullTask(Task):
     """
 
     def __init__(self, root_entity: Entity | None = None) -> None:
-        if root_entity is None:
-            root_entity = Arena()
-        self._root_entity = root_entity
-
-    @property
-    def root_entity(self) -> Entity:
-        """The entity that holds all others."""
-        return self._root_entity
+        self._root_entity = Arena() if root_entity is None else root_entity
 
     def get_reward(self, physics: Any) -> float:
         """Return 0."""

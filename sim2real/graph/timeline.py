@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -116,12 +117,12 @@ class Timeline:
     def save(self, path: Path) -> None:
         """Write the timeline to an ``.npz`` file."""
         names = {"vertices": list(self.vertices), "edges": [[*key, e.sender] for key, e in self.edges.items()]}
-        arrays = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
+        arrays: dict[str, Any] = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
         for n, v in enumerate(self.vertices.values()):
             arrays |= {f"vertex_{n}_start": v.start, f"vertex_{n}_end": v.end, f"vertex_{n}_count": v.count}
         for n, e in enumerate(self.edges.values()):
             arrays |= {f"edge_{n}_received": e.received, f"edge_{n}_seq_in": e.seq_in}
-        np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(path, **arrays)
 
     @staticmethod
     def load(path: Path) -> Timeline:

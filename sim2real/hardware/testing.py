@@ -161,7 +161,7 @@ class DeviceConformance(ABC):
         """Right after `enable` the motors stay where they are; `disable` ends it, and it can begin anew."""
         robot, device = start()
         with device:
-            still = device.measure().position_rad
+            still, readings = device.measure().position_rad, []
             for _ in range(2):
                 device.enable()
                 readings = self.play(device, 5)

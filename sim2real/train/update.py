@@ -19,12 +19,12 @@ class Normaliser(NamedTuple):
     """Running mean and variance of the observations.
 
     Attributes:
-        count: Shape ``()``: number of observations so far.
+        seen: Shape ``()``: number of observations so far.
         mean: Shape ``(O,)``.
         var: Shape ``(O,)``.
     """
 
-    count: jax.Array
+    seen: jax.Array
     mean: jax.Array
     var: jax.Array
 
@@ -103,9 +103,9 @@ def update_normaliser(normaliser: Normaliser, rows: Rows) -> Normaliser:
     count = jnp.maximum(weight.sum(), 1.0)
     mean = (weight * rows.observation).sum((0, 1), keepdims=True) / count
     var = (weight * (rows.observation - mean) ** 2).sum((0, 1)) / count
-    total = normaliser.count + count
+    total = normaliser.seen + count
     delta = mean[0, 0] - normaliser.mean
-    spread = normaliser.var * normaliser.count + var * count + delta**2 * normaliser.count * count / total
+    spread = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
     return Normaliser(total, normaliser.mean + delta * count / total, spread / total)
 
 

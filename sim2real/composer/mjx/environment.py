@@ -109,7 +109,7 @@ class MjxEnvironment:
         arena: Any = None,
     ) -> None:
         if arena is not None:
-            task._root_entity = arena  # pyright: ignore[reportAttributeAccessIssue]
+            task._root_entity = arena
         self.task, self._attempts, self._legacy = task, max_reset_attempts, legacy_step
         self._hooks, self._registry = TracedHooks(task), Registry()
         random_state = np.random.RandomState(seed)

@@ -71,7 +71,8 @@ def _touches(physics: MjxPhysics, own: Any, later: Any) -> Any:
         return jnp.zeros((), bool)
     model = physics.mjx_model
     data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, physics.mjx_data)))
-    contact: Any = data._impl.contact  # pyright: ignore[reportAttributeAccessIssue]
+    impl: Any = data._impl
+    contact = impl.contact
     pair = jnp.stack([contact.geom1, contact.geom2])
     hit = (contact.dist <= 0) & jnp.isin(pair, own).any(axis=0) & ~jnp.isin(pair, later).any(axis=0)
     return hit.any()

@@ -175,8 +175,6 @@ class _Same:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Same) and self.value is other.value
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
 
 def _print(value: Any, seen: set[int] | None = None, depth: int = 0) -> Any:
     """Return what tells whether a value has changed: its contents, of containers and of a program's own objects."""

@@ -159,8 +159,8 @@ class DefaultElement(Element):
         return self.root.records.of_class(self._native, self.kind)
 
     @property
-    def full_identifier(self) -> None:
-        """Defaults have no name."""
+    def full_identifier(self) -> Any:
+        """None, as dm_control has it: defaults have no name."""
         return None
 
     def __getattr__(self, name: str) -> Any:

@@ -39,8 +39,6 @@ class ElementList(Sequence[Any]):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __add__(self, other: Iterable[Any]) -> list[Any]:
         return [*self, *other]
 

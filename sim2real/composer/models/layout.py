@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mujoco.introspect.ast_nodes import StructFieldDecl
 from mujoco.introspect.structs import STRUCTS
 
 from sim2real.composer.models.translate import mj
@@ -81,7 +82,7 @@ class Field:
 def array_fields(struct: str) -> dict[str, Field]:
     """Return the arrays of ``model`` or ``data`` by name."""
     fields = STRUCTS["mjModel" if struct == "model" else "mjData"].fields
-    extents = ((f.name, getattr(f, "array_extent", None)) for f in fields)  # pyright: ignore[reportAttributeAccessIssue]
+    extents = ((f.name, f.array_extent) for f in fields if isinstance(f, StructFieldDecl))
     return {name: Field(struct, name, str(extent[0])) for name, extent in extents if extent}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models import translate
 from sim2real.composer.models.given import Document, Given, Records
@@ -148,7 +148,8 @@ class Tree(Scope, Generic[H]):
             return prefix or "world"
         if element._native.name:
             return prefix + element._native.name
-        number = self.find_all(element.kind, exclude_attachments=True).index(element)  # pyright: ignore[reportArgumentType]
+        peers = self.find_all(element.kind, exclude_attachments=True)
+        number = [*map(id, peers)].index(id(element))
         own = f"/unnamed_{element.kind}_{number}"
         return (prefix or ("/" if relative_to is None else "")) + own
 
@@ -162,10 +163,9 @@ class Tree(Scope, Generic[H]):
     def handle(self, kind: str, native: Any) -> H:
         """Return the handle on an element of the spec; always the same one."""
         key = (native, kind) if kind == "inertial" else native  # a part of its body
-        found: Any = self._handles.get(key)
-        if found is None:
-            found = self._handles[key] = self.handle_type(self, kind, native)  # pyright: ignore[reportArgumentType]
-        return found
+        if key not in self._handles:
+            self._handles[key] = cast("H", self.handle_type(self, kind, native))
+        return self._handles[key]
 
     def find_handle(self, native: Any) -> H:
         """Return the handle on an element that has one."""

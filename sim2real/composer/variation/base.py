@@ -93,8 +93,6 @@ class UnaryOperation(Variation):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UnaryOperation) and (self._op, self._variation) == (other._op, other._variation)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __str__(self) -> str:
         return f"{self._op.__name__}({self._variation})"
 
@@ -125,8 +123,6 @@ class BinaryOperation(Variation):
             return False
         return (self._op, self._first, self._second) == (other._op, other._first, other._second)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __str__(self) -> str:
         return f"{self._op.__name__}({self._first}, {self._second})"
 
@@ -149,8 +145,6 @@ class GetItemOperation(Variation):
         if not isinstance(other, GetItemOperation):
             return False
         return (self._variation, self._index) == (other._variation, other._index)
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __str__(self) -> str:
         return f"{self._variation}[{self._index}]"

@@ -32,8 +32,6 @@ class RgbVariation(Variation):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RgbVariation) and self._channels == other._channels
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         r, g, b, alpha = self._channels
         return f"RgbVariation(r={r}, g={g}, b={b}, alpha={alpha})"
@@ -64,8 +62,6 @@ class HsvVariation(Variation):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, HsvVariation) and self._channels == other._channels
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __repr__(self) -> str:
         h, s, v, alpha = self._channels

@@ -27,8 +27,6 @@ class Constant(Variation):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Constant) and self._value == other._value
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __str__(self) -> str:
         return f"{self._value}"
 

@@ -56,8 +56,6 @@ class Distribution(Variation):
         mine = (self._args, self._kwargs, self._single_sample)
         return mine == (other._args, other._kwargs, other._single_sample)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         name = type(self).__name__
         return f"{name}(args={self._args}, kwargs={self._kwargs}, single_sample={self._single_sample})"
@@ -126,8 +124,6 @@ class UniformPointOnSphere(Variation):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UniformPointOnSphere) and self._single_sample == other._single_sample
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __repr__(self) -> str:
         return f"UniformPointOnSphere(single_sample={self._single_sample})"

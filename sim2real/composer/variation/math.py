@@ -31,8 +31,6 @@ class MathOp(Variation):
             return False
         return (self._args, self._kwargs) == (other._args, other._kwargs)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}(args={self._args}, kwargs={self._kwargs})"
 

@@ -28,8 +28,6 @@ class Additive(Variation):
             return False
         return (self._variation, self._cumulative) == (other._variation, other._cumulative)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         return f"Additive(variation={self._variation}, cumulative={self._cumulative})"
 
@@ -54,8 +52,6 @@ class Multiplicative(Variation):
         if not isinstance(other, Multiplicative):
             return False
         return (self._variation, self._cumulative) == (other._variation, other._cumulative)
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __repr__(self) -> str:
         return f"Multiplicative(variation={self._variation}, cumulative={self._cumulative})"

@@ -26,8 +26,6 @@ class UniformQuaternion(Variation):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UniformQuaternion)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         return "UniformQuaternion()"
 
@@ -55,8 +53,6 @@ class QuaternionFromAxisAngle(Variation):
             return False
         return (self._axis, self._angle) == (other._axis, other._angle)
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
-
     def __repr__(self) -> str:
         return f"QuaternionFromAxisAngle(axis={self._axis}, angle={self._angle})"
 
@@ -77,8 +73,6 @@ class QuaternionPreMultiply(Variation):
         if not isinstance(other, QuaternionPreMultiply):
             return False
         return (self._quat, self._cumulative) == (other._quat, other._cumulative)
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __repr__(self) -> str:
         return f"QuaternionPreMultiply(quat={self._quat}, cumulative={self._cumulative})"
@@ -112,8 +106,6 @@ class QuaternionRotate(Variation):
             return False
         mine = (self._quat, self._vec, self._cumulative)
         return mine == (other._quat, other._vec, other._cumulative)
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
 
     def __repr__(self) -> str:
         return f"QuaternionRotate(quat={self._quat}, vec={self._vec}, cumulative={self._cumulative})"
