@@ -70,5 +70,3 @@ class Identity(Variation):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Identity)
-
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
