@@ -17,11 +17,11 @@ from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.hardware import Embedded, ServoSession
-from sim2real.robots.joints import Joint
 from sim2real.robots.loop_robot import LoopRobot
 
 from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, Measurement, dynamics, node_params
@@ -49,6 +49,7 @@ class PendulumRobot(LoopRobot):
         ObservationTerm("past voltage", ("V",), HISTORY),
     )
     action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
+    mounting = (HINGE,)
     tick_s = 1 / WORLD_HZ
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
@@ -115,7 +116,7 @@ class PendulumRobot(LoopRobot):
 
     def read(self, reading: Reading) -> Measurement:
         """Return the sensor's message of a reading."""
-        return Measurement(HINGE.angle(reading.position_rad[0]), HINGE.speed(reading.velocity_rad_s[0]))
+        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
@@ -126,7 +127,7 @@ class PendulumRobot(LoopRobot):
         """
         rig = session.rig
         for _ in range(_PUSHES):
-            angle = HINGE.angle(rig.wait_until_still(settle_s).position_rad[0])
+            angle = rig.wait_until_still(settle_s).position_rad[0]
             if np.cos(angle) < -0.95:
                 return
             rig.start()

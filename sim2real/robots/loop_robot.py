@@ -14,6 +14,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.base import Datum, Robot, positive, tuple_of
@@ -31,7 +32,11 @@ class LoopRobot(Robot):
         tick_s: The world's period [s].
         channels: What is measured of each joint.
         at_rest: The sensor's message of a robot at rest.
-        embedded: The robot inside the computer, for the port ``embedded``; None: there is none.
+        mounting: How the joints are mounted, in the order of the motors; empty: as the device measures and commands
+            them. All that the robot says and is told of its joints is on their side; see ``Rig``.
+        embedded: The robot inside the computer, for the port ``embedded``; None: there is none. Its plant knows joints
+            alone: they are mounted as ``mounting`` says.
+        encoder_zero_rad: What the embedded robot's encoders read, from count 0, where the device says 0 [rad].
         message: Makes the actuator's message from a command, shape ``(actions,)``.
         expected_delay_s: Computation delays of sensor, supervisor and actuator that phases allow for: a bus
             transaction, and a policy with its thread's wake-up [s].
@@ -42,7 +47,9 @@ class LoopRobot(Robot):
     tick_s: float
     channels: tuple[Channel, ...]
     at_rest: Any
+    mounting: tuple[Joint, ...] = ()
     embedded: Embedded | None = None
+    encoder_zero_rad: float = 0.0
     message: Callable[[Any], Any]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     delay_spread_s: float = 0.002
@@ -53,6 +60,7 @@ class LoopRobot(Robot):
         "tick_s": ("a number above 0 [s]", positive),
         "channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel)),
         "at_rest": ("a message of the sensor", lambda value: value is not None),
+        "mounting": ("a tuple of sim2real.hardware.joint.Joint", lambda value: value == () or tuple_of(Joint)(value)),
         "message": ("the type of the actuator's message", callable),
     }
 
@@ -137,7 +145,8 @@ class LoopRobot(Robot):
         def device(port: str) -> Device:
             return self.make_device(port, limits.servo_watchdog_s)
 
-        return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
+        twin = self.embedded and self.embedded.mounted(self.mounting, self.encoder_zero_rad)
+        return ServoSession(port, device, self.gate(limits), twin, truth_path, seed, self.mounting)
 
     def recording_nodes(self, session: ServoSession, signal: np.ndarray) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays commands, one row a step ``(N, actions)``."""

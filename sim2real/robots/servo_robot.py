@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.registry import load_device
 from sim2real.identify.model import Channel
@@ -42,7 +44,7 @@ class Servos:
     """The servos on the bus, in the order of the joints.
 
     Attributes:
-        joints: Names.
+        joints: Their names, or the joints with zero, direction and gear; a zero is what the device reads there.
         ids: Numbers on the bus.
         low: Lowest goals [rad].
         high: Highest goals [rad].
@@ -54,7 +56,7 @@ class Servos:
         device: Name of the device that they are; see `sim2real.hardware.registry`.
     """
 
-    joints: tuple[str, ...]
+    joints: tuple[Joint | str, ...]
     ids: tuple[int, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -64,6 +66,16 @@ class Servos:
     rest_tolerance: float = 0.4
     baud_rate: int = 1_000_000
     device: str = "dynamixel"
+
+    @property
+    def mounting(self) -> tuple[Joint, ...]:
+        """The joints."""
+        return tuple(Joint.of(joint) for joint in self.joints)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The joints' names."""
+        return tuple(joint.name for joint in self.mounting)
 
     @property
     def at_rest(self) -> np.ndarray:
@@ -87,6 +99,7 @@ class ServoRobot(LoopRobot):
     command = "goal"
     message = Goals
     expected_delay_s = (0.004, 0.003, 0.002)
+    encoder_zero_rad = math.pi
 
     servos: Servos
     aim: tuple[tuple[str, str], ...] = ()
@@ -143,7 +156,8 @@ class ServoRobot(LoopRobot):
         s, task = self.servos, self.task
         arguments = {
             "mjcf": task.root_entity.mjcf_model.root_model.to_xml_string(),
-            "joints": {name: j.full_identifier for name, j in zip(s.joints, task.joints, strict=True)},
+            "joints": {name: j.full_identifier for name, j in zip(s.names, task.joints, strict=True)},
+            "gears": [joint.gear for joint in s.mounting],
             "servo_ids": s.ids,
             "p_gain": s.sheet.p_gain,
             "factors": factors,
@@ -162,6 +176,11 @@ class ServoRobot(LoopRobot):
     # -- what the stages ask
 
     @property
+    def mounting(self) -> tuple[Joint, ...]:
+        """How the joints are mounted."""
+        return self.servos.mounting
+
+    @property
     def units(self) -> dict[str, str]:
         """Field of a message -> its unit."""
         of_aim = {f"aim[{i}]": unit for i, (_, unit) in enumerate(self.aim)}
@@ -170,7 +189,7 @@ class ServoRobot(LoopRobot):
     @property
     def joints(self) -> dict[str, dict[str, str]]:
         """For the log: which fields are which joint's."""
-        rows = enumerate(self.servos.joints)
+        rows = enumerate(self.servos.names)
         return {j: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, j in rows}
 
     @property
@@ -192,13 +211,13 @@ class ServoRobot(LoopRobot):
     def action(self) -> tuple[ActionTerm, ...]:
         """The policy's actions, as fast as goals may go, either way [rad/s]."""
         speed = self.servos.speed
-        return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.joints)
+        return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.names)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """Position and velocity of each joint."""
         sigmas = self.position_sigma_rad, self.velocity_sigma_rad_s
-        rows = enumerate(self.servos.joints)
+        rows = enumerate(self.servos.names)
         return tuple(Channel("position", "velocity", *sigmas, index=i, label=j, goal="goal") for i, j in rows)
 
     @cached_property
@@ -287,7 +306,7 @@ class ServoRobot(LoopRobot):
             limits.max_speed_rad_s,
             stale="hold",
             node=self.roles.actuator,
-            joints=s.joints,
+            joints=s.names,
             stuck_effort=limits.stuck_effort,
         )
 
@@ -315,7 +334,7 @@ class ServoRobot(LoopRobot):
         worst = int(np.argmax(off))
         if off[worst] > self.servos.rest_tolerance:
             raise SafetyStop(
-                f"joint {self.servos.joints[worst]!r} rests at {position[worst]:.2f} rad, "
+                f"joint {self.servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
                 f"not within {self.servos.rest_tolerance:g} rad of {self.servos.at_rest[worst]:g} rad",
                 hint="free it, or check the zero of its encoder",
             )
