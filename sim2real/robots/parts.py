@@ -32,7 +32,7 @@ class Servo(Robot):
 
     def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
         mounted = Joint.of(name)
-        gear = mounted.gear
+        gear = self.gear = mounted.gear
         self._model = mjcf.RootElement(model=mounted.name)
         horn = self._model.worldbody.add("body", name="horn")
         self.joint = horn.add(

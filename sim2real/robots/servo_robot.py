@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import SafetyStop
+from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
@@ -222,8 +222,18 @@ class ServoRobot(LoopRobot):
 
     @cached_property
     def task(self) -> GoalTask:
-        """The composed task of this robot's world."""
-        return self.make_task()
+        """The composed task of this robot's world.
+
+        Raises:
+            UsageError: Its servos have other gears than the joints.
+        """
+        task, joints = self.make_task(), self.servos.mounting
+        if (built := [s.gear for s in task.robot.servos]) != (said := [j.gear for j in joints]):
+            raise UsageError(
+                f"the model's servos have the gears {built}, the joints {said}",
+                hint="make each part of its joint: `Servo(joint, axis, sheet)`, not of the joint's name",
+            )
+        return task
 
     @property
     def tick_s(self) -> float:
