@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from sim2real.graph.delays import DelayDistribution
@@ -22,6 +23,7 @@ from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, in_a_loop, simulated_loop
+from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
 
 
@@ -77,17 +79,21 @@ class LoopRobot(Robot):
         """Return the policy's node, with options of ``BaseNode``."""
 
     @abstractmethod
-    def training_task(
-        self, agent: BaseNode, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> TrainingTask:
-        """Return the task of a policy.
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Return parameters of the nodes for a random episode of training: dynamics, delays, start, what it is about.
 
         Args:
-            agent: The policy's node.
-            values: Parameters by name.
-            draws: Samples of some parameters, each of shape ``(K,)``.
-            spread_s: By how much delays vary, either way [s].
+            key: JAX key.
+            draw: Draws dynamics and delays: key -> values by name.
         """
+
+    @abstractmethod
+    def reward(self, state: Any, action: jax.Array) -> jax.Array:
+        """Return the reward of a policy step, from the world's state after it and the action ``(actions,)``."""
+
+    @abstractmethod
+    def success(self, state: Any) -> jax.Array:
+        """Return whether a state of the world is one that the task wants, bool."""
 
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
@@ -196,7 +202,7 @@ class LoopRobot(Robot):
         )
         agent, sensor = self.make_agent(**on_agent), SimSensor(roles.sensor, self.rate_hz, world, **on_sensor)
         nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
-        return nodes, self.training_task(agent, values, draws, self.delay_spread_s if delays else 0.0)
+        return nodes, LoopTask(self, agent, values, draws, self.delay_spread_s if delays else 0.0)
 
     def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
         """Return node parameters of the loop in simulation, from rest.

@@ -6,7 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -27,60 +27,16 @@ from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
-from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import GoalTask
+from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
-from sim2real.robots.training import ServoTask
+from sim2real.robots.training import Draw
 
 _AT_HOME_RAD, _HOME_RAD_S, _HOLD_S = 0.1, 1.0, 0.5
-
-
-@dataclass(frozen=True)
-class Servos:
-    """The servos on the bus, in the order of the joints.
-
-    Attributes:
-        joints: Their names, or the joints with zero, direction and gear; a zero is what the device reads there.
-        ids: Numbers on the bus.
-        low: Lowest goals [rad].
-        high: Highest goals [rad].
-        sheet: What their data sheet says, and how they are set up.
-        speed: The fastest that a policy moves goals [rad/s].
-        rest: Where the joints hang without torque [rad]; default: 0.
-        rest_tolerance: How far from there an episode may start [rad].
-        baud_rate: Of the bus.
-        device: Name of the device that they are; see `sim2real.hardware.registry`.
-    """
-
-    joints: tuple[Joint | str, ...]
-    ids: tuple[int, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    sheet: DataSheet
-    speed: float = 1.5
-    rest: tuple[float, ...] = ()
-    rest_tolerance: float = 0.4
-    baud_rate: int = 1_000_000
-    device: str = "dynamixel"
-
-    @property
-    def mounting(self) -> tuple[Joint, ...]:
-        """The joints."""
-        return tuple(Joint.of(joint) for joint in self.joints)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The joints' names."""
-        return tuple(joint.name for joint in self.mounting)
-
-    @property
-    def at_rest(self) -> np.ndarray:
-        """Where the joints hang without torque, ``(joints,)`` [rad]."""
-        return np.asarray(self.rest or np.zeros(len(self.joints)), np.float64)
 
 
 class ServoRobot(LoopRobot):
@@ -117,10 +73,6 @@ class ServoRobot(LoopRobot):
     @abstractmethod
     def draw_aim(self, key: jax.Array) -> jax.Array:
         """Return the aim of an episode, ``(k,)``."""
-
-    @abstractmethod
-    def success(self, state: Any) -> jax.Array:
-        """Return whether a state of the composed world is one that the task wants, bool."""
 
     def aim_fields(self, task: Any) -> Mapping[str, tuple[Any, str]]:
         """Return where an aim stands in the model: name -> (elements, attribute)."""
@@ -256,11 +208,19 @@ class ServoRobot(LoopRobot):
             roles.supervisor, self.rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
         )
 
-    def training_task(
-        self, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> ServoTask:
-        """Return the task of a policy, see ``LoopRobot``."""
-        return ServoTask(self, agent, values, draws, spread_s)
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Draw an episode: half of the starts are at rest, half at any position.
+
+        Args:
+            key: JAX key.
+            draw: Draws dynamics and delays: key -> values by name.
+        """
+        k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
+        drawn, s = draw(k_values), self.servos
+        low, high, rest = (jnp.asarray(x, jnp.float32) for x in (s.low, s.high, s.at_rest))
+        anywhere = jax.random.uniform(k_start, low.shape, minval=low, maxval=high)
+        start = jnp.where(jax.random.bernoulli(k_where), rest, anywhere)
+        return self.node_params(drawn, start, jnp.zeros_like(start), self.draw_aim(k_aim))
 
     def node_params(
         self, values: Mapping[str, Any], position: Any, velocity: Any, aim: Any, policy: Any = None
