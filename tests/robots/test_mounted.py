@@ -67,6 +67,11 @@ def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
     np.testing.assert_allclose([s.profile_rad_s for s in robot.task.robot.servos], 2.0 / gears)
 
 
+def test_what_is_no_joint_is_refused_when_the_robot_is_made():
+    with pytest.raises(UsageError, match=r"has mounting = \('hinge',\), which is not a tuple of .*Joint"):
+        turned(load_pipeline("pendulum").load(), mounting=("hinge",))
+
+
 def test_a_model_without_the_joints_gears_is_refused():
     robot = turned(PairRobot(), servos=Geared.servos)
     with pytest.raises(UsageError, match=r"servos have the gears \[1\.0, 1\.0\], the joints \[2\.0, 0\.5\]") as caught:
