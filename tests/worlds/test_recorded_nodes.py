@@ -1,4 +1,4 @@
-"""Worlds that recorded commands drive: where they start, their first message, when commands act, what is read of them."""
+"""Worlds that recorded commands drive: where they start, their first message, when commands act, what is read."""
 
 from types import SimpleNamespace
 
