@@ -8,12 +8,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.node import BaseNode
 from sim2real.worlds import friction
-from sim2real.worlds.encoder import Encoder
 from sim2real.worlds.friction import FrictionParams
-from sim2real.worlds.joint import Forces, JointState, JointWorld
-from sim2real.worlds.recorded import command_delay
+from sim2real.worlds.joint import Forces, JointWorld
 
 
 @struct.dataclass
@@ -69,20 +66,6 @@ class DiskWorld(JointWorld):
             start=jnp.zeros(2),
         )
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial angle and velocity that the parameters name."""
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return JointState(params.start[0], params.start[1])
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial state."""
-        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
-
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay of the command, where the actuator's parameters set one."""
-        del rng
-        return command_delay(graph_state)
-
     def command(self, step_state: StepState) -> Any:
         """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
@@ -99,21 +82,3 @@ class DiskWorld(JointWorld):
             damping=friction.damping(p.friction, velocity),
             dry=friction.dry(p.friction, velocity, radial),
         )
-
-
-class Sensor(BaseNode):
-    """The encoder."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Encoder:
-        """Return an encoder that is mounted well."""
-        del rng, graph_state
-        return Encoder(0.0, 0.0)
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
-        """Return an angle."""
-        del rng, graph_state
-        return Measurement(th=jnp.float32(0.0))
-
-    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
-        """Read."""
-        return step_state, Measurement(th=step_state.params.read(step_state.inputs["world"][-1].data.position))

@@ -11,9 +11,10 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.recorded import LoggedRobot
-from sim2real.worlds.recorded import RecordedActuator
+from sim2real.worlds.encoder import Encoder
+from sim2real.worlds.recorded import RecordedActuator, RecordedSensor
 
-from .model import Command, DiskWorld, Sensor
+from .model import Command, DiskWorld, Measurement
 
 
 class DiskRobot(LoggedRobot):
@@ -46,7 +47,7 @@ class DiskRobot(LoggedRobot):
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
         """Return sensor, actuator and world."""
         actuator = RecordedActuator("actuator", 40.0, Command(action=jnp.zeros(1)))
-        return Sensor("sensor", 40.0), actuator, DiskWorld("world", 200.0)
+        return RecordedSensor("sensor", 40.0, Measurement, Encoder(0.0, 0.0)), actuator, DiskWorld("world", 200.0)
 
     def started(self, params: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters with a start where the encoder reads ``start`` and its rate."""

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.loop import DelayParams, delay_of
+from sim2real.robots.agent import DirectAgent
 from sim2real.worlds.ode import OdeWorld
 
 GRAVITY = 9.81  # [m/s^2]
@@ -127,15 +126,6 @@ def dynamics() -> list[Parameter]:
     ]
 
 
-def node_params(values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-    """Return the parameters of the model's nodes for identified values; delays are in [s]."""
-    return {
-        "world": from_groups(values, start),
-        "sensor": DelayParams(delay=values.get("sensor_delay")),
-        "actuator": DelayParams(delay=values.get("actuator_delay")),
-    }
-
-
 class PendulumWorld(OdeWorld):
     """The pendulum as an ordinary differential equation, driven by the ``actuator`` input."""
 
@@ -148,10 +138,6 @@ class PendulumWorld(OdeWorld):
         """Return the initial angle and velocity that the parameters name."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return Measurement(th=params.start[0], thdot=params.start[1])
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
-        """Return the initial state: what a sensor sees before the first tick has ended."""
-        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
 
     def command(self, step_state: StepState) -> Any:
         """Return the voltage during this tick [V]."""
@@ -170,68 +156,13 @@ class PendulumWorld(OdeWorld):
         return Measurement(th=state.th, thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
 
 
-class DelayedWorld(PendulumWorld):
-    """The world whose actuation delay is set by the actuator's ``DelayParams``."""
+class Agent(DirectAgent):
+    """The policy's node: cos, sin, thdot / 10 and a short history in, ``(19,)``; a voltage out."""
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the actuation delay, where the actuator's parameters set one."""
-        return delay_of("actuator", "actuator", graph_state)
-
-
-@struct.dataclass
-class AgentParams(Base):
-    """The policy, a pytree with ``get_action(obs, rng)``; None commands zero."""
-
-    policy: Any = None
+    def __init__(self, name: str, rate: float, **options: Any) -> None:
+        super().__init__(name, rate, features, (3, 1), HISTORY, Command, **options)
 
 
-@struct.dataclass
-class AgentState(Base):
-    """The last observations ``(HISTORY, 3)`` and actions ``(HISTORY, 1)``, newest first."""
-
-    observations: Any
-    actions: Any
-
-
-class Agent(BaseNode):
-    """The policy's node: the newest measurement and a short history in, a voltage out."""
-
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
-        """Return no policy."""
-        del rng, graph_state
-        return AgentParams()
-
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentState:
-        """Return an empty history."""
-        del rng, graph_state
-        return AgentState(observations=jnp.zeros((HISTORY, 3)), actions=jnp.zeros((HISTORY, 1)))
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Command:
-        """Return zero voltage."""
-        del rng, graph_state
-        return Command(action=jnp.zeros(1))
-
-    def observe(self, step_state: StepState) -> jax.Array:
-        """Return what the policy sees, shape ``(19,)``: cos, sin, thdot / 10, then the history."""
-        state = step_state.state
-        return jnp.concatenate([_features(step_state), state.observations.ravel(), state.actions.ravel()])
-
-    def act(self, step_state: StepState, action: Any) -> tuple[StepState, Command]:
-        """Return the step's results for an action, shape ``(1,)`` [V]."""
-        state = step_state.state
-        state = AgentState(
-            observations=jnp.concatenate([_features(step_state)[None], state.observations[:-1]]),
-            actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], state.actions[:-1]]),
-        )
-        return step_state.replace(state=state), Command(action=action)
-
-    def step(self, step_state: StepState) -> tuple[StepState, Command]:
-        """Ask the policy."""
-        policy = step_state.params.policy
-        action = jnp.zeros(1) if policy is None else policy.get_action(self.observe(step_state))
-        return self.act(step_state, action)
-
-
-def _features(step_state: StepState) -> jax.Array:
-    m = step_state.inputs["sensor"][-1].data
+def features(m: Measurement) -> jax.Array:
+    """Return what the policy sees of a measurement, ``(3,)``."""
     return jnp.stack([jnp.cos(m.th), jnp.sin(m.th), m.thdot / 10.0]).astype(jnp.float32)

@@ -89,7 +89,7 @@ class PendulumPlant:
         return {"th": float(self.data.qpos[0]), "thdot": float(self.data.qvel[0]), "voltage": self._voltage or 0.0}
 
     def truth(self) -> dict[str, Any]:
-        """Return the groups that a log can tell, in the units of ``pipelines/pendulum/parameters.py``."""
+        """Return the groups that a log can tell, in the units of ``pipelines/pendulum/model.py``."""
         return {
             "gain": self._K / _R / self._J,
             "gravity": _MASS * 9.81 * _LENGTH / self._J,

@@ -1,4 +1,4 @@
-"""The pendulum for the stages: a DYNAMIXEL servo in PWM mode, its loop, and its score."""
+"""The pendulum for the stages: a DYNAMIXEL servo in PWM mode, its task, swing up and stay upright, and its score."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop
@@ -17,22 +19,31 @@ from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.agent import AgentParams
 from sim2real.robots.hardware import Embedded, ServoSession
-from sim2real.robots.joints import Joint
+from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
+from sim2real.robots.training import Draw
 
-from .model import HISTORY, Agent, AgentParams, Command, DelayedWorld, Measurement, dynamics, node_params
+from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, dynamics, from_groups
 from .plant import SUPPLY_V
-from .task import LIMIT_V, SwingUp, upright
 
 SERVO_ID = 1
+LIMIT_V = 2.0
+"""Largest voltage that the policy may ask for [V]."""
 WORLD_HZ = 100.0
 HINGE = Joint("hinge", zero_rad=0.0)
 """Angle 0 is upright."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
+
+
+def upright(th: Any, thdot: Any) -> Any:
+    """Return where the pendulum counts as upright: cos(th) > 0.95 and |thdot| < 0.5 rad/s."""
+    return (jnp.cos(th) > 0.95) & (jnp.abs(thdot) < 0.5)
 
 
 class PendulumRobot(LoopRobot):
@@ -49,6 +60,7 @@ class PendulumRobot(LoopRobot):
         ObservationTerm("past voltage", ("V",), HISTORY),
     )
     action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
+    mounting = (HINGE,)
     tick_s = 1 / WORLD_HZ
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
@@ -69,29 +81,44 @@ class PendulumRobot(LoopRobot):
         """Return what a log can tell of the model."""
         return dynamics()
 
-    def make_world(self, resumed: bool = False) -> DelayedWorld:
+    def make_world(self, resumed: bool = False) -> PendulumWorld:
         """Return the world's node; all of its state is measured, so a resumed one is no other."""
         del resumed
-        return DelayedWorld("world", WORLD_HZ)
+        return PendulumWorld("world", WORLD_HZ)
 
     def make_agent(self, **options: Any) -> Agent:
         """Return the policy's node."""
         return Agent("agent", self.rate_hz, **options)
 
-    def training_task(
-        self, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> SwingUp:
-        """Return the task; see ``LoopRobot``."""
-        return SwingUp(agent, values, draws, spread_s)
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Draw an episode, see ``LoopRobot``: half of them start hanging, half anywhere."""
+        k_values, k_state, k_where = jax.random.split(key, 3)
+        drawn = draw(k_values)
+        anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
+        hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
+        return self.resumed_params(drawn, jnp.where(jax.random.bernoulli(k_where), hanging, anywhere))
+
+    def reward(self, state: Measurement, action: jax.Array) -> jax.Array:
+        """Return minus the seed's cost: angle, speed that matters only near the top, and voltage."""
+        th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
+        return -(th**2 + 0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2 + 0.01 * action[0] ** 2)
+
+    def success(self, state: Measurement) -> jax.Array:
+        """Return whether the pendulum is upright."""
+        return upright(state.th, state.thdot)
 
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return node parameters for values and an initial state ``(th, thdot)``."""
-        return node_params(values, start)
+        return {
+            "world": from_groups(values, start),
+            "sensor": DelayParams(delay=values.get("sensor_delay")),
+            "actuator": DelayParams(delay=values.get("actuator_delay")),
+        }
 
     def rest_params(self, values: Mapping[str, Any], policy: Any, trial: int) -> dict[str, Any]:
         """Return node parameters for an episode that begins hanging at rest; every trial is the same."""
         del trial
-        return {**node_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
+        return {**self.resumed_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
 
     def agent_params(self, session: ServoSession, policy: Any, trial: int) -> AgentParams:
         """Return the agent's parameters; every trial is the same."""
@@ -115,7 +142,7 @@ class PendulumRobot(LoopRobot):
 
     def read(self, reading: Reading) -> Measurement:
         """Return the sensor's message of a reading."""
-        return Measurement(HINGE.angle(reading.position_rad[0]), HINGE.speed(reading.velocity_rad_s[0]))
+        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
@@ -126,7 +153,7 @@ class PendulumRobot(LoopRobot):
         """
         rig = session.rig
         for _ in range(_PUSHES):
-            angle = HINGE.angle(rig.wait_until_still(settle_s).position_rad[0])
+            angle = rig.wait_until_still(settle_s).position_rad[0]
             if np.cos(angle) < -0.95:
                 return
             rig.start()

@@ -11,9 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.node import BaseNode
-from sim2real.worlds.joint import Forces, JointState, JointWorld
-from sim2real.worlds.recorded import command_delay
+from sim2real.worlds.joint import Forces, JointWorld
 from sim2real.worlds.servo import motor_torque, position_duty
 
 MASS_KG, LENGTH_M, GRAVITY = 0.49, 0.10, 9.81
@@ -85,20 +83,6 @@ class ServoWorld(JointWorld):
         del rng, graph_state
         return ServoParams()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial angle and velocity that the parameters name."""
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return JointState(params.start[0], params.start[1])
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
-        """Return the initial state."""
-        return (graph_state or GraphState()).state.get(self.name) or self.init_state(rng, graph_state)
-
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
-        """Return the delay of the goals, where the actuator's parameters set one."""
-        del rng
-        return command_delay(graph_state)
-
     def command(self, step_state: StepState) -> Command:
         """Return what the servo is told during this tick."""
         return step_state.inputs["actuator"][-1].data
@@ -115,16 +99,3 @@ class ServoWorld(JointWorld):
         inertia = MASS_KG * LENGTH_M**2 + p.armature
         brake = p.viscous + jnp.where(on, 0.0, _OPEN * p.back_emf)
         return Forces(acceleration=(motor + weight) / inertia, damping=brake / inertia, dry=rubbing / inertia)
-
-
-class Sensor(BaseNode):
-    """The encoder."""
-
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
-        """Return an angle."""
-        del rng, graph_state
-        return Measurement(position=jnp.float32(0.0))
-
-    def step(self, step_state: StepState) -> tuple[StepState, Measurement]:
-        """Read."""
-        return step_state, Measurement(position=step_state.inputs["world"][-1].data.position)

@@ -10,9 +10,9 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.recorded import LoggedRobot
-from sim2real.worlds.recorded import RecordedActuator
+from sim2real.worlds.recorded import RecordedActuator, RecordedSensor
 
-from .model import Command, Sensor, ServoWorld
+from .model import Command, Measurement, ServoWorld
 
 _FASTEST_HZ = 300.0
 """Goals came 3.5 to 7 ms apart."""
@@ -48,7 +48,7 @@ class ServoOnArm(LoggedRobot):
         """Return sensor, actuator and world."""
         released = Command(jnp.float32(0.0), jnp.float32(0.0), jnp.float32(0.0))
         actuator = RecordedActuator("actuator", _FASTEST_HZ, released)
-        return Sensor("sensor", 200.0), actuator, ServoWorld("world", 1 / self.tick_s)
+        return RecordedSensor("sensor", 200.0, Measurement), actuator, ServoWorld("world", 1 / self.tick_s)
 
 
 ROBOT = ServoOnArm()

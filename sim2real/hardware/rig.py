@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from typing import Final, Self
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.gate import GateConfig, SafetyGate
+from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.plausibility import Plausibility
 
 _CHECK_PERIOD_S: Final = 0.5
@@ -18,6 +20,9 @@ _CHECK_PERIOD_S: Final = 0.5
 
 class Rig:
     """A device behind a safety gate, commanded in the device's unit; it is opened with the rig, with torque off.
+
+    Whatever is commanded, limited, checked and returned here is on the joints' side: an angle is the joint's, and a
+    positive voltage or load pushes towards larger angles of the joint. The device alone has the motors' side.
 
     Three things stop its motors: every way out of this context (torque off); what watches the device from outside this
     process, when this one dies or hangs; and a watchdog here when commands stop coming while measurements, which show
@@ -27,14 +32,16 @@ class Rig:
     Args:
         device: The device, not opened yet.
         gate: Limits of the commands, in the device's unit.
+        joints: How each motor's joint is mounted; none: as the device measures and commands it.
 
     Raises:
-        UsageError: Gate and device do not fit together.
+        UsageError: Gate, joints and device do not fit together.
         HardwareLost: The device cannot be opened, or a motor does not answer.
     """
 
-    def __init__(self, device: Device, gate: GateConfig) -> None:
+    def __init__(self, device: Device, gate: GateConfig, joints: Sequence[Joint] = ()) -> None:
         _require_stale(gate, device)
+        self._mounting = Mounting(joints, device)
         self.device = device
         self.gate = SafetyGate(gate)
         self._plausibility = Plausibility(gate)
@@ -88,7 +95,7 @@ class Rig:
         self._commanded_s = self._speed_rad_s = self._failure = None
         self._require_reach()
         self.device.enable()
-        self.gate.reset(self.device.rest())
+        self.gate.reset(self._mounting.to_joints(self.device.rest()))
         self._plausibility.reset()
         self._sent = self.gate.fallback
         threading.Thread(target=self._watch, args=(self._done,), name="sim2real:watchdog", daemon=True).start()
@@ -111,7 +118,7 @@ class Rig:
         self.device.close()
 
     def measure(self) -> Reading:
-        """Read positions and velocities of all motors.
+        """Read positions, velocities and loads of all joints.
 
         Raises:
             SafetyStop: A motor has stopped itself, or what it measures cannot be true.
@@ -120,12 +127,13 @@ class Rig:
         self._check()
         self._supervise()
         sent = self._sent
-        reading = self.device.measure()
-        position, asked = reading.position_rad, reading.transaction
-        effort = np.zeros(len(position))
+        measured = self.device.measure()
+        reading, asked = self._mounting.reading(measured), measured.transaction
+        effort = np.zeros(len(measured.position_rad))
         if sent is not None and not self.torque_withheld:
-            effort = self.device.effort(sent, position)
-        self._plausibility.check(position, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
+            # Of the motors, whose direction does not matter to what is plausible.
+            effort = self.device.effort(self._mounting.to_motors(sent), measured.position_rad)
+        self._plausibility.check(reading.position_rad, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
         self._speed_rad_s = reading.velocity_rad_s
         return reading
 
@@ -133,7 +141,7 @@ class Rig:
         """Send a command through the gate and return what was sent.
 
         Args:
-            command: Shape ``(n,)`` [the device's unit].
+            command: Shape ``(n,)``, of the joints [the device's unit].
             age_s: How long ago it was decided [s].
             now_s: A monotonic time, for the slew limit [s].
 
@@ -144,7 +152,7 @@ class Rig:
         self._check()
         with self._lock:
             allowed = self.gate.apply(command, age_s, now_s, self._speed_rad_s)
-            self.device.command(allowed)
+            self.device.command(self._mounting.to_motors(allowed))
             self._sent = allowed
             self._commanded_s = time.monotonic()
         return allowed
@@ -186,7 +194,7 @@ class Rig:
 
     def _require_reach(self) -> None:
         """Refuse gate limits beyond what the motors follow, or for another number of motors."""
-        gate, (low, high) = self.gate.config, self.device.reach()
+        gate, (low, high) = self.gate.config, self._mounting.limits(*self.device.reach())
         for limits in gate.range:
             if limits.ndim and limits.shape != low.shape:
                 raise UsageError(f"gate of {gate.node!r}: limits for {limits.size} motors, but there are {low.size}")
@@ -210,7 +218,7 @@ class Rig:
                 if waiting or late:
                     try:
                         fallback = self.gate.fallback
-                        self.device.command(fallback)
+                        self.device.command(self._mounting.to_motors(fallback))
                         self._sent = fallback
                     except Sim2RealError as error:
                         self._failure = error

@@ -23,8 +23,9 @@ _FACTORS = ("gain", "damping", "armature", "friction")
 class TwinPlant:
     """Position-controlled servos on a model's position actuators; see ``sim2real.hardware.plant.Plant``.
 
-    A joint is at 0 where its encoder reads the centre of its range. With torque off the motor applies no torque, but
-    the model's damping still acts. Position errors are computed in whole counts, as in the firmware.
+    A joint is at 0 where its encoder reads the centre of its range; ``MountedPlant`` puts other mountings in between.
+    With torque off the motor applies no torque, but the model's damping still acts. Position errors are computed in
+    whole counts, as in the firmware.
 
     Args:
         mjcf: The model, with one position actuator per joint.
@@ -33,6 +34,8 @@ class TwinPlant:
         p_gain: Position P Gain to which the actuators' ``kp`` corresponds [counts].
         factors: Factors on the model's parameters: ``gain``, ``damping``, ``armature``, ``friction``; default: 1.
         step_s: MuJoCo's time step [s].
+        gears: Turns of each servo for one of its joint; default: 1. The model's numbers are the joints', the counts of
+            the firmware and ``truth`` the servos'.
 
     Raises:
         UsageError: When a factor or a joint is unknown.
@@ -46,9 +49,11 @@ class TwinPlant:
         p_gain: int,
         factors: Mapping[str, float] | None = None,
         step_s: float = 0.0005,
+        gears: Sequence[float] = (),
     ) -> None:
         self.servo_ids = tuple(servo_ids)
         self.joints = tuple(joints)
+        self._gears = tuple(gears) or (1.0,) * len(self.joints)
         elements = [joints[name] for name in self.joints]
         f = dict.fromkeys(_FACTORS, 1.0) | dict(factors or {})
         if unknown := set(f) - set(_FACTORS):
@@ -89,8 +94,9 @@ class TwinPlant:
                     continue
                 reach = self._profiles[i] * step_s
                 self._references[i] += min(max(goal - self._references[i], -reach), reach)
-                counts = round(self._references[i] / _RAD_PER_COUNT) - round(angle / _RAD_PER_COUNT)
-                data.ctrl[motor] = angle + counts * _RAD_PER_COUNT
+                count_rad = _RAD_PER_COUNT / self._gears[i]
+                counts = round(self._references[i] / count_rad) - round(angle / count_rad)
+                data.ctrl[motor] = angle + counts * count_rad
             mj_step(model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
@@ -139,12 +145,12 @@ class TwinPlant:
 
         Parameters that the joints share are those of the first servo; ``gain`` belongs to ``p_gain``.
         """
-        dof, motor = self._dofs[0], self._motors[0]
-        dofs = zip(self.joints, self._dofs, strict=True)
-        friction = {f"friction_{name}": float(self.model.dof_frictionloss[d]) for name, d in dofs}
+        dof, motor, gear = self._dofs[0], self._motors[0], self._gears[0]
+        dofs = zip(self.joints, self._dofs, self._gears, strict=True)
+        friction = {f"friction_{name}": float(self.model.dof_frictionloss[d]) / g for name, d, g in dofs}
         return {
-            "gain": float(self._kp[motor]),
-            "damping": float(self.model.dof_damping[dof]),
-            "armature": float(self.model.dof_armature[dof]),
+            "gain": float(self._kp[motor]) / gear**2,
+            "damping": float(self.model.dof_damping[dof]) / gear**2,
+            "armature": float(self.model.dof_armature[dof]) / gear**2,
             **friction,
         }

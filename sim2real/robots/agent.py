@@ -1,4 +1,4 @@
-"""The policy's node: reads measurements, keeps a short history, and sends goal positions of the joints."""
+"""The policy's node: reads measurements, keeps a short history, and sends goals of joints, or actions as they are."""
 
 from __future__ import annotations
 
@@ -116,3 +116,86 @@ class GoalAgent(BaseNode):
         policy = step_state.params.policy
         action = jnp.zeros_like(self._low) if policy is None else policy.get_action(self.observe(step_state))
         return self.act(step_state, action)
+
+
+@struct.dataclass
+class Past(Base):
+    """The last steps, newest first.
+
+    Attributes:
+        observations: Shape ``(history, features)``.
+        actions: Shape ``(history, actions)``.
+    """
+
+    observations: Any
+    actions: Any
+
+
+class DirectAgent(BaseNode):
+    """Sends a policy's actions as they are, e.g. voltages.
+
+    The policy sees features of the newest measurement, and the features and actions of the last steps.
+
+    Args:
+        name: Unique in the graph.
+        rate: Steps per second [Hz].
+        features: What the policy sees of a measurement: message of the sensor -> ``(features,)``.
+        sizes: Numbers of features and of actions.
+        history: Number of past steps in the observation.
+        message: Makes the node's message from an action.
+        sensor: Name of the sensor.
+        **options: Options of ``BaseNode``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        features: Callable[[Any], jax.Array],
+        sizes: tuple[int, int],
+        history: int,
+        message: Callable[[Any], Any],
+        sensor: str = ROLES.sensor,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._features, self._sizes, self._history = features, sizes, history
+        self._message, self._sensor = message, sensor
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
+        """Return no policy."""
+        del rng, graph_state
+        return AgentParams()
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Past:
+        """Return an empty history."""
+        del rng, graph_state
+        return Past(*(jnp.zeros((self._history, size)) for size in self._sizes))
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return a message with zeros."""
+        del rng, graph_state
+        return self._message(jnp.zeros(self._sizes[1]))
+
+    def observe(self, step_state: StepState) -> jax.Array:
+        """Return the policy's observation: the features, then the history, newest first."""
+        past = step_state.state
+        return jnp.concatenate([self._now(step_state), past.observations.ravel(), past.actions.ravel()])
+
+    def act(self, step_state: StepState, action: Any) -> tuple[StepState, Any]:
+        """Return the new step state and the message for an action ``(actions,)``."""
+        past = step_state.state
+        new = Past(
+            observations=jnp.concatenate([self._now(step_state)[None], past.observations[:-1]]),
+            actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], past.actions[:-1]]),
+        )
+        return step_state.replace(state=new), self._message(action)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Make a step with the policy's action."""
+        policy = step_state.params.policy
+        action = jnp.zeros(self._sizes[1]) if policy is None else policy.get_action(self.observe(step_state))
+        return self.act(step_state, action)
+
+    def _now(self, step_state: StepState) -> jax.Array:
+        return self._features(step_state.inputs[self._sensor][-1].data)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +17,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.embedded import EmbeddedRobot
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.rig import Rig
 from sim2real.robots.roles import ROLES
@@ -36,6 +37,19 @@ class Embedded:
     emulator: BusEmulation
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
+    def mounted(self, joints: Sequence[Joint], zero_rad: float) -> Embedded:
+        """Return the same robot with its joints mounted; where all are plain, nothing is in between.
+
+        Args:
+            joints: One per servo, in the order of the plant's ``servo_ids``.
+            zero_rad: What an encoder reads, from count 0, where the device says 0 [rad].
+        """
+        if all(joint.is_plain for joint in joints):
+            return self
+        inside = {"plant": self.plant, "plant_args": dict(self.plant_args)}
+        rows = {"joints": [asdict(joint) for joint in joints], "zero_rad": zero_rad}
+        return replace(self, plant="sim2real.hardware.mounted:MountedPlant", plant_args=inside | rows)
+
 
 class ServoSession:
     """An open robot: the rig, and, for the port ``embedded``, the process of the emulated robot.
@@ -47,6 +61,7 @@ class ServoSession:
         embedded: The emulated robot; None: there is none.
         truth_path: File for the emulated robot's true states and latencies.
         seed: Seed of the emulated robot's jitter and faults.
+        joints: How each motor's joint is mounted; none: as the device measures and commands it.
 
     Raises:
         UsageError: The port is ``embedded``, but the robot has none.
@@ -61,6 +76,7 @@ class ServoSession:
         embedded: Embedded | None,
         truth_path: Path,
         seed: int,
+        joints: Sequence[Joint] = (),
     ) -> None:
         self._stack = ExitStack()
         self.embedded: EmbeddedRobot | None = None
@@ -75,7 +91,7 @@ class ServoSession:
                 port = self.embedded.port
                 # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
                 opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
-            self.rig = opening.enter_context(Rig(device(port), gate))
+            self.rig = opening.enter_context(Rig(device(port), gate, joints))
             self._stack = opening.pop_all()
 
     def __enter__(self) -> Self:

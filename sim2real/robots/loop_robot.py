@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from sim2real.graph.delays import DelayDistribution
@@ -14,6 +15,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.base import Datum, Robot, positive, tuple_of
@@ -21,6 +23,7 @@ from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, in_a_loop, simulated_loop
+from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
 
 
@@ -31,7 +34,11 @@ class LoopRobot(Robot):
         tick_s: The world's period [s].
         channels: What is measured of each joint.
         at_rest: The sensor's message of a robot at rest.
-        embedded: The robot inside the computer, for the port ``embedded``; None: there is none.
+        mounting: How the joints are mounted, in the order of the motors; empty: as the device measures and commands
+            them. All that the robot says and is told of its joints is on their side; see ``Rig``.
+        embedded: The robot inside the computer, for the port ``embedded``; None: there is none. Its plant knows joints
+            alone: they are mounted as ``mounting`` says.
+        encoder_zero_rad: What the embedded robot's encoders read, from count 0, where the device says 0 [rad].
         message: Makes the actuator's message from a command, shape ``(actions,)``.
         expected_delay_s: Computation delays of sensor, supervisor and actuator that phases allow for: a bus
             transaction, and a policy with its thread's wake-up [s].
@@ -42,7 +49,9 @@ class LoopRobot(Robot):
     tick_s: float
     channels: tuple[Channel, ...]
     at_rest: Any
+    mounting: tuple[Joint, ...] = ()
     embedded: Embedded | None = None
+    encoder_zero_rad: float = 0.0
     message: Callable[[Any], Any]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     delay_spread_s: float = 0.002
@@ -53,6 +62,7 @@ class LoopRobot(Robot):
         "tick_s": ("a number above 0 [s]", positive),
         "channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel)),
         "at_rest": ("a message of the sensor", lambda value: value is not None),
+        "mounting": ("a tuple of sim2real.hardware.joint.Joint", lambda value: value == () or tuple_of(Joint)(value)),
         "message": ("the type of the actuator's message", callable),
     }
 
@@ -69,17 +79,21 @@ class LoopRobot(Robot):
         """Return the policy's node, with options of ``BaseNode``."""
 
     @abstractmethod
-    def training_task(
-        self, agent: BaseNode, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> TrainingTask:
-        """Return the task of a policy.
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Return parameters of the nodes for a random episode of training: dynamics, delays, start, what it is about.
 
         Args:
-            agent: The policy's node.
-            values: Parameters by name.
-            draws: Samples of some parameters, each of shape ``(K,)``.
-            spread_s: By how much delays vary, either way [s].
+            key: JAX key.
+            draw: Draws dynamics and delays: key -> values by name.
         """
+
+    @abstractmethod
+    def reward(self, state: Any, action: jax.Array) -> jax.Array:
+        """Return the reward of a policy step, from the world's state after it and the action ``(actions,)``."""
+
+    @abstractmethod
+    def success(self, state: Any) -> jax.Array:
+        """Return whether a state of the world is one that the task wants, bool."""
 
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
@@ -137,7 +151,8 @@ class LoopRobot(Robot):
         def device(port: str) -> Device:
             return self.make_device(port, limits.servo_watchdog_s)
 
-        return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
+        twin = self.embedded and self.embedded.mounted(self.mounting, self.encoder_zero_rad)
+        return ServoSession(port, device, self.gate(limits), twin, truth_path, seed, self.mounting)
 
     def recording_nodes(self, session: ServoSession, signal: np.ndarray) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays commands, one row a step ``(N, actions)``."""
@@ -187,7 +202,7 @@ class LoopRobot(Robot):
         )
         agent, sensor = self.make_agent(**on_agent), SimSensor(roles.sensor, self.rate_hz, world, **on_sensor)
         nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
-        return nodes, self.training_task(agent, values, draws, self.delay_spread_s if delays else 0.0)
+        return nodes, LoopTask(self, agent, values, draws, self.delay_spread_s if delays else 0.0)
 
     def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
         """Return node parameters of the loop in simulation, from rest.

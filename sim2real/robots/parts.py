@@ -9,6 +9,7 @@ import numpy as np
 from sim2real.composer import mjcf
 from sim2real.composer.robot import Robot
 from sim2real.composer.task import Task
+from sim2real.hardware.joint import Joint
 from sim2real.robots.datasheet import DataSheet
 
 GOAL, REFERENCE = "goal", "reference"
@@ -20,30 +21,34 @@ class Servo(Robot):
     """A position-controlled servo: torque = gain * (setpoint - angle), limited to the stall torque.
 
     The joint's damping is back-EMF and viscous friction together. The driven part is attached to the site ``horn``.
+    A gear between servo and joint makes the joint slower and its torque larger; gain, damping and inertia grow by its
+    square.
 
     Args:
-        name: Name of the model.
+        name: Name of the model, or the joint with its gear.
         axis: Axis of rotation.
         sheet: The servo's data.
     """
 
-    def _build(self, name: str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
-        self._model = mjcf.RootElement(model=name)
+    def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
+        mounted = Joint.of(name)
+        gear = self.gear = mounted.gear
+        self._model = mjcf.RootElement(model=mounted.name)
         horn = self._model.worldbody.add("body", name="horn")
         self.joint = horn.add(
             "joint",
             name="joint",
             axis=axis,
-            damping=sheet.damping,
-            armature=sheet.armature,
-            frictionloss=sheet.friction,
+            damping=sheet.damping * gear**2,
+            armature=sheet.armature * gear**2,
+            frictionloss=sheet.friction * gear,
         )
         self.horn = horn.add("site", name="horn")
-        most = (-sheet.stall, sheet.stall)
+        most = (-sheet.stall * gear, sheet.stall * gear)
         self.actuator = self._model.actuator.add(
-            "position", name="motor", joint=self.joint, kp=sheet.gain, forcerange=most, forcelimited=True
+            "position", name="motor", joint=self.joint, kp=sheet.gain * gear**2, forcerange=most, forcelimited=True
         )
-        self.profile_rad_s = sheet.profile_rad_s
+        self.profile_rad_s = sheet.profile_rad_s / gear
 
     @property
     def mjcf_model(self) -> Any:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -13,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import SafetyStop
+from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.joint import Joint
 from sim2real.hardware.planned import BusEmulation
 from sim2real.hardware.registry import load_device
 from sim2real.identify.model import Channel
@@ -25,50 +27,16 @@ from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
-from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import GoalTask
+from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
-from sim2real.robots.training import ServoTask
+from sim2real.robots.training import Draw
 
 _AT_HOME_RAD, _HOME_RAD_S, _HOLD_S = 0.1, 1.0, 0.5
-
-
-@dataclass(frozen=True)
-class Servos:
-    """The servos on the bus, in the order of the joints.
-
-    Attributes:
-        joints: Names.
-        ids: Numbers on the bus.
-        low: Lowest goals [rad].
-        high: Highest goals [rad].
-        sheet: What their data sheet says, and how they are set up.
-        speed: The fastest that a policy moves goals [rad/s].
-        rest: Where the joints hang without torque [rad]; default: 0.
-        rest_tolerance: How far from there an episode may start [rad].
-        baud_rate: Of the bus.
-        device: Name of the device that they are; see `sim2real.hardware.registry`.
-    """
-
-    joints: tuple[str, ...]
-    ids: tuple[int, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    sheet: DataSheet
-    speed: float = 1.5
-    rest: tuple[float, ...] = ()
-    rest_tolerance: float = 0.4
-    baud_rate: int = 1_000_000
-    device: str = "dynamixel"
-
-    @property
-    def at_rest(self) -> np.ndarray:
-        """Where the joints hang without torque, ``(joints,)`` [rad]."""
-        return np.asarray(self.rest or np.zeros(len(self.joints)), np.float64)
 
 
 class ServoRobot(LoopRobot):
@@ -87,6 +55,7 @@ class ServoRobot(LoopRobot):
     command = "goal"
     message = Goals
     expected_delay_s = (0.004, 0.003, 0.002)
+    encoder_zero_rad = math.pi
 
     servos: Servos
     aim: tuple[tuple[str, str], ...] = ()
@@ -104,10 +73,6 @@ class ServoRobot(LoopRobot):
     @abstractmethod
     def draw_aim(self, key: jax.Array) -> jax.Array:
         """Return the aim of an episode, ``(k,)``."""
-
-    @abstractmethod
-    def success(self, state: Any) -> jax.Array:
-        """Return whether a state of the composed world is one that the task wants, bool."""
 
     def aim_fields(self, task: Any) -> Mapping[str, tuple[Any, str]]:
         """Return where an aim stands in the model: name -> (elements, attribute)."""
@@ -143,7 +108,8 @@ class ServoRobot(LoopRobot):
         s, task = self.servos, self.task
         arguments = {
             "mjcf": task.root_entity.mjcf_model.root_model.to_xml_string(),
-            "joints": {name: j.full_identifier for name, j in zip(s.joints, task.joints, strict=True)},
+            "joints": {name: j.full_identifier for name, j in zip(s.names, task.joints, strict=True)},
+            "gears": [joint.gear for joint in s.mounting],
             "servo_ids": s.ids,
             "p_gain": s.sheet.p_gain,
             "factors": factors,
@@ -162,6 +128,11 @@ class ServoRobot(LoopRobot):
     # -- what the stages ask
 
     @property
+    def mounting(self) -> tuple[Joint, ...]:
+        """How the joints are mounted."""
+        return self.servos.mounting
+
+    @property
     def units(self) -> dict[str, str]:
         """Field of a message -> its unit."""
         of_aim = {f"aim[{i}]": unit for i, (_, unit) in enumerate(self.aim)}
@@ -170,7 +141,7 @@ class ServoRobot(LoopRobot):
     @property
     def joints(self) -> dict[str, dict[str, str]]:
         """For the log: which fields are which joint's."""
-        rows = enumerate(self.servos.joints)
+        rows = enumerate(self.servos.names)
         return {j: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, j in rows}
 
     @property
@@ -192,19 +163,29 @@ class ServoRobot(LoopRobot):
     def action(self) -> tuple[ActionTerm, ...]:
         """The policy's actions, as fast as goals may go, either way [rad/s]."""
         speed = self.servos.speed
-        return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.joints)
+        return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.names)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """Position and velocity of each joint."""
         sigmas = self.position_sigma_rad, self.velocity_sigma_rad_s
-        rows = enumerate(self.servos.joints)
+        rows = enumerate(self.servos.names)
         return tuple(Channel("position", "velocity", *sigmas, index=i, label=j, goal="goal") for i, j in rows)
 
     @cached_property
     def task(self) -> GoalTask:
-        """The composed task of this robot's world."""
-        return self.make_task()
+        """The composed task of this robot's world.
+
+        Raises:
+            UsageError: Its servos have other gears than the joints.
+        """
+        task, joints = self.make_task(), self.servos.mounting
+        if (built := [s.gear for s in task.robot.servos]) != (said := [j.gear for j in joints]):
+            raise UsageError(
+                f"the model's servos have the gears {built}, the joints {said}",
+                hint="make each part of its joint: `Servo(joint, axis, sheet)`, not of the joint's name",
+            )
+        return task
 
     @property
     def tick_s(self) -> float:
@@ -227,11 +208,19 @@ class ServoRobot(LoopRobot):
             roles.supervisor, self.rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
         )
 
-    def training_task(
-        self, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> ServoTask:
-        """Return the task of a policy, see ``LoopRobot``."""
-        return ServoTask(self, agent, values, draws, spread_s)
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Draw an episode: half of the starts are at rest, half at any position.
+
+        Args:
+            key: JAX key.
+            draw: Draws dynamics and delays: key -> values by name.
+        """
+        k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
+        drawn, s = draw(k_values), self.servos
+        low, high, rest = (jnp.asarray(x, jnp.float32) for x in (s.low, s.high, s.at_rest))
+        anywhere = jax.random.uniform(k_start, low.shape, minval=low, maxval=high)
+        start = jnp.where(jax.random.bernoulli(k_where), rest, anywhere)
+        return self.node_params(drawn, start, jnp.zeros_like(start), self.draw_aim(k_aim))
 
     def node_params(
         self, values: Mapping[str, Any], position: Any, velocity: Any, aim: Any, policy: Any = None
@@ -287,7 +276,7 @@ class ServoRobot(LoopRobot):
             limits.max_speed_rad_s,
             stale="hold",
             node=self.roles.actuator,
-            joints=s.joints,
+            joints=s.names,
             stuck_effort=limits.stuck_effort,
         )
 
@@ -315,7 +304,7 @@ class ServoRobot(LoopRobot):
         worst = int(np.argmax(off))
         if off[worst] > self.servos.rest_tolerance:
             raise SafetyStop(
-                f"joint {self.servos.joints[worst]!r} rests at {position[worst]:.2f} rad, "
+                f"joint {self.servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
                 f"not within {self.servos.rest_tolerance:g} rad of {self.servos.at_rest[worst]:g} rad",
                 hint="free it, or check the zero of its encoder",
             )

@@ -1,24 +1,53 @@
-"""The training task of a servo robot: a composed task with random dynamics, delays and starts."""
+"""The training task of a robot in a loop: random dynamics, delays and starts, and what the robot says of its states."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
-from sim2real.robots.agent import GoalAgent
+from sim2real.policy.contract import ActionTerm
 from sim2real.robots.loop import draw_values
+from sim2real.robots.roles import Roles
 
-if TYPE_CHECKING:
-    from sim2real.robots.servo_robot import ServoRobot
+Draw = Callable[[jax.Array], dict[str, Any]]
+"""Draws dynamics and delays of an episode, by name."""
 
 
-class ServoTask:
-    """The training task of a servo robot; see ``sim2real.train.env.TrainingTask``.
+class TrainableLoop(Protocol):
+    """What a task asks of its robot; see ``LoopRobot``."""
+
+    roles: Roles
+
+    @property
+    def action(self) -> tuple[ActionTerm, ...]:
+        """The policy's actions, with their bounds."""
+        ...
+
+    @property
+    def observation_size(self) -> int:
+        """Number of entries of the policy's observation."""
+        ...
+
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
+        """Return parameters of the nodes for a random episode."""
+        ...
+
+    def reward(self, state: Any, action: jax.Array) -> jax.Array:
+        """Return the reward of a policy step."""
+        ...
+
+    def success(self, state: Any) -> jax.Array:
+        """Return whether a state of the world is one that the task wants, bool."""
+        ...
+
+
+class LoopTask:
+    """The training task of a robot in a loop; see ``sim2real.train.env.TrainingTask``.
 
     Args:
         robot: The robot.
@@ -31,8 +60,8 @@ class ServoTask:
 
     def __init__(
         self,
-        robot: ServoRobot,
-        agent: GoalAgent,
+        robot: TrainableLoop,
+        agent: Any,
         values: Mapping[str, float],
         draws: Mapping[str, np.ndarray],
         delay_spread_s: float,
@@ -42,18 +71,11 @@ class ServoTask:
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.delay_spread_s = delay_spread_s
         self.observation_size = robot.observation_size
-        speed = np.full(len(robot.servos.joints), robot.servos.speed, np.float32)
-        self.action_low, self.action_high = -speed, speed
+        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.action], np.float32).T
 
     def params(self, key: jax.Array) -> dict[str, Any]:
-        """Draw dynamics, delays, aim and start of an episode: half of the starts are at rest, half at any position."""
-        k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
-        drawn = draw_values(k_values, self.values, self.draws, self.delay_spread_s)
-        servos = self.robot.servos
-        low, high, rest = (jnp.asarray(x, jnp.float32) for x in (servos.low, servos.high, servos.at_rest))
-        anywhere = jax.random.uniform(k_start, low.shape, minval=low, maxval=high)
-        start = jnp.where(jax.random.bernoulli(k_where), rest, anywhere)
-        return self.robot.node_params(drawn, start, jnp.zeros_like(start), self.robot.draw_aim(k_aim))
+        """Draw the parameters of an episode."""
+        return self.robot.random_params(key, self._draw)
 
     def observe(self, step_state: StepState) -> jax.Array:
         """Return the policy's observation, made by the agent's node."""
@@ -70,3 +92,6 @@ class ServoTask:
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
         return self.robot.success(graph_state.state[self.robot.roles.world])
+
+    def _draw(self, key: jax.Array) -> dict[str, Any]:
+        return draw_values(key, self.values, self.draws, self.delay_spread_s)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from flax import struct
 
-from sim2real.graph.base import Base
+from sim2real.graph.base import Base, GraphState
 from sim2real.worlds.friction import stopped
 from sim2real.worlds.stepped import SteppedWorld
 
@@ -42,6 +42,9 @@ class Forces(NamedTuple):
 class JointWorld(SteppedWorld):
     """Joints integrated by position Verlet, with implicit damping (trapezoidal rule) and exact dry friction.
 
+    The parameters' ``start`` has the initial positions, then the velocities: shape ``(2,)`` for one joint, whose state
+    are numbers, or ``(2 * joints,)``.
+
     Forces are evaluated at the middle of a substep. The method is of second order as long as no joint sticks and only
     damping depends on the velocity. With semi-implicit Euler, an identified delay is biased by half a substep.
 
@@ -58,6 +61,12 @@ class JointWorld(SteppedWorld):
         self, name: str, rate: float, substep_s: float = 0.005, color: str | None = None, order: int | None = None
     ) -> None:
         super().__init__(name, rate, substep_s, color=color, order=order)
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+        """Return the initial positions and velocities that the parameters name."""
+        start = ((graph_state or GraphState()).params.get(self.name) or self.init_params(rng)).start
+        half = len(start) // 2
+        return JointState(start[0], start[1]) if half == 1 else JointState(start[:half], start[half:])
 
     @abstractmethod
     def forces(self, params: Any, position: Any, velocity: Any, command: Any) -> Forces:

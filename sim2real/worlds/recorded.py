@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
-from sim2real.graph.base import Base, GraphState
+from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.worlds.encoder import Encoder
 
 
 @struct.dataclass
@@ -44,6 +47,35 @@ class RecordedActuator(BaseNode):
         """Return the command that the node was made with."""
         del rng, graph_state
         return jax.tree_util.tree_map(lambda leaf: leaf, self._message)
+
+
+class RecordedSensor(BaseNode):
+    """The node that measured one joint: shows the world's position, as an encoder reads it.
+
+    Args:
+        name: Unique in the graph.
+        rate: Samples per second [Hz].
+        message: Makes a message from positions.
+        encoder: The encoder; its parameters may be identified. None: positions are shown as they are.
+    """
+
+    def __init__(self, name: str, rate: float, message: Callable[[Any], Any], encoder: Encoder | None = None) -> None:
+        super().__init__(name, rate)
+        self._message, self._encoder = message, encoder
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the encoder."""
+        return self._encoder or super().init_params(rng, graph_state)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the message of a position of 0."""
+        del rng, graph_state
+        return self._message(jnp.float32(0.0))
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Read."""
+        position = step_state.inputs["world"][-1].data.position
+        return step_state, self._message(step_state.params.read(position) if self._encoder else position)
 
 
 def command_delay(graph_state: GraphState | None, actuator: str = "actuator") -> dict[str, Any]:

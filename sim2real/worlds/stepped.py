@@ -11,12 +11,15 @@ import jax
 import jax.numpy as jnp
 
 from sim2real.errors import UsageError
-from sim2real.graph.base import StepState
+from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseWorld
+from sim2real.worlds.recorded import command_delay
 
 
 class SteppedWorld(BaseWorld):
     """Base class of worlds that divide a tick into substeps; subclasses integrate.
+
+    If the parameters of the node ``actuator`` have a ``delay``, it is that of its commands.
 
     Args:
         name: Unique in the graph.
@@ -52,6 +55,17 @@ class SteppedWorld(BaseWorld):
         """Return the message that leaves at the end of the tick; default: the state."""
         del params
         return state
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the output of the initial state: what a sensor sees before the first tick has ended."""
+        gs = graph_state or GraphState()
+        state = gs.state.get(self.name) or self.init_state(rng, graph_state)
+        return self.output(gs.params.get(self.name) or self.init_params(rng), state)
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the delay of the commands, where the actuator's parameters set one."""
+        del rng
+        return command_delay(graph_state)
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Integrate over one tick."""

@@ -20,9 +20,9 @@ VALUES = {"gain": 4.2, "damping": 0.15, "armature": 0.008, "friction_left": 0.03
 
 
 class Pair(ServoDriven):
-    def _build(self, sheet, name="pair"):
+    def _build(self, sheet, joints, name="pair"):
         self._model = mjcf.RootElement(model=name)
-        self.servos = tuple(Servo(n, (0.0, 1.0, 0.0), sheet) for n in ("left", "right"))
+        self.servos = tuple(Servo(joint, (0.0, 1.0, 0.0), sheet) for joint in joints)
         for servo, y, mass in zip(self.servos, (-0.1, 0.1), (0.05, 0.1), strict=True):
             servo.joint.parent.add("inertial", pos=(0, 0, -0.1), mass=mass, diaginertia=[1e-4] * 3)
             self.attach(servo, self._model.worldbody.add("site", name=f"at_{servo.mjcf_model.model}", pos=(0, y, 0)))
@@ -35,8 +35,8 @@ class Pair(ServoDriven):
 class PairTask(GoalTask):
     """Stay at 0."""
 
-    def __init__(self, **sheet):
-        self.robot, self._arena = Pair(replace(SHEET, **sheet)), composer.Arena("stand")
+    def __init__(self, joints=("left", "right"), **sheet):
+        self.robot, self._arena = Pair(replace(SHEET, **sheet), joints), composer.Arena("stand")
         option = self._arena.mjcf_model.option
         option.integrator, option.flag.contact = "implicitfast", "disable"
         option.iterations, option.ls_iterations = 4, 8

@@ -7,8 +7,8 @@ import pytest
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.testing import NodeConformance
-from sim2real.robots.agent import AgentParams, GoalAgent
-from sim2real.robots.messages import JointReading
+from sim2real.robots.agent import AgentParams, DirectAgent, GoalAgent
+from sim2real.robots.messages import Goals, JointReading
 
 LOW, HIGH, RATE_HZ = np.array([-1.0, -0.5]), np.array([0.8, 1.2]), 50.0
 AIM, START = np.array([0.25, -0.5, 2.0]), np.array([0.1, -0.2])
@@ -127,3 +127,21 @@ def test_it_asks_the_policy_and_without_one_goals_stay():
     np.testing.assert_array_equal(policy.shown[0], agent.observe(now))
     _, decision = agent.step(now.replace(params=now.params.replace(policy=None)))
     np.testing.assert_allclose(decision.goal, START, atol=1e-7)
+
+
+def test_a_direct_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_before():
+    agent = DirectAgent("agent", RATE_HZ, lambda m: m.position * 10.0, (2, 1), 2, Goals)
+    policy = Push(jnp.array([0.5]))
+    state, sent = agent.init_state(), []
+    for k in range(3):
+        one = jnp.zeros(1)
+        reading = JointReading(jnp.array([[k, -k]], jnp.float32), jnp.zeros((1, 2)))
+        heard = {"sensor": InputState(one.astype(int), one, one, reading)}
+        policy.action = jnp.array([0.5 + k])
+        made = agent.step(StepState(state=state, params=AgentParams(policy=policy), inputs=heard))
+        state = made[0].state
+        sent.append(float(made[1].goal[0]))
+    assert sent == [0.5, 1.5, 2.5]
+    np.testing.assert_array_equal(policy.shown[0], np.zeros(8))
+    np.testing.assert_array_equal(policy.shown[2], [20, -20, 10, -10, 0, 0, 1.5, 0.5])
+    np.testing.assert_array_equal(agent.init_output().goal, [0.0])

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim2real.policy import ActionTerm
 from sim2real.robots import testing
 from sim2real.robots.roles import Roles
 from sim2real.stages.pipeline import load_pipeline
@@ -24,6 +23,12 @@ def changed(**changes):
     return type("Changed", (type(load_pipeline("pendulum").load()),), changes)()
 
 
+def too_strong(robot, values, draws, computation, delays):
+    nodes, task = super(type(robot), robot).training(values, draws, computation, delays)
+    task.action_high = 2.0 * task.action_high
+    return nodes, task
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -31,7 +36,7 @@ def changed(**changes):
         ({"roles": Roles(world="plant")}, "nodes of the model: there are .* but not plant"),
         ({"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
         ({"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
-        ({"action": (ActionTerm("voltage", "V", -1.0, 1.0),)}, "go beyond what the robot bears"),
+        ({"training": too_strong}, "go beyond what the robot bears"),
     ],
 )
 def test_who_does_not_fit_is_noticed(changes, said, tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.joints import Joint
+from sim2real.hardware.joint import Joint
 
 ENCODER_RAD = np.linspace(-3.0, 4.0, 29)
 
@@ -19,6 +19,14 @@ def test_there_and_back(direction, gear):
     assert joint.angle(0.7) == 0.0
     assert np.all(np.sign(np.diff(angles)) == direction)
     assert np.ptp(angles) == pytest.approx(7.0 / gear)
+
+
+def test_a_name_stands_for_a_joint_that_turns_with_its_encoder():
+    assert Joint.of("hinge") == Joint("hinge", 0.0, 1, 1.0)
+    assert Joint.of("hinge").is_plain
+    geared = Joint("hinge", gear=2.0)
+    assert Joint.of(geared) is geared
+    assert not any(joint.is_plain for joint in (geared, Joint("a", 0.1), Joint("a", direction=-1)))
 
 
 def test_a_joint_on_its_motor_changes_no_bit():

@@ -1,0 +1,131 @@
+"""How joints are mounted on their motors: between what an encoder reads and a command does, and the joint's side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.hardware.device import Device, Reading
+
+_POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0}
+"""Unit -> power of the gear by which the motor's value is the larger one: it turns faster, with less torque."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint, and what is between it and the encoder of its motor.
+
+    Attributes:
+        name: Its name.
+        zero_rad: What the encoder reads, as the device tells it, where the joint's angle is 0 [rad].
+        direction: 1 where both turn the same way, -1 where they turn against each other.
+        gear: Turns of the encoder for one of the joint.
+    """
+
+    name: str
+    zero_rad: float = 0.0
+    direction: int = 1
+    gear: float = 1.0
+
+    @classmethod
+    def of(cls, joint: Joint | str) -> Joint:
+        """Return a joint; a name stands for one that turns with its encoder."""
+        return joint if isinstance(joint, Joint) else cls(joint)
+
+    def __post_init__(self) -> None:
+        """Check that angles can be converted both ways."""
+        if self.direction not in (1, -1):
+            raise UsageError(f"joint {self.name!r}: direction = {self.direction!r} is neither 1 nor -1")
+        if not (math.isfinite(self.gear) and self.gear > 0):
+            raise UsageError(
+                f"joint {self.name!r}: gear = {self.gear!r} is not a number above 0",
+                hint="direction = -1 says that encoder and joint turn against each other",
+            )
+        if not math.isfinite(self.zero_rad):
+            raise UsageError(f"joint {self.name!r}: zero_rad = {self.zero_rad!r} is not a finite angle")
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the joint's angle is the encoder's."""
+        return self.zero_rad == 0.0 and self.direction == 1 and self.gear == 1.0
+
+    def angle(self, encoder_rad: Any) -> Any:
+        """Return the joint's angle [rad] for an encoder's, of any shape."""
+        return self.direction * (encoder_rad - self.zero_rad) / self.gear
+
+    def encoder(self, angle_rad: Any) -> Any:
+        """Return what the encoder reads [rad] at an angle of the joint, of any shape."""
+        return self.zero_rad + self.direction * self.gear * angle_rad
+
+    def speed(self, encoder_rad_s: Any) -> Any:
+        """Return the joint's speed [rad/s] for the encoder's, of any shape."""
+        return self.direction * encoder_rad_s / self.gear
+
+
+class Mounting:
+    """The mountings of all joints of a device: what is said and measured at the joints, and at the motors.
+
+    An angle of a joint is that of `Joint.angle`. A command is an angle, a speed, a torque, or what drives the motor, by
+    its unit: `V`, `A` or `1` change their sign alone. Gears are taken to lose nothing.
+
+    Args:
+        joints: One per motor, in the device's order; none: each turns with its encoder.
+        device: The device; it need not be open.
+
+    Raises:
+        UsageError: There is another number of joints than of motors, or nobody knows what a gear or a direction does to
+            the unit of the device's commands or loads.
+    """
+
+    def __init__(self, joints: Sequence[Joint], device: Device) -> None:
+        own = tuple(joints) or tuple(Joint(name) for name in device.motors)
+        if len(own) != len(device.motors):
+            names = ", ".join(joint.name for joint in own)
+            raise UsageError(f"there are {len(own)} joints ({names}) for {len(device.motors)} motors")
+        kind = device.commanded
+        rows = np.array([(joint.zero_rad, joint.direction, joint.gear) for joint in own], np.float64)
+        self._zero, direction, gear = rows.reshape(-1, 3).T
+        self._turns = direction * gear
+        plain = all(joint.is_plain for joint in own)
+        self._factor, self._load = (
+            np.ones(len(own)) if plain else direction * gear ** _power(unit, what)
+            for unit, what in ((kind.unit, kind.name), (device.measures.get("load", "1"), "loads"))
+        )
+        self._offset = self._zero if kind.unit == "rad" else np.zeros(len(own))
+
+    def to_motors(self, command: np.ndarray) -> np.ndarray:
+        """Return the device's command for one of the joints, ``(n,)``."""
+        return self._offset + self._factor * command
+
+    def to_joints(self, command: np.ndarray) -> np.ndarray:
+        """Return the joints' command that the device's stands for, ``(n,)``."""
+        return (command - self._offset) / self._factor
+
+    def limits(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest command of the joints between the device's, each ``(n,)``."""
+        ends = self.to_joints(low), self.to_joints(high)
+        return np.minimum(*ends), np.maximum(*ends)  # turned round where joint and motor turn against each other
+
+    def reading(self, reading: Reading) -> Reading:
+        """Return angles, speeds and loads of the joints for those of the motors."""
+        return replace(
+            reading,
+            position_rad=(reading.position_rad - self._zero) / self._turns,
+            velocity_rad_s=reading.velocity_rad_s / self._turns,
+            load=reading.load / self._load,
+        )
+
+
+def _power(unit: str, what: str) -> int:
+    if unit not in _POWER_OF_GEAR:
+        raise UsageError(
+            f"{what} in {unit!r} cannot be converted between motors and joints with a zero, a direction or a gear. "
+            f"Units: {', '.join(_POWER_OF_GEAR)}",
+            hint="have the device convert them, and leave its joints plain",
+        )
+    return _POWER_OF_GEAR[unit]
