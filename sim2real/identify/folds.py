@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -12,9 +13,9 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify import terms
-from sim2real.identify.fit import Fit, as_numbers
+from sim2real.identify.fit import Fit
 from sim2real.identify.prediction import labels
-from sim2real.identify.problem import Data, Problem
+from sim2real.identify.problem import Problem
 from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import linearise
@@ -36,7 +37,10 @@ class Fold:
         """Return which segments of a length share time with this part, ``(S,)``, bool."""
         return np.array(
             [
-                any(r == s.recording and s.begin_s < end and begin < s.begin_s + length_s for r, begin, end in self.parts)
+                any(
+                    r == s.recording and s.begin_s < end and begin < s.begin_s + length_s
+                    for r, begin, end in self.parts
+                )
                 for s in spans
             ]
         )
@@ -82,7 +86,7 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = ()) -> list[F
         found = [Fold(name, tuple((r, 0.0, np.inf) for r in own)) for name, own in groups.items()]
     else:
         edges = np.linspace(begin, end, blocks + 1)
-        found = [Fold(f"{a:.0f} to {b:.0f} s", ((recordings[0], a, b),)) for a, b in zip(edges, edges[1:], strict=False)]
+        found = [Fold(f"{a:.0f} to {b:.0f} s", ((recordings[0], a, b),)) for a, b in pairwise(edges)]
     counts = [int(f.touches(spans, problem.segment_s).sum()) for f in found]
     if len(found) < 2 or min(counts) == 0 or max(counts) == len(spans):
         raise UsageError(
@@ -90,6 +94,12 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = ()) -> list[F
             hint="fewer --folds, a longer recording, or shorter segments",
         )
     return found
+
+
+def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
+    """Return which fitted segments share time with each part, ``(K, S)``, bool."""
+    spans = [problem.spans[i] for i in problem.train]
+    return np.array([p.touches(spans, problem.segment_s) for p in parts])
 
 
 def leave_out(
@@ -106,16 +116,14 @@ def leave_out(
         free_run_s: Longest stretch that is simulated in one go [s]; 0 leaves it out.
     """
     problem, table = found.problem, found.problem.table
-    spans = [problem.spans[i] for i in problem.train]
-    masks = np.array([p.touches(spans, problem.segment_s) for p in parts])
-    stats = terms.statistics(problem, linearise(problem, found.z), masks) if choose else None
+    touched = masks(problem, parts)
+    stats = terms.statistics(problem, linearise(problem, found.z), touched)
     values, kept = [], []
-    for k, mask in enumerate(masks):
-        own = np.ones(len(table.terms), bool) if stats is None else terms.choose(stats.without(k), table).kept
-        weight = np.ones(problem.segments, np.float32)
-        weight[problem.train[mask]] = 0.0
-        data = Data(problem.data.measured, problem.data.starts, jnp.asarray(weight), jnp.asarray(own))
-        z = refine(problem, found.z[None], steps, 1, data=data).z
+    for k, mask in enumerate(touched):
+        own = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
+        # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
+        start = table.at_scale(stats.x + stats.step(table, own, k))
+        z = refine(problem, start[None], steps, 1, data=problem.part(problem.train[mask], own)).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, own, strict=True) if there))
     stacked = {n: jnp.stack([jnp.asarray(v[n], jnp.float32) for v in values]) for n in values[0]}
@@ -124,11 +132,11 @@ def leave_out(
     return [LeftOut(*row) for row in zip(parts, values, kept, ahead, free, strict=True)]
 
 
-def _ahead(windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float) -> list[dict[str, float]]:
+def _ahead(
+    windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float
+) -> list[dict[str, float]]:
     """Return the errors of the windows of each part, predicted from the first part of each."""
-    spans = [windows.spans[i] for i in windows.train]
-    masks = np.array([p.touches(spans, windows.segment_s) for p in parts])
-    fold, segment = np.nonzero(masks)
+    fold, segment = np.nonzero(masks(windows, parts))
     errors = _predicted(windows, stacked, fold, windows.train[segment], settle_s)
     return [_rmse(windows, [e for e, k in zip(errors, fold, strict=True) if k == own]) for own in range(len(parts))]
 

@@ -247,7 +247,11 @@ class ParameterTable:
         at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(own, self.columns, strict=True)]
         inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
         x = np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)])
-        share = np.clip((x - self._low) / (self._high - self._low), 1e-3, 1 - 1e-3)
+        return self.at_scale(x)
+
+    def at_scale(self, x: np.ndarray) -> np.ndarray:
+        """Return the unbounded vector ``(P,)`` for a point on the parameters' scales, just inside their bounds."""
+        share = np.clip((x - self._low) / self.span, 1e-3, 1 - 1e-3)
         return np.log(share / (1 - share))
 
     def posterior(self, z: np.ndarray, covariance: np.ndarray) -> Posterior:

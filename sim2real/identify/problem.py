@@ -341,6 +341,18 @@ class Problem:
         other.programs = {}
         return other
 
+    def part(self, left_out: Any = (), kept: Any = None) -> Data:
+        """Return what is fitted without some segments, and with some of the table's terms.
+
+        Args:
+            left_out: Numbers of the segments that do not count.
+            kept: Shape ``(T,)``, bool: which terms are part of the model; default: all.
+        """
+        weight = np.ones(self.segments, np.float32)
+        weight[np.asarray(left_out, int)] = 0.0
+        kept = np.ones(len(self.table.terms), bool) if kept is None else np.asarray(kept)
+        return self.data._replace(weight=jnp.asarray(weight), kept=jnp.asarray(kept))
+
     def cut_anew(self, spans: Sequence[Span], length_s: float) -> Problem:
         """Return the same recordings, cut into other segments [s]."""
         return Problem(self.model, self._recordings, spans, length_s, self.config, self.table)

@@ -62,11 +62,9 @@ def refine(
         Sim2RealError: When no start has a finite loss.
     """
     improve = problem.programs.setdefault(("improve", steps), _program(problem, steps))
-    if data is None:
-        full_loss = problem.programs.setdefault("alone", jax.jit(lambda z: problem.losses(z[None], z)[0]))
-    else:
-        of_data = problem.programs.setdefault("of data", jax.jit(lambda z, d: problem.losses(z[None], z, data=d)[0]))
-        full_loss = functools.partial(of_data, d=data)
+    data = data or problem.part()
+    of_data = problem.programs.setdefault("loss", jax.jit(lambda z, d: problem.losses(z[None], z, data=d)[0]))
+    full_loss = functools.partial(of_data, d=data)
     first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
     if not np.isfinite(first).any():
         raise Sim2RealError(
@@ -93,14 +91,14 @@ def refine(
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
 
 
-def _program(problem: Problem, steps: int) -> Callable[[Any, Data | None], tuple[Any, Any]]:
+def _program(problem: Problem, steps: int) -> Callable[[Any, Data], tuple[Any, Any]]:
     """Return one round of Levenberg-Marquardt, compiled on its first call: ``z, data -> (z, steps taken)``."""
     import optimistix  # 0.5 s
 
     solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
-    def improve(z: Any, data: Data | None) -> tuple[Any, Any]:
+    def improve(z: Any, data: Data) -> tuple[Any, Any]:
         columns = problem.sensitivities(z, data=data)
 
         def weighed(y: Any) -> Any:

@@ -36,6 +36,28 @@ class Statistics:
     prior: np.ndarray
     count: np.ndarray
 
+    def step(self, table: ParameterTable, kept: np.ndarray, left_out: int | None = None) -> np.ndarray:
+        """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
+
+        Args:
+            table: The parameters.
+            kept: Shape ``(T,)``, bool: which terms are part of the model.
+            left_out: Number of the part that is left out; None: none is.
+        """
+        place = {name: i for i, name in enumerate(table.terms)}
+        step, gone = np.zeros(len(self.x)), np.zeros(len(self.x), bool)
+        for i, column in enumerate(table.columns):
+            p = column.parameter
+            if p.term and not kept[place[p.term]]:
+                gone[i] = True
+                step[i] = p.to_scale(min(max(p.without, p.low), p.high)) - self.x[i]
+        g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
+        if left_out is not None:
+            g, H = g - self.gradient[left_out], H - self.information[left_out]
+        rest = np.flatnonzero(~gone)
+        step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
+        return step
+
     def without(self, part: int) -> Statistics:
         """Return the same without one part."""
         rows = np.delete(np.arange(len(self.value)), part)
@@ -51,7 +73,7 @@ class Choice:
     Attributes:
         kept: Shape ``(T,)``, bool: which of the table's terms.
         order: The terms in the order in which they were left out, the least needed first.
-        excess: Shape ``(T + 1,)``: mean square on what was left out, over that of the best of these models, as the terms
+        excess: Shape ``(T + 1,)``: mean square on what was left out, over that of the best of these models, as terms
             are left out one after the other; the first entry is the widest model's.
         error: Shape ``(T + 1,)``: standard error of ``excess``.
     """
@@ -118,20 +140,9 @@ def choose(stats: Statistics, table: ParameterTable) -> Choice:
 
 def _left_out(stats: Statistics, table: ParameterTable, kept: np.ndarray) -> np.ndarray:
     """Return the mean square on each part when it is left out of the fit, ``(K,)``, for a model with some terms."""
-    place = {name: i for i, name in enumerate(table.terms)}
-    move = np.zeros(len(stats.x))
-    for i, column in enumerate(table.columns):
-        p = column.parameter
-        if p.term and not kept[place[p.term]]:
-            move[i] = p.to_scale(min(max(p.without, p.low), p.high)) - stats.x[i]
-    gone = np.array([bool(c.parameter.term) and not kept[place[c.parameter.term]] for c in table.columns])
-    rest = np.flatnonzero(~gone)
     found = []
-    gradient, information = stats.gradient.sum(axis=0), stats.information.sum(axis=0) + stats.prior
     for k in range(len(stats.value)):
-        g, H = gradient - stats.gradient[k], information - stats.information[k]
-        step = move.copy()
-        step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ move)[rest])
+        step = stats.step(table, kept, k)
         own = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
         found.append(own / stats.count[k])
     return np.array(found)
