@@ -222,6 +222,7 @@ class Left:
         name: The part.
         terms: Optional terms of the model that the rest of the data chose, or that it was given.
         values: Parameter -> estimate without the part.
+        share: Parameter -> share of what all recordings say about it that this part says.
         ahead: Field -> root mean square error up to the longest horizon.
         free: Field -> root mean square error where the part is simulated in one go; empty where it was not.
     """
@@ -229,6 +230,7 @@ class Left:
     name: str
     terms: tuple[str, ...]
     values: Mapping[str, Any]
+    share: Mapping[str, float]
     ahead: Mapping[str, float | None]
     free: Mapping[str, float | None] = field(default_factory=dict)
 

@@ -54,6 +54,7 @@ class LeftOut:
         fold: The part.
         values: The estimate without it, by name.
         kept: Names of the optional terms that the rest of the data chose.
+        share: Label of a free parameter -> share of what all recordings say about it that this part says, in [0, 1].
         ahead: Field -> root mean square error up to the horizon of the windows.
         free: Field -> root mean square error when the part is simulated in one go, from its first samples.
     """
@@ -61,6 +62,7 @@ class LeftOut:
     fold: Fold
     values: Mapping[str, Any]
     kept: tuple[str, ...]
+    share: Mapping[str, float]
     ahead: Mapping[str, float]
     free: Mapping[str, float]
 
@@ -127,9 +129,11 @@ def leave_out(
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, own, strict=True) if there))
     stacked = {n: jnp.stack([jnp.asarray(v[n], jnp.float32) for v in values]) for n in values[0]}
+    own = np.einsum("kpp->kp", stats.information)
+    shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
     ahead = _ahead(found.windows, parts, stacked, settle_s)
     free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
-    return [LeftOut(*row) for row in zip(parts, values, kept, ahead, free, strict=True)]
+    return [LeftOut(*row) for row in zip(parts, values, kept, shares, ahead, free, strict=True)]
 
 
 def _ahead(

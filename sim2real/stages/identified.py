@@ -17,6 +17,7 @@ from sim2real.artifacts.identification import (
     HeldOut,
     Identification,
     Judgement,
+    Left,
     Matrix,
     Refinement,
     Search,
@@ -51,10 +52,15 @@ class Findings:
     trip: RoundTrip | None
 
     @staticmethod
-    def of(fit: Fit) -> Findings:
-        """Compute how uncertain a fit is."""
+    def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
+        """Compute how uncertain a fit is.
+
+        Args:
+            fit: The fit.
+            without: What was identified without one part of the recordings or another.
+        """
         at = uncertainty.linearise(fit.problem, fit.z)
-        spread = uncertainty.from_linearised(fit.problem, at)
+        spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
         return Findings(fit, at.x, spread, check, round_trip(fit.problem.table, at.x, spread))
 

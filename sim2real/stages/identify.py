@@ -81,11 +81,11 @@ def identify(
         with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
             found = patiently(lambda: _fit(model, episodes, len(fitted), windows, again, table, told))
     with progress(None, "identify: errors, predictions and baselines"):
-        findings = patiently(lambda: identified.Findings.of(found))
+        without = patiently(lambda: left_out.examined(all_terms, config, names)) if config.folds else ()
+        findings = patiently(lambda: identified.Findings.of(found, without))
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
         document = identified.document(pipeline.name, findings, truth, time.monotonic() - begin)
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, table, found))
-        without = patiently(lambda: left_out.examined(all_terms, config, names)) if config.folds else ()
         document = replace(document, left_out=without, terms=terms)
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(

@@ -14,13 +14,15 @@ from sim2real.identify import terms
 from sim2real.identify.fit import Fit
 from sim2real.identify.folds import folds_of, leave_out, masks
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.uncertainty import linearise
+from sim2real.identify.uncertainty import Uncertainty, between_parts, linearise
 from sim2real.identify.verdict import Position
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note
 
 _LEAST = 4
 """Segments of which parts can be left out."""
+_FEWEST = 4
+"""Parts from which on they say how much estimates differ."""
 _STEPS = 8
 """Most steps of Levenberg-Marquardt for each part: it starts where the linearised residuals say."""
 
@@ -72,7 +74,24 @@ def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[
         return ()
     parts = folds_of(found.problem, min(config.folds, segments // 2), names)
     rows = leave_out(found, parts, config.settle_s, config.terms == "auto", _STEPS, config.free_run_s)
-    return tuple(Left(r.fold.name, r.kept, r.values, r.ahead, r.free) for r in rows)
+    return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
+
+
+def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[Left]) -> Uncertainty:
+    """Return an uncertainty that holds how much estimates differ without one part or another.
+
+    Args:
+        spread: What the fit alone says.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        rows: What was identified without each part.
+    """
+    if len(rows) < _FEWEST:
+        return spread
+    values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
+    moved = np.array([[c.parameter.to_scale(v) for c, v in zip(table.columns, own, strict=True)] for own in values])
+    share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
+    return between_parts(spread, table, x, moved, share)
 
 
 def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: float) -> list[str]:
