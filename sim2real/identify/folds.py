@@ -90,7 +90,7 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = ()) -> list[F
         edges = np.linspace(begin, end, blocks + 1)
         found = [Fold(f"{a:.0f} to {b:.0f} s", ((recordings[0], a, b),)) for a, b in pairwise(edges)]
     counts = [int(f.touches(spans, problem.segment_s).sum()) for f in found]
-    if len(found) < 2 or min(counts) == 0 or max(counts) == len(spans):
+    if not 2 <= len(found) <= len(spans) or min(counts) == 0 or max(counts) == len(spans):
         raise UsageError(
             f"{len(spans)} segments of {problem.segment_s:g} s cannot be divided into {len(found)} parts to leave out",
             hint="fewer --folds, a longer recording, or shorter segments",
