@@ -215,6 +215,27 @@ class Quantity:
 
 
 @dataclass(frozen=True)
+class Left:
+    """What was identified without one part of the recordings, and how far it is off there.
+
+    Attributes:
+        name: The part.
+        terms: Optional terms of the model that the rest of the data chose, or that it was given.
+        values: Parameter -> estimate without the part.
+        share: Parameter -> share of what all recordings say about it that this part says.
+        ahead: Field -> root mean square error up to the longest horizon.
+        free: Field -> root mean square error where the part is simulated in one go; empty where it was not.
+    """
+
+    name: str
+    terms: tuple[str, ...]
+    values: Mapping[str, Any]
+    share: Mapping[str, float]
+    ahead: Mapping[str, float | None]
+    free: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Identification:
     """What identify found.
 
@@ -233,6 +254,8 @@ class Identification:
         held_out: Errors of each position on held-out data, the worst first.
         free_run: Errors of the free runs.
         aggregate: Each recording identified by itself, and all combined; empty unless that was asked for.
+        left_out: What was identified with one part left out, for each part; empty where that was not asked for.
+        terms: Optional terms of the model that were chosen, or given; None where it has none.
         segments: How many segments were simulated.
         held_out_from_s: Where the first segment that was held out begins [s].
         settle_s: Length of the first part of a held-out segment, to which its initial state was fitted [s].
@@ -260,6 +283,8 @@ class Identification:
     held_out: tuple[HeldOut, ...] = ()
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
+    left_out: tuple[Left, ...] = ()
+    terms: tuple[str, ...] | None = None
     segments: int | None = None
     held_out_from_s: float | None = None
     settle_s: float = 0.0

@@ -34,6 +34,8 @@ class Parameter:
         per_recording: Whether each recording has a value of its own.
         free: Whether it is identified; else it stays at ``nominal``.
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
+        term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": of none.
+        off: Its value where that term is left out; default: the nominal one.
     """
 
     name: str
@@ -49,6 +51,8 @@ class Parameter:
     per_recording: bool = False
     free: bool = True
     side: Literal["", "command", "measurement"] = ""
+    term: str = ""
+    off: float | None = None
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -64,6 +68,11 @@ class Parameter:
             )
         if self.transform == "logit" and not 0.0 < self.low < self.high < 1.0:
             raise UsageError(f"parameter {self.name!r}: a logit scale needs bounds within (0, 1)")
+        if self.off is not None and not (self.term and math.isfinite(self.off)):
+            raise UsageError(
+                f"parameter {self.name!r}: off = {self.off} is what it is where its term {self.term!r} is left out",
+                hint="name the term, and a finite value",
+            )
         if self.prior is not None and not callable(getattr(self.prior, "log_prob", None)):
             raise UsageError(
                 f"parameter {self.name!r}: the prior {self.prior!r} has no log_prob",
@@ -74,6 +83,11 @@ class Parameter:
                 f"parameter {self.name!r}: the prior {type(self.prior).__name__} has no single, finite mode",
                 hint="leave the prior out for a uniform one: the bounds are that",
             )
+
+    @property
+    def without(self) -> float:
+        """Its value where its term is left out."""
+        return self.nominal if self.off is None else self.off
 
     def to_scale(self, value: float) -> float:
         """Return where a value stands on the parameter's scale."""
@@ -169,12 +183,41 @@ class ParameterTable:
             changed[name] = p
         return ParameterTable(changed.values(), self.recordings)
 
-    def decode(self, z: Any) -> dict[str, Any]:
-        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable."""
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the optional terms that have free parameters, in the order of the table."""
+        return tuple(dict.fromkeys(c.parameter.term for c in self.columns if c.parameter.term))
+
+    def with_terms(self, names: Iterable[str]) -> ParameterTable:
+        """Return the table with some optional terms; the parameters of all others are held at what they are without.
+
+        Raises:
+            UsageError: When there is no such term.
+        """
+        names = set(names)
+        known = dict.fromkeys(p.term for p in self.parameters if p.term)
+        if unknown := sorted(names - set(known)):
+            raise UsageError(f"unknown term {unknown[0]!r}. Available: {', '.join(known) or 'none'}")
+        rows = (
+            p if not p.term else replace(p, free=True) if p.term in names else replace(p, nominal=p.without, free=False)
+            for p in self.parameters
+        )
+        return ParameterTable(rows, self.recordings)
+
+    def decode(self, z: Any, kept: Any = None) -> dict[str, Any]:
+        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable.
+
+        Args:
+            z: The vector.
+            kept: Shape ``(T,)``, bool: which of ``terms`` are part of the model; default: all.
+        """
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
         found: dict[str, list[Any]] = {}
         for i, c in enumerate(self.columns):
-            found.setdefault(c.parameter.name, []).append(from_scale(c.parameter.transform, x[i], jnp))
+            p, value = c.parameter, from_scale(c.parameter.transform, x[i], jnp)
+            if kept is not None and p.term:
+                value = jnp.where(kept[self.terms.index(p.term)], value, p.without)
+            found.setdefault(p.name, []).append(value)
         values: dict[str, Any] = {}
         for p in self.parameters:
             own = found.get(p.name)
@@ -204,7 +247,11 @@ class ParameterTable:
         at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(own, self.columns, strict=True)]
         inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
         x = np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)])
-        share = np.clip((x - self._low) / (self._high - self._low), 1e-3, 1 - 1e-3)
+        return self.at_scale(x)
+
+    def at_scale(self, x: np.ndarray) -> np.ndarray:
+        """Return the unbounded vector ``(P,)`` for a point on the parameters' scales, just inside their bounds."""
+        share = np.clip((x - self._low) / self.span, 1e-3, 1 - 1e-3)
         return np.log(share / (1 - share))
 
     def posterior(self, z: np.ndarray, covariance: np.ndarray) -> Posterior:

@@ -28,15 +28,19 @@ from sim2real.runtime.compiled import CompiledGraph
 
 
 class Data(NamedTuple):
-    """What was measured, as an argument of compiled programs: one program serves other measurements, too.
+    """What is fitted, as an argument of compiled programs: one program serves other measurements, and parts of them.
 
     Attributes:
         measured: Field -> ``(E, N, ...)``, as in ``Segments``.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
+        weight: Shape ``(E,)``: 1 for a segment that counts, 0 for one that is left out; None: all count.
+        kept: Shape ``(T,)``, bool: which of the table's terms are part of the model; None: all.
     """
 
     measured: Mapping[str, Any]
     starts: Any
+    weight: Any = None
+    kept: Any = None
 
 
 class Problem:
@@ -64,7 +68,7 @@ class Problem:
         config: FitConfig = FitConfig(),  # noqa: B008 - frozen
         table: ParameterTable | None = None,
     ) -> None:
-        self.model, self.config = model, config
+        self.model, self.config, self._recordings = model, config, recordings
         self.table = (table or model.parameters).for_recordings(len(recordings))
         self.channels = model.channels
         nodes = model.nodes(config.max_delay_s)
@@ -233,7 +237,7 @@ class Problem:
             shift, error = (jnp.where(gain > 0, new, old) for new, old in ((moved, shift), (after, error)))
         return error, ts
 
-    def losses(self, candidates: Any, around: Any, pick: Any = None) -> Any:
+    def losses(self, candidates: Any, around: Any, pick: Any = None, data: Data | None = None) -> Any:
         """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, and the priors.
 
         One linearised rollout, at ``around``, serves to solve for the initial states of all candidates; the closer they
@@ -243,16 +247,20 @@ class Problem:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``: the middle of the generation.
             pick: Shape ``(B,)``: the segments to take, the same for all candidates; default: all that are fitted.
+            data: What is fitted; default: the logs.
         """
         pick = jnp.asarray(self.train) if pick is None else pick
-        columns = self.sensitivities(around, pick)
+        columns = self.sensitivities(around, pick, data)
 
         def candidate(z: Any) -> Any:
-            values = self.table.decode(z)
-            r, ts = jax.vmap(lambda e, c: self.projected(values, e, c))(pick, columns)
-            r = self._tamed(r)
+            values = self._values(z, data)
+            r, ts = jax.vmap(lambda e, c: self.projected(values, e, c, data))(pick, columns)
+            r, counts = self._tamed(r), ts >= 0
+            if data is not None and data.weight is not None:
+                own = data.weight[pick]
+                r, counts = r * own[:, None, None], counts * own[:, None]
             prior = jnp.sum(self.table.prior_residuals(z) ** 2) / self.measurements
-            return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(ts >= 0) * r.shape[-1], 1) + prior)
+            return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(counts) * r.shape[-1], 1) + prior)
 
         return jax.vmap(candidate)(candidates)
 
@@ -266,7 +274,7 @@ class Problem:
         """
         if self.config.initial_state != "free":
             return None
-        values, zero = self.table.decode(z), jnp.zeros(2 * len(self.channels))
+        values, zero = self._values(z, data), jnp.zeros(2 * len(self.channels))
         pick = jnp.asarray(self.train) if pick is None else pick
         return jax.vmap(lambda e: self.sensitivity(values, e, zero, data))(pick)
 
@@ -294,8 +302,15 @@ class Problem:
         return r, slope[..., None] * J, raw
 
     def _untamed(self, z: Any, columns: Any, data: Data | None) -> Any:
-        values = self.table.decode(z)
-        return jax.vmap(lambda e, c: self.projected(values, e, c, data)[0])(jnp.asarray(self.train), columns)
+        values, pick = self._values(z, data), jnp.asarray(self.train)
+        residuals = jax.vmap(lambda e, c: self.projected(values, e, c, data)[0])(pick, columns)
+        if data is None or data.weight is None:
+            return residuals
+        return residuals * data.weight[pick][:, None, None]
+
+    def _values(self, z: Any, data: Data | None) -> dict[str, Any]:
+        """Return the parameters' values, those of terms that are left out at what they are without."""
+        return self.table.decode(z, None if data is None else data.kept)
 
     def _tamed(self, residuals: Any) -> Any:
         return tamed(residuals, self.config.loss, self.config.reach)
@@ -325,6 +340,22 @@ class Problem:
         other.table = table.for_recordings(self.table.recordings)
         other.programs = {}
         return other
+
+    def part(self, left_out: Any = (), kept: Any = None) -> Data:
+        """Return what is fitted without some segments, and with some of the table's terms.
+
+        Args:
+            left_out: Numbers of the segments that do not count.
+            kept: Shape ``(T,)``, bool: which terms are part of the model; default: all.
+        """
+        weight = np.ones(self.segments, np.float32)
+        weight[np.asarray(left_out, int)] = 0.0
+        kept = np.ones(len(self.table.terms), bool) if kept is None else np.asarray(kept)
+        return self.data._replace(weight=jnp.asarray(weight), kept=jnp.asarray(kept))
+
+    def cut_anew(self, spans: Sequence[Span], length_s: float) -> Problem:
+        """Return the same recordings, cut into other segments [s]."""
+        return Problem(self.model, self._recordings, spans, length_s, self.config, self.table)
 
     def _start(self, eps: Any, delay_s: Any, data: Data) -> Any:
         """Return the initial state ``(2 * channels,)`` as measured around the start; samples come ``delay_s`` late."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError
 from sim2real.identify.derivative import by_jacobian
-from sim2real.identify.problem import Problem
+from sim2real.identify.problem import Data, Problem
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ def refine(
     steps: int = 25,
     rounds: int = 3,
     on_round: Callable[[float, np.ndarray], None] | None = None,
+    data: Data | None = None,
 ) -> Refined:
     """Improve each start, and return the best result; a round that does not lower the loss is dropped.
 
@@ -54,12 +56,15 @@ def refine(
         steps: Most steps of a round.
         rounds: Most rounds from a start; the first that gains less than 0.01 % is the last.
         on_round: Called after each round with the best loss and point so far.
+        data: What is fitted; default: the problem's logs.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
     improve = problem.programs.setdefault(("improve", steps), _program(problem, steps))
-    full_loss = problem.programs.setdefault("alone", jax.jit(lambda z: problem.losses(z[None], z)[0]))
+    data = data or problem.part()
+    of_data = problem.programs.setdefault("loss", jax.jit(lambda z, d: problem.losses(z[None], z, data=d)[0]))
+    full_loss = functools.partial(of_data, d=data)
     first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
     if not np.isfinite(first).any():
         raise Sim2RealError(
@@ -70,7 +75,7 @@ def refine(
     for start, loss in zip(starts, first, strict=True):
         z = jnp.asarray(start, jnp.float32)
         for _ in range(rounds):
-            moved, count = improve(z)
+            moved, count = improve(z, data)
             taken += int(count)
             new = float(full_loss(moved))
             better = bool(jnp.all(jnp.isfinite(moved))) and new < loss
@@ -86,18 +91,18 @@ def refine(
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
 
 
-def _program(problem: Problem, steps: int) -> Callable[[Any], tuple[Any, Any]]:
-    """Return one round of Levenberg-Marquardt, compiled on its first call: ``z -> (z, steps taken)``."""
+def _program(problem: Problem, steps: int) -> Callable[[Any, Data], tuple[Any, Any]]:
+    """Return one round of Levenberg-Marquardt, compiled on its first call: ``z, data -> (z, steps taken)``."""
     import optimistix  # 0.5 s
 
     solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
-    def improve(z: Any) -> tuple[Any, Any]:
-        columns = problem.sensitivities(z)
+    def improve(z: Any, data: Data) -> tuple[Any, Any]:
+        columns = problem.sensitivities(z, data=data)
 
         def weighed(y: Any) -> Any:
-            residuals = problem.stacked(y, columns).reshape(-1)
+            residuals = problem.stacked(y, columns, data).reshape(-1)
             return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
 
         residuals = by_jacobian(problem.differentiable(weighed))

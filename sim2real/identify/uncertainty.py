@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import jax
@@ -23,6 +23,8 @@ _BLOCKS = 20
 """How many blocks there are at least, where the recordings are long enough: fewer leave too few degrees of freedom."""
 _LEAST_FREEDOM = 2.0
 """With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
+_ALONE = 0.5
+"""Share of the information about a parameter above which one part stands alone with what it says."""
 _BY_CHANCE = 0.1
 """Intervals widen only where blocks differ so much that chance alone would explain it in this share of recordings."""
 
@@ -163,6 +165,49 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
         inflation=inflation,
         misfit=float(np.sqrt(np.sum(at.raw**2) / max(count, 1))),
         widening=wider,
+    )
+
+
+def between_parts(
+    spread: Uncertainty, table: ParameterTable, x: np.ndarray, moved: np.ndarray, share: np.ndarray
+) -> Uncertainty:
+    """Return wider intervals where estimates without a part of the recordings differ more than by chance.
+
+    The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). Parts are
+    recordings, or long blocks: it holds what differs from one to the next, which shorter blocks do not show. It says
+    nothing about a parameter of which a single part says more than all others together: such intervals stay.
+
+    Args:
+        spread: The uncertainty without it.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        moved: Shape ``(K, P)``: estimates without each part, on the scales.
+        share: Shape ``(K, P)``: which share of the information about each parameter a part holds.
+    """
+    parts = len(moved)
+    error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
+    own = np.sqrt(np.diag(spread.scale_covariance))
+    shifts = time_shift(table) != 0.0
+    factor = _widening(error / np.maximum(own, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
+    factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
+    factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(own, 1e-30)))
+    cov = spread.scale_covariance * np.outer(factor, factor)
+    middle = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, table.unscale(x), strict=True)])
+    low, high = (
+        np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, ends, strict=True)])
+        for ends in (spread.low, spread.high)
+    )
+    margin = np.minimum(x - table.low, table.high - x) / table.span
+    error = np.sqrt(np.diag(cov))
+    return replace(
+        spread,
+        covariance=spread.covariance * np.outer(factor, factor),
+        scale_covariance=cov,
+        standard_error=spread.standard_error * factor,
+        low=table.unscale(middle - factor * (middle - low)),
+        high=table.unscale(middle + factor * (high - middle)),
+        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shifts, strict=True)),
+        widening=spread.widening * factor,
     )
 
 

@@ -72,6 +72,12 @@ class IdentifyConfig(FitConfig):
     """Share of each log, at its end, that is held out; 0 where whole logs are."""
     free_run_s: float = 10.0
     """Longest simulation of held-out data from a single initial state [s]."""
+    folds: int = 5
+    """Parts that are left out of the fit one at a time, to say how far off it is on what it never saw: each log where
+    there are several, else so many blocks of the one there is; 0 leaves that out."""
+    terms: str = "own"
+    """Optional terms of the model: 'own' takes the pipeline's, 'auto' those without which what is left out is predicted
+    worse, 'all' or 'none' say it, else names with commas between."""
     each: bool = False
     """Identify each log by itself as well, and report the spread between them."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
@@ -100,6 +106,11 @@ class IdentifyConfig(FitConfig):
             raise UsageError(f"spacing_s must not be negative, got {self.spacing_s}")
         if not 0.0 <= self.free_run_s <= 3600.0:
             raise UsageError(f"free_run_s must lie in [0, 3600] s, got {self.free_run_s}")
+        if self.folds < 0 or self.folds == 1 or (self.terms == "auto" and not self.folds):
+            raise UsageError(
+                f"folds must be 0, or 2 and more, got {self.folds} with terms {self.terms!r}",
+                hint="terms are chosen by what is left out: --terms auto needs --folds",
+            )
         if self.each and len(self.log) < 2:
             raise UsageError("each needs two logs at least", hint="name them with --log, one flag a log")
 

@@ -17,6 +17,7 @@ from sim2real.artifacts.identification import (
     HeldOut,
     Identification,
     Judgement,
+    Left,
     Matrix,
     Refinement,
     Search,
@@ -28,6 +29,7 @@ from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import RoundTrip, round_trip
 from sim2real.identify.verdict import Position, Score, judge, scores
+from sim2real.stages import left_out
 from sim2real.stages.console import note, table
 
 
@@ -50,10 +52,15 @@ class Findings:
     trip: RoundTrip | None
 
     @staticmethod
-    def of(fit: Fit) -> Findings:
-        """Compute how uncertain a fit is."""
+    def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
+        """Compute how uncertain a fit is.
+
+        Args:
+            fit: The fit.
+            without: What was identified without one part of the recordings or another.
+        """
         at = uncertainty.linearise(fit.problem, fit.z)
-        spread = uncertainty.from_linearised(fit.problem, at)
+        spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
         return Findings(fit, at.x, spread, check, round_trip(fit.problem.table, at.x, spread))
 
@@ -104,12 +111,15 @@ def judged(
         max_delay_s: For which delays the model is made [s].
         outside: Where held-out data goes beyond what was fitted: sentences.
     """
-    rows = scores(document.prediction, positions(found.fit.problem, units))
+    judged_on = positions(found.fit.problem, units)
+    rows = scores(document.prediction, judged_on)
     table = found.fit.problem.table
     verdict = judge(
         rows, table, found.x, found.spread, found.check, trip=found.trip, max_delay_s=max_delay_s, beyond=outside
     )
-    told = Judgement(verdict.status, verdict.reasons, verdict.flags)
+    horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
+    worth = left_out.sentences(document.left_out, judged_on, horizon_s)
+    told = Judgement(verdict.status, (*worth, *verdict.reasons), verdict.flags)
     return replace(document, verdict=told, held_out=tuple(scored(rows)))
 
 

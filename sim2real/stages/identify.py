@@ -24,7 +24,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, beyond
 from sim2real.identify.verdict import NO_DELAY
-from sim2real.stages import advice, identified
+from sim2real.stages import advice, identified, left_out
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import progress
 from sim2real.stages.cutting import reach, spans, split_of
@@ -67,16 +67,26 @@ def identify(
     episodes = [log.episode for log in logs]
     robot = pipeline.load()
     model = robot.identifiable(config.max_delay_s)
-    table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
+    table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
+    names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
     with _told("identify", best) as told:
-        found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told))
+        all_terms = found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told))
+    terms = found.problem.table.terms or None
+    if config.terms == "auto":
+        terms = left_out.chosen(found, config, names)
+        table = table.with_terms(terms).with_nominal(found.values)
+        again = replace(config, generations=0)
+        with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
+            found = patiently(lambda: _fit(model, episodes, len(fitted), windows, again, table, told))
     with progress(None, "identify: errors, predictions and baselines"):
-        findings = patiently(lambda: identified.Findings.of(found))
+        without = patiently(lambda: left_out.examined(all_terms, config, names)) if config.folds else ()
+        findings = patiently(lambda: identified.Findings.of(found, without))
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
         document = identified.document(pipeline.name, findings, truth, time.monotonic() - begin)
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, table, found))
+        document = replace(document, left_out=without, terms=terms)
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
         identified.judged(document, findings, robot.units, config.max_delay_s, outside),
@@ -101,7 +111,8 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     logs = [open_recording(path, pipeline) for path in paths]
     fitted = len(logs) - len(config.hold_out)
     model = robot.identifiable(config.max_delay_s)
-    table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix).for_recordings(len(logs))
+    table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
+    table = table.for_recordings(len(logs))
     # Logs that are too short are refused before a folder is made.
     spans([log.episode for log in logs], fitted, config, config.settle_s + config.horizon_s)
     inputs = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}

@@ -44,6 +44,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
     blocks = [
         *_parameters(found),
         *_aggregate(found),
+        *_parts(found),
         *_predictions(found),
         *_residuals(found),
         *_correlation(found),
@@ -168,6 +169,28 @@ def _aggregate(found: Identification) -> list[Block]:
         ),
         TableBlock(f"Over {count} recordings", heads, rows, text_columns=(5, 6)),
     ]
+
+
+def _parts(found: Identification) -> list[Block]:
+    """Return the errors on parts of the recordings that were left out of the fit, with their mean and the worst."""
+    rows = found.left_out
+    if not rows:
+        return []
+    kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
+    units = {column: unit_of(column, found.units) for _, column in kinds}
+    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in one go'} [{units[column]}]" for kind, column in kinds]
+    errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
+    with_terms = bool(found.terms) or any(r.terms for r in rows)
+    table = []
+    summed = [("mean", errors.mean(axis=0)), ("worst", errors.max(axis=0))]
+    for name, own, terms in [
+        *((r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)),
+        *((name, e, "") for name, e in summed),
+    ]:
+        table.append([name, *([terms] if with_terms else []), *(number(e, 3) for e in own)])
+    caption = "Identified without this part, and off on it by (root mean square)"
+    columns = ["left out", *(["terms"] if with_terms else []), *heads]
+    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
 
 
 def _predictions(found: Identification) -> list[Block]:

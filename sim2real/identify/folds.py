@@ -1,0 +1,179 @@
+"""Leaving parts of the recordings out, one at a time: what an identification is worth on data that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.identify import terms
+from sim2real.identify.fit import Fit
+from sim2real.identify.prediction import labels
+from sim2real.identify.problem import Problem
+from sim2real.identify.refine import refine
+from sim2real.identify.segments import Span
+from sim2real.identify.uncertainty import linearise
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A part of the recordings that is left out.
+
+    Attributes:
+        name: What people call it.
+        parts: The stretches that are left out: recording, begin and end [s].
+    """
+
+    name: str
+    parts: tuple[tuple[int, float, float], ...]
+
+    def touches(self, spans: Sequence[Span], length_s: float) -> np.ndarray:
+        """Return which segments of a length share time with this part, ``(S,)``, bool."""
+        return np.array(
+            [
+                any(
+                    r == s.recording and s.begin_s < end and begin < s.begin_s + length_s
+                    for r, begin, end in self.parts
+                )
+                for s in spans
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was identified without one part, and how far it is off there.
+
+    Attributes:
+        fold: The part.
+        values: The estimate without it, by name.
+        kept: Names of the optional terms that the rest of the data chose.
+        share: Label of a free parameter -> share of what all recordings say about it that this part says, in [0, 1].
+        ahead: Field -> root mean square error up to the horizon of the windows.
+        free: Field -> root mean square error when the part is simulated in one go, from its first samples.
+    """
+
+    fold: Fold
+    values: Mapping[str, Any]
+    kept: tuple[str, ...]
+    share: Mapping[str, float]
+    ahead: Mapping[str, float]
+    free: Mapping[str, float]
+
+
+def folds_of(problem: Problem, blocks: int, names: Sequence[str] = ()) -> list[Fold]:
+    """Return what to leave out: each recording once, or blocks of equal length where there is one recording alone.
+
+    Args:
+        problem: Its fitted segments are divided.
+        blocks: How many blocks of a single recording.
+        names: What recordings of one name are left out together are called; default: each goes by itself.
+
+    Raises:
+        UsageError: When there is too little to leave a part out.
+    """
+    spans = [problem.spans[i] for i in problem.train]
+    recordings = sorted({s.recording for s in spans})
+    begin, end = min(s.begin_s for s in spans), max(s.begin_s for s in spans) + problem.segment_s
+    if len(recordings) > 1:
+        groups: dict[str, list[int]] = {}
+        for r in recordings:
+            groups.setdefault(names[r] if names else f"recording {r + 1}", []).append(r)
+        found = [Fold(name, tuple((r, 0.0, np.inf) for r in own)) for name, own in groups.items()]
+    else:
+        edges = np.linspace(begin, end, blocks + 1)
+        found = [Fold(f"{a:.0f} to {b:.0f} s", ((recordings[0], a, b),)) for a, b in pairwise(edges)]
+    counts = [int(f.touches(spans, problem.segment_s).sum()) for f in found]
+    if not 2 <= len(found) <= len(spans) or min(counts) == 0 or max(counts) == len(spans):
+        raise UsageError(
+            f"{len(spans)} segments of {problem.segment_s:g} s cannot be divided into {len(found)} parts to leave out",
+            hint="fewer --folds, a longer recording, or shorter segments",
+        )
+    return found
+
+
+def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
+    """Return which fitted segments share time with each part, ``(K, S)``, bool."""
+    spans = [problem.spans[i] for i in problem.train]
+    return np.array([p.touches(spans, problem.segment_s) for p in parts])
+
+
+def leave_out(
+    found: Fit, parts: Sequence[Fold], settle_s: float, choose: bool, steps: int = 25, free_run_s: float = 0.0
+) -> list[LeftOut]:
+    """Identify without each part, from the estimate of all, and predict it.
+
+    Args:
+        found: The estimate of all.
+        parts: What is left out, one at a time.
+        settle_s: First part of what is predicted, to which its initial state is fitted [s].
+        choose: Whether the data that is left chooses the optional terms of the model; else all are kept.
+        steps: Most steps of Levenberg-Marquardt for each.
+        free_run_s: Longest stretch that is simulated in one go [s]; 0 leaves it out.
+    """
+    problem, table = found.problem, found.problem.table
+    touched = masks(problem, parts)
+    stats = terms.statistics(problem, linearise(problem, found.z), touched)
+    values, kept = [], []
+    for k, mask in enumerate(touched):
+        own = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
+        # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
+        start = table.at_scale(stats.x + stats.step(table, own, k))
+        z = refine(problem, start[None], steps, 1, data=problem.part(problem.train[mask], own)).z
+        values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
+        kept.append(tuple(n for n, there in zip(table.terms, own, strict=True) if there))
+    stacked = {n: jnp.stack([jnp.asarray(v[n], jnp.float32) for v in values]) for n in values[0]}
+    own = np.einsum("kpp->kp", stats.information)
+    shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
+    ahead = _ahead(found.windows, parts, stacked, settle_s)
+    free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
+    return [LeftOut(*row) for row in zip(parts, values, kept, shares, ahead, free, strict=True)]
+
+
+def _ahead(
+    windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float
+) -> list[dict[str, float]]:
+    """Return the errors of the windows of each part, predicted from the first part of each."""
+    fold, segment = np.nonzero(masks(windows, parts))
+    errors = _predicted(windows, stacked, fold, windows.train[segment], settle_s)
+    return [_rmse(windows, [e for e, k in zip(errors, fold, strict=True) if k == own]) for own in range(len(parts))]
+
+
+def _free(
+    problem: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float, longest_s: float
+) -> list[dict[str, float]]:
+    """Return the errors of each part, simulated in one go."""
+    fitted = [problem.spans[i] for i in problem.train]
+    where = []
+    for k, part in enumerate(parts):
+        for r, begin, end in part.parts:
+            own = [s.begin_s for s in fitted if s.recording == r]
+            first, last = max(begin, min(own)), min(end, max(own) + problem.segment_s)
+            where.append((k, Span(r, first, False), last - first))
+    length_s = min(longest_s, *(w[2] for w in where))
+    runs = problem.cut_anew([w[1] for w in where], length_s)
+    fold = np.array([w[0] for w in where])
+    errors = _predicted(runs, stacked, fold, np.arange(len(where)), settle_s)
+    return [_rmse(runs, [e for e, k in zip(errors, fold, strict=True) if k == own]) for own in range(len(parts))]
+
+
+def _predicted(
+    problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float
+) -> list[np.ndarray]:
+    """Return the errors ``(N, fields)`` of segments beyond their first part, in deviations of the measurement."""
+    own = {n: v[fold] for n, v in stacked.items()}
+    predict = jax.jit(jax.vmap(lambda v, e: problem.predict(v, e, settle_s)))
+    errors, ts = (np.asarray(a, np.float64) for a in predict(own, jnp.asarray(segment)))
+    return [e[t > settle_s] for e, t in zip(errors, ts, strict=True)]
+
+
+def _rmse(problem: Problem, errors: Sequence[np.ndarray]) -> dict[str, float]:
+    sigmas = [sigma for _, sigma, _ in problem.fields]
+    whole = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0)) * sigmas
+    return dict(zip(labels(problem), whole.tolist(), strict=True))

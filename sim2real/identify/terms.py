@@ -1,0 +1,148 @@
+"""Which optional terms a model needs: chosen by how well data that was left out is explained.
+
+Around the estimate of the widest model the loss of every part of the recordings is a quadratic function of the
+parameters. The loss of any smaller model, fitted to some parts and judged on another, follows from those by linear
+algebra; a term that matters little is close to where it is left out, and there the approximation is good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem import Problem
+from sim2real.identify.uncertainty import Linearised
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The loss of K parts of the recordings around a point, as quadratic functions of the parameters' scales.
+
+    Attributes:
+        x: Shape ``(P,)``: the point.
+        value: Shape ``(K,)``: sums of squares there.
+        gradient: Shape ``(K, P)``: half the gradients.
+        information: Shape ``(K, P, P)``: half the second derivatives.
+        prior: Shape ``(P, P)``: what priors and bounds add to the information of all parts.
+        count: Shape ``(K,)``: how many measurements each part holds.
+    """
+
+    x: np.ndarray
+    value: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+    prior: np.ndarray
+    count: np.ndarray
+
+    def step(self, table: ParameterTable, kept: np.ndarray, left_out: int | None = None) -> np.ndarray:
+        """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
+
+        Args:
+            table: The parameters.
+            kept: Shape ``(T,)``, bool: which terms are part of the model.
+            left_out: Number of the part that is left out; None: none is.
+        """
+        place = {name: i for i, name in enumerate(table.terms)}
+        step, gone = np.zeros(len(self.x)), np.zeros(len(self.x), bool)
+        for i, column in enumerate(table.columns):
+            p = column.parameter
+            if p.term and not kept[place[p.term]]:
+                gone[i] = True
+                step[i] = p.to_scale(min(max(p.without, p.low), p.high)) - self.x[i]
+        g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
+        if left_out is not None:
+            g, H = g - self.gradient[left_out], H - self.information[left_out]
+        rest = np.flatnonzero(~gone)
+        step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
+        return step
+
+    def without(self, part: int) -> Statistics:
+        """Return the same without one part."""
+        rows = np.delete(np.arange(len(self.value)), part)
+        return Statistics(
+            self.x, self.value[rows], self.gradient[rows], self.information[rows], self.prior, self.count[rows]
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen.
+
+    Attributes:
+        kept: Shape ``(T,)``, bool: which of the table's terms.
+        order: The terms in the order in which they were left out, the least needed first.
+        excess: Shape ``(T + 1,)``: mean square on what was left out, over that of the best of these models, as terms
+            are left out one after the other; the first entry is the widest model's.
+        error: Shape ``(T + 1,)``: standard error of ``excess``.
+    """
+
+    kept: np.ndarray
+    order: tuple[str, ...]
+    excess: np.ndarray
+    error: np.ndarray
+
+
+def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistics:
+    """Return the loss of parts of the recordings around a point.
+
+    Args:
+        problem: The residuals.
+        at: The point; of fitted segments only.
+        parts: Shape ``(K, S)``, bool: which fitted segments belong to each part.
+    """
+    size = len(at.x)
+    rows = [(at.residuals[own].reshape(-1), at.jacobian[own].reshape(-1, size)) for own in parts]
+    variance = float(np.sum(at.residuals**2)) / max(np.count_nonzero(at.residuals), 1)
+    return Statistics(
+        x=at.x,
+        value=np.array([r @ r for r, _ in rows]),
+        gradient=np.array([J.T @ r for r, J in rows]),
+        information=np.array([J.T @ J for _, J in rows]),
+        prior=at.prior * variance,
+        count=np.array([max(np.count_nonzero(r), 1) for r, _ in rows], np.float64),
+    )
+
+
+def choose(stats: Statistics, table: ParameterTable) -> Choice:
+    """Leave out terms one after the other, each time the one that is missed least, and say where to stop.
+
+    Chosen is the smallest model that is worse than the best one by no more than one standard error of the difference
+    between parts (Breiman et al., Classification and Regression Trees, 1984): a term that helps in a single part has a
+    standard error as large as its gain, and is left out.
+
+    Args:
+        stats: The loss of at least two parts.
+        table: The parameters, those of all terms free.
+    """
+    names = table.terms
+    kept = np.ones(len(names), bool)
+    path, scores, order = [kept.copy()], [_left_out(stats, table, kept)], []
+    while kept.any():
+        trials = {}
+        for t in np.flatnonzero(kept):
+            fewer = kept.copy()
+            fewer[t] = False
+            trials[int(t)] = _left_out(stats, table, fewer)
+        least = min(trials, key=lambda t: float(trials[t].mean()))
+        kept[least] = False
+        path.append(kept.copy())
+        scores.append(trials[least])
+        order.append(names[least])
+    means = np.array([s.mean() for s in scores])
+    best = scores[int(np.argmin(means))]
+    excess = np.array([(s - best).mean() for s in scores])
+    error = np.array([(s - best).std(ddof=1) / np.sqrt(len(best)) for s in scores])
+    smallest = int(np.flatnonzero(excess <= error)[-1])
+    return Choice(path[smallest], tuple(order), excess, error)
+
+
+def _left_out(stats: Statistics, table: ParameterTable, kept: np.ndarray) -> np.ndarray:
+    """Return the mean square on each part when it is left out of the fit, ``(K,)``, for a model with some terms."""
+    found = []
+    for k in range(len(stats.value)):
+        step = stats.step(table, kept, k)
+        own = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
+        found.append(own / stats.count[k])
+    return np.array(found)

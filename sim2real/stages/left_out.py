@@ -1,0 +1,135 @@
+"""Optional terms of a model, and what an identification is worth on parts of the recordings that were left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import stdtrit
+
+from sim2real.artifacts.identification import Left
+from sim2real.errors import UsageError
+from sim2real.identify import terms
+from sim2real.identify.fit import Fit
+from sim2real.identify.folds import folds_of, leave_out, masks
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.uncertainty import Uncertainty, between_parts, linearise
+from sim2real.identify.verdict import Position
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.console import note
+
+_LEAST = 4
+"""Segments of which parts can be left out."""
+_FEWEST = 4
+"""Parts from which on they say how much estimates differ."""
+_STEPS = 8
+"""Most steps of Levenberg-Marquardt for each part: it starts where the linearised residuals say."""
+
+
+def widest(table: ParameterTable, wanted: str) -> ParameterTable:
+    """Return the table with the optional terms that a flag names; for ``auto`` with all of them, to choose from.
+
+    Args:
+        table: The robot's.
+        wanted: ``own``, ``auto``, ``all``, ``none``, or names with commas between.
+    """
+    if wanted == "own":
+        return table
+    known = tuple(dict.fromkeys(p.term for p in table if p.term))
+    if wanted == "auto" and not known:
+        raise UsageError(
+            "this robot's model has no optional terms to choose from",
+            hint="give parameters a term in the pipeline: Parameter(..., term='cogging', off=0.0)",
+        )
+    names = {"auto": known, "all": known, "none": ()}.get(wanted, tuple(n.strip() for n in wanted.split(",")))
+    return table.with_terms(names)
+
+
+def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the optional terms without which parts that are left out are predicted worse.
+
+    Args:
+        found: The fit with all of them.
+        config: How many parts.
+        names: Of the recordings; each is left out by itself.
+    """
+    problem, table = found.problem, found.problem.table
+    parts = masks(problem, folds_of(problem, config.folds, names))
+    choice = terms.choose(terms.statistics(problem, linearise(problem, found.z), parts), table)
+    return tuple(n for n, kept in zip(table.terms, choice.kept, strict=True) if kept)
+
+
+def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[Left, ...]:
+    """Return what is identified without each part of the recordings, and how far it is off there.
+
+    Args:
+        found: The fit; with ``--terms auto`` the one with all optional terms, as each part's absence chooses anew.
+        config: How.
+        names: Of the recordings; each is left out by itself.
+    """
+    segments = len(found.problem.train)
+    if segments < _LEAST:
+        note(f"{segments} segments are too few to leave parts out of the fit")
+        return ()
+    parts = folds_of(found.problem, min(config.folds, segments // 2), names)
+    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", _STEPS, config.free_run_s)
+    return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
+
+
+def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[Left]) -> Uncertainty:
+    """Return an uncertainty that holds how much estimates differ without one part or another.
+
+    Args:
+        spread: What the fit alone says.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        rows: What was identified without each part.
+    """
+    if len(rows) < _FEWEST:
+        return spread
+    values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
+    moved = np.array([[c.parameter.to_scale(v) for c, v in zip(table.columns, own, strict=True)] for own in values])
+    share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
+    return between_parts(spread, table, x, moved, share)
+
+
+def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: float) -> list[str]:
+    """Return how far each position is off on parts that were left out: mean, worst, and what one more would be.
+
+    Args:
+        rows: The parts.
+        positions: What is judged.
+        horizon_s: Up to which horizon [s].
+    """
+    if not rows:
+        return []
+    said = []
+    for p in positions:
+        for what, errors in (
+            (f"up to {horizon_s:g} s ahead", _of(rows, p, "ahead")),
+            ("in one go", _of(rows, p, "free")),
+        ):
+            if errors.size:
+                unit = f" {p.unit}".rstrip()
+                said.append(
+                    f"{p.name}, {what}, on parts that were left out of the fit: off by {errors.mean():.2g}{unit} on "
+                    f"average, {errors.max():.2g}{unit} at worst of {errors.size}; 95 % of further parts like these "
+                    f"stay below {further(errors):.2g}{unit}"
+                )
+    return said
+
+
+def further(errors: np.ndarray) -> float:
+    """Return the error below which one more part stays with 95 % probability, from those of K parts ``(K,)``.
+
+    Errors are taken to be log-normal: the upper end of a one-sided prediction interval by Student's distribution.
+    """
+    logs = np.log(np.maximum(errors, 1e-300))
+    k = len(logs)
+    return float(math.exp(logs.mean() + stdtrit(k - 1, 0.95) * logs.std(ddof=1) * math.sqrt(1.0 + 1.0 / k)))
+
+
+def _of(rows: Sequence[Left], position: Position, kind: str) -> np.ndarray:
+    found = [getattr(row, kind).get(position.column) for row in rows]
+    return np.array([e for e in found if e is not None and math.isfinite(e)])

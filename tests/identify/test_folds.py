@@ -1,0 +1,215 @@
+"""Leaving parts out: the same as never having recorded them, and the choice of terms never sees them."""
+
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base
+from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import fit
+from sim2real.identify.folds import Fold, folds_of, leave_out
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.segments import Span
+
+TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
+GAIN, TAU_S, BIAS, NOISE = 1.7, 0.13, 0.2, 0.002
+
+
+@struct.dataclass
+class Level(Base):
+    """State and measurement."""
+
+    y: jnp.ndarray
+
+
+@struct.dataclass
+class Command(Base):
+    """What drives it."""
+
+    u: jnp.ndarray
+
+
+@struct.dataclass
+class Params(Base):
+    """A lag whose input has a bias, and a square that it does not have."""
+
+    gain: float = 1.0
+    tau: float = 0.1
+    bias: float = 0.0
+    square: float = 0.0
+    start: float = 0.0
+
+
+class Lag(BaseWorld):
+    """A first-order lag, exact over a tick."""
+
+    def init_params(self, rng=None, graph_state=None):
+        return Params()
+
+    def init_state(self, rng=None, graph_state=None):
+        return Level(y=jnp.asarray(graph_state.params["world"].start, jnp.float32))
+
+    def init_output(self, rng=None, graph_state=None):
+        return graph_state.state["world"]
+
+    def step(self, step_state):
+        p, u = step_state.params, step_state.inputs["actuator"][-1].data.u
+        steady = p.gain * (u + p.bias + p.square * u**2)
+        new = Level(y=steady + (step_state.state.y - steady) * jnp.exp(-TICK_S / p.tau))
+        return step_state.replace(state=new), new
+
+
+class Sensor(BaseNode):
+    """Passes the level on."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Level(y=jnp.float32(0.0))
+
+    def step(self, step_state):
+        return step_state, step_state.inputs["world"][-1].data
+
+
+class Actuator(BaseNode):
+    """Plays what was recorded."""
+
+    def init_output(self, rng=None, graph_state=None):
+        return Command(u=jnp.float32(0.0))
+
+
+class Model:
+    """What a pipeline provides."""
+
+    sensor = "sensor"
+    ahead_s = 0.0
+    given = {"actuator": Command(u="u")}  # noqa: RUF012
+    channels = (Channel("y", None, position_sigma=NOISE, velocity_sigma=0.1),)
+    parameters = ParameterTable(
+        [
+            Parameter("gain", "1", 1.5, 0.25, 4.0, leaf="world.gain"),
+            Parameter("tau", "s", 0.1, 0.02, 0.5, leaf="world.tau"),
+            Parameter("bias", "1", 0.0, -1.0, 1.0, "linear", leaf="world.bias", term="bias"),
+            Parameter("square", "1", 0.0, -1.0, 1.0, "linear", leaf="world.square", term="square"),
+            Parameter("offset", "1", 0.0, -1.0, 1.0, "linear", "measurement", free=False),
+        ]
+    )
+
+    def nodes(self, max_delay_s):
+        world, sensor, actuator = (
+            Lag("world", 1 / TICK_S),
+            Sensor("sensor", 1 / PERIOD_S),
+            Actuator("actuator", 1 / PERIOD_S),
+        )
+        world.connect(actuator, skip=True)
+        sensor.connect(world)
+        return {n.name: n for n in (sensor, actuator, world)}
+
+    def params(self, values, start):
+        return self.parameters.placed({"world": replace(Params(), start=start[0])}, values)
+
+
+def lag_log(seed, bias=BIAS):
+    """A lag's log: commands hold from one sample to the next, and act from the sample on."""
+    rng = np.random.default_rng(seed)
+    count = round(DURATION_S / PERIOD_S)
+    u = np.repeat(rng.uniform(-1, 1, count // 5), 5)
+    y = np.zeros(count)
+    for k in range(1, count):
+        steady = GAIN * (u[k - 1] + bias)
+        y[k] = steady + (y[k - 1] - steady) * np.exp(-PERIOD_S / TAU_S)
+    slots = np.arange(count) * round(PERIOD_S * 1e6)
+    none, late = np.zeros_like(slots), slots > 0
+
+    def steps(start, end):
+        return Steps(scheduled=slots, start=start, woken=start, ts_overwrite=none - 1, end=end, drift=none)
+
+    return Episode(
+        steps={"sensor": steps(slots, slots + 10), "actuator": steps(slots - 20 * late, slots - 5 * late)},
+        messages={},
+        outputs={"sensor": {"y": y + NOISE * rng.normal(size=count)}, "actuator": {"u": u}},
+    )
+
+
+def spans(recording):
+    return [Span(recording, float(b)) for b in np.arange(0.4, DURATION_S - LENGTH_S - 0.3, LENGTH_S)]
+
+
+CONFIG = FitConfig(max_delay_s=0.02, generations=0, refine=1, initial_state="free")
+
+
+@pytest.fixture(scope="module")
+def one():
+    """One log, fitted with all terms, and again without each of three parts."""
+    episode = lag_log(0)
+    whole = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG)
+    parts = folds_of(whole.problem, 3)
+    rows = leave_out(whole, parts, 0.2, choose=False, free_run_s=20.0)
+    return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
+
+
+def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
+    for part, row in zip(one.parts, one.rows, strict=True):
+        rest = [s for s, gone in zip(spans(0), part.touches(spans(0), LENGTH_S), strict=True) if not gone]
+        assert 4 <= len(rest) < len(spans(0))
+        alone = fit(Model(), [one.episode], rest, LENGTH_S, CONFIG).values
+        for name in ("gain", "tau", "bias", "square"):
+            spread = abs(alone[name] - one.fit.values[name])
+            assert float(row.values[name]) == pytest.approx(alone[name], abs=0.02 * spread + 2e-5)
+
+
+def test_blocks_cover_the_log_without_overlap(one):
+    ends = [(begin, end) for part in one.parts for _, begin, end in part.parts]
+    assert ends[0][0] == pytest.approx(0.4)
+    assert all(a[1] == pytest.approx(b[0]) for a, b in pairwise(ends))
+    masks = np.array([p.touches(spans(0), LENGTH_S) for p in one.parts])
+    assert masks.any(axis=0).all()
+
+
+def test_a_model_that_is_right_leaves_the_noise(one):
+    for row in one.rows:
+        assert row.ahead["y"] == pytest.approx(NOISE, rel=0.25)
+        assert row.free["y"] == pytest.approx(NOISE, rel=0.25)
+
+
+@pytest.fixture(scope="module")
+def three():
+    """Three logs, of which the last is of another robot: its input has ten times the bias."""
+    episodes = [lag_log(1), lag_log(2), lag_log(3, 10 * BIAS / 4)]
+    whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
+    return whole, leave_out(whole, folds_of(whole.problem, 3), 0.2, choose=True)
+
+
+def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
+    whole, rows = three
+    assert [r.fold.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
+    assert float(rows[2].values["bias"]) == pytest.approx(BIAS, abs=0.003)
+    assert rows[2].ahead["y"] > 20 * NOISE
+    assert whole.values["bias"] > BIAS + 0.002
+
+
+def test_terms_are_chosen_without_what_is_left_out(three):
+    _, rows = three
+    assert all("square" not in r.kept for r in rows)
+    assert rows[2].kept == ("bias",)
+    assert float(rows[2].values["square"]) == 0.0
+
+
+def test_recordings_of_one_name_go_together(three):
+    whole, _ = three
+    found = folds_of(whole.problem, 5, ["slow", "fast", "slow"])
+    assert found == [Fold("slow", ((0, 0.0, np.inf), (2, 0.0, np.inf))), Fold("fast", ((1, 0.0, np.inf),))]
+
+
+def test_too_little_to_leave_out_is_refused(one, three):
+    with pytest.raises(UsageError, match="cannot be divided into 40 parts"):
+        folds_of(one.fit.problem, 40)
+    with pytest.raises(UsageError, match="cannot be divided into 1 parts"):
+        folds_of(three[0].problem, 5, ["all", "all", "all"])

@@ -1,0 +1,108 @@
+"""Terms chosen by what is left out, on a linear model: there the statistics are exact, and numpy can do it all over."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.terms import Statistics, choose
+
+PARTS, ROWS, NOISE = 6, 200, 0.1
+
+
+def row(name, term="", off=None):
+    return Parameter(name, "1", 0.0, -10.0, 10.0, "linear", term=term, off=off)
+
+
+TABLE = ParameterTable(
+    [row("a"), row("b"), row("c", "real"), row("d", "idle"), row("e", "idle"), row("f", "once", 0.5)]
+)
+
+
+@pytest.fixture
+def linear():
+    """y = X w + noise in six parts; d and e do nothing, and f differs from 0.5 in one part alone."""
+    rng = np.random.default_rng(4)
+    X = rng.normal(size=(PARTS, ROWS, 6))
+    w = np.tile([1.0, -2.0, 0.3, 0.0, 0.0, 0.5], (PARTS, 1))
+    w[3, 5] = 1.0
+    y = np.einsum("krp,kp->kr", X, w) + NOISE * rng.normal(size=(PARTS, ROWS))
+    x = np.linalg.lstsq(X.reshape(-1, 6), y.reshape(-1), rcond=None)[0] + 0.05 * rng.normal(size=6)
+    r = np.einsum("krp,p->kr", X, x) - y
+    stats = Statistics(
+        x=x,
+        value=np.sum(r**2, axis=1),
+        gradient=np.einsum("krp,kr->kp", X, r),
+        information=np.einsum("krp,krq->kpq", X, X),
+        prior=np.zeros((6, 6)),
+        count=np.full(PARTS, float(ROWS)),
+    )
+    return SimpleNamespace(X=X, y=y, stats=stats)
+
+
+def by_numpy(linear, free, held):
+    """Fit each part's complement by least squares, and return the mean square on the part."""
+    found = []
+    for k in range(PARTS):
+        rest = np.delete(np.arange(PARTS), k)
+        X, y = linear.X[rest].reshape(-1, 6), linear.y[rest].reshape(-1)
+        w = held.copy()
+        w[free] = np.linalg.lstsq(X[:, free], y - X @ held, rcond=None)[0]
+        found.append(np.mean((linear.X[k] @ w - linear.y[k]) ** 2))
+    return np.array(found)
+
+
+def test_excess_and_errors_are_those_of_fits_by_numpy(linear):
+    found = choose(linear.stats, TABLE)
+    assert found.order[-1] == "real"
+    held = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+    term_of = {"real": [2], "idle": [3, 4], "once": [5]}
+    free, scores = [0, 1, 2, 3, 4, 5], []
+    for gone in [None, *found.order]:
+        free = [i for i in free if gone is None or i not in term_of[gone]]
+        own = np.where(np.isin(np.arange(6), free), 0.0, held)
+        scores.append(by_numpy(linear, free, own))
+    best = min(scores, key=lambda s: s.mean())
+    np.testing.assert_allclose(found.excess, [(s - best).mean() for s in scores], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        found.error, [(s - best).std(ddof=1) / np.sqrt(PARTS) for s in scores], rtol=1e-6, atol=1e-12
+    )
+
+
+def test_a_term_that_all_parts_need_stays_and_one_that_none_or_one_needs_goes(linear):
+    np.testing.assert_array_equal(choose(linear.stats, TABLE).kept, [True, False, False])
+
+
+def test_steps_are_least_squares_without_the_part(linear):
+    step = linear.stats.step(TABLE, np.array([True, False, True]), 2)
+    rest = np.delete(np.arange(PARTS), 2)
+    free = [0, 1, 2, 5]
+    w = np.linalg.lstsq(linear.X[rest].reshape(-1, 6)[:, free], linear.y[rest].reshape(-1), rcond=None)[0]
+    np.testing.assert_allclose((linear.stats.x + step)[free], w, rtol=1e-8)
+    np.testing.assert_allclose((linear.stats.x + step)[[3, 4]], 0.0, atol=1e-12)
+
+
+def test_without_leaves_one_part_out_of_the_choice(linear):
+    fewer = linear.stats.without(3)  # the only part that needs f
+    found = choose(fewer, TABLE)
+    assert len(fewer.value) == PARTS - 1
+    assert found.kept[0]
+    assert not found.kept[2]
+    assert found.excess[list(found.order).index("once") + 1] < 1e-3
+
+
+def test_a_table_knows_its_terms():
+    assert TABLE.terms == ("real", "idle", "once")
+    fewer = TABLE.with_terms(["real"])
+    assert fewer.terms == ("real",)
+    assert [p.name for p in fewer if not p.free] == ["d", "e", "f"]
+    assert fewer["f"].nominal == 0.5
+    with pytest.raises(UsageError, match="unknown term 'gone'"):
+        TABLE.with_terms(["gone"])
+    values = TABLE.decode(np.ones(6), np.array([True, False, False]))
+    assert [round(float(values[n]), 3) for n in "def"] == [0.0, 0.0, 0.5]
+    assert float(values["c"]) == pytest.approx(float(TABLE.decode(np.ones(6))["c"])) != 0.0
+    with pytest.raises(UsageError, match="where its term"):
+        row("g", off=1.0)
