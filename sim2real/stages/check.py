@@ -27,6 +27,7 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
 from sim2real.robots.base import Robot
+from sim2real.robots.worlds import in_world
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
@@ -62,7 +63,7 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
     # A robust loss would hide what is wrong with the nominal model.
     fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)

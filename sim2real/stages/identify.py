@@ -24,13 +24,15 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, beyond
 from sim2real.identify.verdict import NO_DELAY
+from sim2real.robots.base import RecordedRobot
+from sim2real.robots.worlds import in_world
 from sim2real.stages import advice, identified
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import progress
 from sim2real.stages.cutting import reach, spans, split_of
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.recordings import open_recording
 from sim2real.stages.truth import true_values
 
@@ -40,7 +42,7 @@ _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 
 def identify(
     recording: Recording | Sequence[Recording],
-    pipeline: Pipeline,
+    robot: RecordedRobot | Pipeline,
     config: IdentifyConfig | None = None,
     hold_out: Sequence[Recording] = (),
     best: Best | None = None,
@@ -49,8 +51,8 @@ def identify(
 
     Args:
         recording: What is fitted: one recording, or several.
-        pipeline: The robot.
-        config: How; default: the pipeline's own. The files that it may name are not read.
+        robot: The robot, or its pipeline.
+        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
 
@@ -61,11 +63,12 @@ def identify(
         UsageError: When the recordings are too short, or the model does not fit them.
         Sim2RealError: When a recording holds no numbers where the model reads some.
     """
+    pipeline = pipeline_of(robot)
     config = config or pipeline.identify
     fitted = [recording] if isinstance(recording, Recording) else list(recording)
     logs = [*fitted, *hold_out]
     episodes = [log.episode for log in logs]
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
     model = robot.identifiable(config.max_delay_s)
     table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
@@ -82,6 +85,7 @@ def identify(
         identified.judged(document, findings, robot.units, config.max_delay_s, outside),
         logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
         units=dict(robot.units),
+        world=config.world,
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
     )
@@ -96,7 +100,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
     logs = [open_recording(path, pipeline) for path in paths]
     fitted = len(logs) - len(config.hold_out)
