@@ -113,7 +113,9 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
+        return JudgedLogs(
+            [shown(p) for p in paths], [open_recording(p, pipeline, pipeline.load()).episode for p in paths], False
+        )
     if not isinstance(pipeline.load(), Robot):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",

@@ -33,7 +33,7 @@ from sim2real.stages.cutting import reach, spans, split_of
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline, pipeline_of
-from sim2real.stages.recordings import open_recording
+from sim2real.stages.recordings import open_recording, require_units
 from sim2real.stages.truth import true_values
 
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
@@ -61,7 +61,7 @@ def identify(
 
     Raises:
         UsageError: When the recordings are too short, or the model does not fit them.
-        Sim2RealError: When a recording holds no numbers where the model reads some.
+        Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
     """
     pipeline = pipeline_of(robot)
     config = config or pipeline.identify
@@ -69,6 +69,9 @@ def identify(
     logs = [*fitted, *hold_out]
     episodes = [log.episode for log in logs]
     robot = in_world(pipeline.load(), config.world)
+    for log in logs:
+        require_units(log, robot)
+    units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
     table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
@@ -82,9 +85,9 @@ def identify(
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, table, found))
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
-        identified.judged(document, findings, robot.units, config.max_delay_s, outside),
+        identified.judged(document, findings, units, config.max_delay_s, outside),
         logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
-        units=dict(robot.units),
+        units=units,
         world=config.world,
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
@@ -102,7 +105,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     """
     robot = in_world(pipeline.load(), config.world)
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
-    logs = [open_recording(path, pipeline) for path in paths]
+    logs = [open_recording(path, pipeline, robot) for path in paths]
     fitted = len(logs) - len(config.hold_out)
     model = robot.identifiable(config.max_delay_s)
     table = model.parameters.with_bounds(config.bounds).with_fixed(config.fix).for_recordings(len(logs))
