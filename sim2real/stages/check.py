@@ -98,12 +98,12 @@ def find_source(
     Raises:
         UsageError: When there is neither a recording nor an excitation to plan one with.
     """
-    paths = [Path(p) for p in config.log]
+    paths, robot = [Path(p) for p in config.log], pipeline.load()
     if not paths and not config.plan:
         try:
             recorded = newest(config.runs, pipeline.name, "record")
         except Sim2RealError as error:
-            if not isinstance(pipeline.load(), Robot):
+            if not isinstance(robot, Robot):
                 raise UsageError(
                     f"there is no recording of {pipeline.name!r} in {shown(config.runs)}, and the pipeline has no "
                     "excitation to plan one with",
@@ -113,10 +113,8 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return JudgedLogs(
-            [shown(p) for p in paths], [open_recording(p, pipeline, pipeline.load()).episode for p in paths], False
-        )
-    if not isinstance(pipeline.load(), Robot):
+        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline, robot).episode for p in paths], False)
+    if not isinstance(robot, Robot):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",
