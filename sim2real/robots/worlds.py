@@ -89,10 +89,11 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
             f"world {name!r} makes a {type(model).__name__}", hint="it has to be a sim2real.robots.worlds.WorldModel"
         )
     _check(name, robot, model)
-    for base, kind in ((LoopRobot, _LoopInWorld), (LoggedRobot, _LogInWorld)):
+    step = {"tick_s": 1.0 / model.node.rate, "lead_s": float(getattr(model.node, "lead_s", 0.0))}
+    for base, kind, data in ((LoopRobot, _LoopInWorld, step), (LoggedRobot, _LogInWorld, {})):
         if isinstance(robot, base):
             made: Any = copy.copy(robot)
-            made.__class__ = type(type(robot).__name__, (kind, type(robot)), {"model": model, "world": name})
+            made.__class__ = type(type(robot).__name__, (kind, type(robot)), {**data, "model": model, "world": name})
             return made
     raise UsageError(
         f"{type(robot).__name__} makes its nodes itself: it cannot be put into world {name!r}",
@@ -117,14 +118,6 @@ class _LoopInWorld(LoopRobot):
 
     model: WorldModel
     world: str
-
-    @property
-    def tick_s(self) -> float:
-        return 1.0 / self.model.node.rate
-
-    @property
-    def lead_s(self) -> float:
-        return float(getattr(self.model.node, "lead_s", 0.0))
 
     def dynamics(self) -> list[Parameter]:
         return self.model.dynamics()
