@@ -15,7 +15,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 
 TESTS = Path(__file__).parents[1]
 PAGE = TESTS.parent / "docs" / "tutorial_device.md"
@@ -43,7 +43,7 @@ def site(tmp_path_factory):
     shutil.copytree(TESTS / "plugin", folder / "source")  # building writes beside the source
     offline = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "install", "--quiet", *offline, "--target", folder / "site"]
-    subprocess.run([*command, folder / "source"], check=True, timeout=120)
+    subprocess.run([*command, folder / "source"], check=True, timeout=300)
     return folder / "site"
 
 
@@ -55,7 +55,7 @@ def call(site, tmp_path_factory):
     def run(*arguments):
         command = [sys.executable, *map(str, arguments)]
         env = {**os.environ, "PYTHONPATH": str(site)}
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=290)
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
         return done.stdout
 
