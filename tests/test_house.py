@@ -19,10 +19,6 @@ MAX_LINES = 400
 MODULES = sorted(PACKAGE.rglob("*.py"))
 MANY = 3
 """From so many parameters on, a public function describes each of them."""
-NOT_YET_DESCRIBED = {
-    "hardware/rig.py", "robots/servo_robot.py",
-}  # fmt: skip
-"""Rooms and modules with functions that do not describe their parameters yet. Nothing may be added here."""
 TWICE = {
     "Robot": {"composer/robot.py", "robots/base.py"},  # the composer's names are dm_control's
 }
@@ -206,13 +202,7 @@ def test_whatever_is_public_has_a_docstring(trees):
 
 
 def test_functions_describe_their_parameters(found):
-    missing = {m: names for m, names in found.items() if not {m, m.split("/")[0]} & NOT_YET_DESCRIBED}
-    assert not missing, f"no Args section that names each parameter, in their order: {missing}"
-
-
-def test_what_is_described_leaves_the_list(found):
-    done = NOT_YET_DESCRIBED - {m.split("/")[0] for m in found} - set(found)
-    assert not done, f"take {', '.join(sorted(done))} off NOT_YET_DESCRIBED: nothing is missing there any more"
+    assert not found, f"no Args section that names each parameter, in their order: {found}"
 
 
 @pytest.mark.parametrize(

@@ -261,6 +261,7 @@ class Identification:
         settle_s: Length of the first part of a held-out segment, to which its initial state was fitted [s].
         sigma: Field -> deviation that a measurement was assumed to have.
         units: Field -> unit.
+        world: Name of the world that was identified in; None: the robot's own.
         posterior: What training draws robots from; None where the search was interrupted.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
@@ -290,6 +291,7 @@ class Identification:
     settle_s: float = 0.0
     sigma: Mapping[str, float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    world: str | None = None
     posterior: Posterior | None = None
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)
     free: Mapping[str, np.ndarray] = field(default_factory=dict)

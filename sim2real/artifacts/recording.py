@@ -66,8 +66,11 @@ class Recording:
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Field -> unit, where the session names them."""
-        return self.episode.metadata.get("units", {})
+        """Field -> unit, as the log's channels say; a field with different units in different nodes is left out."""
+        pairs = {pair for fields in self.episode.units.values() for pair in fields.items()}
+        fields = [field for field, _ in pairs]
+        told = {field: unit for field, unit in sorted(pairs) if fields.count(field) == 1}
+        return {**self.episode.metadata.get("units", {}), **told}  # older logs: units are the session's
 
     @property
     def end(self) -> Mapping[str, Any]:

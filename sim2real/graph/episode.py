@@ -125,6 +125,7 @@ class Episode:
         outputs: Node -> field name -> array with one row a step, shape ``(N, ...)``.
         metadata: What the session's log says about itself (pipeline, configuration, versions, ...).
         complete: Whether the session ended properly; False after a crash.
+        units: Node -> field, or entry of one (``"aim[0]"``) -> unit, as far as the recording says.
     """
 
     steps: Mapping[str, Steps]
@@ -132,6 +133,7 @@ class Episode:
     outputs: Mapping[str, Mapping[str, np.ndarray]]
     metadata: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
+    units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:

@@ -273,14 +273,14 @@ class PlannedBus(ABC):
         servo.trip_watchdog()
         self._truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
         if servo.watchdog_stops:
-            self._stop_motor(servo, t_ns, OperatingMode.PWM)
+            self._stop_motor(servo, t_ns, servo.command()[0])
 
     def _overload(self, t_ns: int) -> None:
         for servo in self._firmware.values():
             servo.overload()
             self._stop_motor(servo, t_ns, OperatingMode.OFF)
 
-    def _stop_motor(self, servo: Firmware, t_ns: int, mode: OperatingMode) -> None:
+    def _stop_motor(self, servo: Firmware, t_ns: int, mode: int) -> None:
         """Stop the motor by the servo's own firmware: at once, dropping commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)

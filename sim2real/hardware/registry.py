@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib import metadata
-from typing import Any, Final, Protocol, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, cast
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import Device
+from sim2real.hardware.entries import DEVICES, available
 from sim2real.hardware.plant import load_named
-
-ENTRY_POINT_GROUP: Final = "sim2real.devices"
-OWN: Final = {
-    "dynamixel": "sim2real.hardware.dynamixel.device:servos",
-    "feetech": "sim2real.hardware.feetech.device:servos",
-}
-"""Name -> ``module:callable`` of the devices that come with sim2real."""
 
 
 class DeviceFactory(Protocol):
@@ -34,33 +27,43 @@ class DeviceFactory(Protocol):
         ...
 
 
-def available() -> dict[str, Any]:
-    """Return name -> source of all devices: those of installed packages before those that come with sim2real."""
-    return {**OWN, **{entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)}}
-
-
 def load_device(name: str) -> DeviceFactory:
     """Return what makes the device of a name.
 
     Raises:
         UsageError: There is no such device, or what its entry point names cannot be imported or called.
     """
-    found = available()
+    return cast(DeviceFactory, load_entry("device", name, DEVICES, "hardware.registry.DeviceFactory"))
+
+
+def load_entry(what: str, name: str, group: str, contract: str) -> Callable[..., Any]:
+    """Return what makes something that goes by a name.
+
+    Args:
+        what: What it is, in a word.
+        name: Its name.
+        group: The entry point group.
+        contract: What says how it is called, for the hint: a name in sim2real.
+
+    Raises:
+        UsageError: There is no such name, or what its entry point names cannot be imported or called.
+    """
+    found = available(group)
     if name not in found:
         raise UsageError(
-            f"unknown device {name!r}. Available: {', '.join(sorted(found))}",
-            hint=f"install a package with the entry point group '{ENTRY_POINT_GROUP}'",
+            f"unknown {what} {name!r}. Available: {', '.join(sorted(found)) or 'none'}",
+            hint=f"install a package with the entry point group '{group}'",
         )
     source = found[name]
     if isinstance(source, str):
-        return cast(DeviceFactory, load_named(source, "device"))
+        return load_named(source, what)
     try:
         factory = source.load()
     except (ImportError, AttributeError) as error:
-        raise UsageError(f"device {name!r} ({source.value}) cannot be imported: {error}") from error
+        raise UsageError(f"{what} {name!r} ({source.value}) cannot be imported: {error}") from error
     if not callable(factory):
         raise UsageError(
-            f"device {name!r} ({source.value}) is {type(factory).__name__}, not a callable that makes a Device",
-            hint="see sim2real.hardware.registry.DeviceFactory",
+            f"{what} {name!r} ({source.value}) is {type(factory).__name__}, not a callable that makes a {what}",
+            hint=f"see sim2real.{contract}",
         )
-    return cast(DeviceFactory, factory)
+    return factory

@@ -160,6 +160,11 @@ class Rig:
     def wait_until_still(self, timeout_s: float, speed_rad_s: float = 0.05, for_s: float = 0.5) -> Reading:
         """Wait, with torque off, until nothing moves any more.
 
+        Args:
+            timeout_s: Longest time to wait [s].
+            speed_rad_s: A motor this slow or slower counts as still [rad/s].
+            for_s: How long all must be still without a break [s].
+
         Raises:
             HardwareLost: It still moves after ``timeout_s``.
         """

@@ -50,7 +50,7 @@ def import_file(
     Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are kept, rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
     sample. Without recorded stamps, they are generated from the node's rate. The episode's metadata has ``stamps``
-    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``units``, ``graph``, ``mapping`` and
+    (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``graph``, ``mapping`` and
     ``versions``.
 
     Args:
@@ -95,11 +95,11 @@ def import_file(
             "pipeline": mapping.pipeline,
             "source": source,
             "stamps": stamps,
-            "units": _shared_units(mapping),
             "graph": {name: {"rate_hz": _rate_hz(t), "inputs": {}} for name, t in ticks.items()},
             "mapping": {name: asdict(node) for name, node in mapping.nodes.items()},
             "versions": {"sim2real": metadata.version("sim2real")},
         },
+        units=mapping.units,
     )
 
 
@@ -119,7 +119,7 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
     """
     names = list(episode.steps)
     examples = {node: {f: v[0] for f, v in fields.items()} for node, fields in episode.outputs.items()}
-    file = SessionFile(Path(path), episode.metadata, {}, examples, [], {}, mapping.units)
+    file = SessionFile(Path(path), episode.metadata, {}, examples, [], {}, episode.units)
     try:
         zero = episode.metadata["source"]["time_zero_us"]
         file.start(1000 * zero if zero >= _WALL_CLOCK else 0, 0)
@@ -288,10 +288,3 @@ def _steps(ticks: np.ndarray) -> Steps:
 
 def _rate_hz(ticks: np.ndarray) -> float | None:
     return round(1e6 / float(np.median(np.diff(ticks))), 3) if len(ticks) > 1 else None
-
-
-def _shared_units(mapping: ImportMapping) -> dict[str, str]:
-    """Return field -> unit, as recorded logs have it; fields with different units in different nodes are left out."""
-    pairs = {(field, how.unit) for node in mapping.nodes.values() for field, how in node.fields.items()}
-    fields = [field for field, _ in pairs]
-    return {field: unit for field, unit in sorted(pairs) if unit and fields.count(field) == 1}

@@ -14,7 +14,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
 from sim2real.log.cdr import read_text
 from sim2real.log.contents import Contents, Range, in_words, walk
-from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields
+from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields, units_of_fields
 
 # Positions of an event's level, and of its name before alignment [bytes].
 _LEVEL_AT, _NAME_AT = 12, 13
@@ -56,6 +56,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     with in_words(path):
         steps, outputs, sequences = _steps_and_outputs(contents, span)
         messages, events = _connections(contents, span, sequences), _events(contents, span)
+        units = _units(contents)
     # Steps before the first one count as lost, unless a range was asked for that starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
@@ -77,6 +78,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         outputs=outputs,
         metadata={**(contents.session or {}), "log": facts},
         complete=contents.end is not None,
+        units=units,
     )
 
 
@@ -128,6 +130,13 @@ def summary(path: str | Path) -> dict[str, Any]:
         "topics": {c.topic: contents.indexed.get(number, 0) for number, c in contents.channels.items()},
         "skipped": contents.damage.skipped,
     }
+
+
+def _units(contents: Contents) -> dict[str, dict[str, str]]:
+    """Return node -> field -> unit, for the nodes whose channels say it."""
+    channels = contents.with_role("output").values()
+    found = {c.metadata["node"]: units_of_fields(json.loads(c.metadata["fields"])) for c in channels}
+    return {node: units for node, units in found.items() if units}
 
 
 def _steps_and_outputs(

@@ -78,7 +78,7 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
     Args:
         node: The node's name.
         example: An output, such as ``init_output`` returns.
-        units: Field -> unit, as far as known.
+        units: Field, or entry of one (``"aim[0]"``) -> unit, as far as known.
 
     Raises:
         Sim2RealError: When two leaves get the same name, or one has a dtype that ROS lacks.
@@ -89,15 +89,15 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
         {"name": names[original], "original": original, "dtype": a.dtype.str, "shape": list(a.shape)}
         for original, a in arrays.items()
     ]
-    for entry in described:
-        if unit := (units or {}).get(entry["original"]):
+    for entry, array in zip(described, arrays.values(), strict=True):
+        if unit := _unit(entry["original"], array.size, units or {}):
             entry["unit"] = unit
     lines = []
     for entry in described:
         part = _field(entry)
         count = f"[{part.size}]" if part.shape else ""
         notes = [f"{entry['original']}, shape {tuple(part.shape)}"] if len(part.shape) > 1 else []
-        notes += [f"[{entry['unit']}]"] if "unit" in entry else []
+        notes += [f"[{', '.join([unit] if isinstance(unit, str) else unit)}]"] if (unit := entry.get("unit")) else []
         note = f"  # {' '.join(notes)}" if notes else ""
         if part.size:
             lines.append(f"{ROS_TYPES[part.dtype.str[1:]]}{count} {entry['name']}{note}\n")
@@ -115,20 +115,39 @@ def layout_of_fields(described: Sequence[Mapping[str, Any]]) -> Layout:
     return Layout(part for entry in described if (part := _field(entry)).size)
 
 
+def units_of_fields(described: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return field, or entry of one -> unit, from ``fields`` in a channel's metadata."""
+    found: dict[str, str] = {}
+    for entry in described:
+        unit, name = entry.get("unit"), entry["original"]
+        if isinstance(unit, str):
+            found[name] = unit
+        elif isinstance(unit, list):
+            found |= {f"{name}[{i}]": str(u) for i, u in enumerate(unit) if u}
+    return found
+
+
 def step_topic(node: str) -> Topic:
     """Return the topic of a node's step records."""
-    metadata = {"role": "step", "node": node, "unit": "1e-6 s from the episode's start"}
+    fields = _scalars({name: "1" if name == "seq" else "us" for name in STEP_FIELDS})
+    metadata = {"role": "step", "node": node, "unit": "1e-6 s from the episode's start", "fields": fields}
     return Topic(f"/{snake(node)}/step", "sim2real_msgs/msg/Step", _int64_text(STEP_FIELDS), STEP_LAYOUT, metadata)
 
 
 def input_topic(node: str, input_name: str) -> Topic:
     """Return the topic of a connection's message records."""
-    metadata = {"role": "input", "node": node, "input": input_name}
+    fields = _scalars(dict.fromkeys(MESSAGE_FIELDS, "1"))
+    metadata = {"role": "input", "node": node, "input": input_name, "fields": fields}
     name = f"/{snake(node)}/inputs/{snake(input_name)}"
     return Topic(name, "sim2real_msgs/msg/Input", _int64_text(MESSAGE_FIELDS), MESSAGE_LAYOUT, metadata)
 
 
-def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]]) -> JointSource:
+def joint_source(
+    node: str,
+    example: Any,
+    joints: Mapping[str, Mapping[str, str]],
+    units: Mapping[str, str] | None = None,
+) -> JointSource:
     """Return how a node's output becomes ``sensor_msgs/msg/JointState``.
 
     Args:
@@ -136,6 +155,7 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
         example: An output of the node.
         joints: Joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the output: ``"th"``, or
             ``"q[2]"`` for an element of the flattened field.
+        units: Field, or entry of one -> unit, as far as known.
 
     Raises:
         Sim2RealError: When a quantity, a field or an element does not exist.
@@ -147,7 +167,8 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
             raise Sim2RealError(
                 f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
             )
-    picks = []
+    picks: list[tuple[tuple[int, int], ...]] = []
+    described: list[dict[str, Any]] = []
     parts: list[CdrConstant | CdrField] = [
         CdrField("sec", np.dtype("<i4")),
         CdrField("nanosec", np.dtype("<u4")),
@@ -161,7 +182,12 @@ def joint_source(node: str, example: Any, joints: Mapping[str, Mapping[str, str]
         parts.append(length(len(chosen)))
         if chosen:
             parts.append(CdrField(quantity, np.dtype("<f8"), (len(chosen),)))
-    metadata = {"role": "joint_states"}
+            entry = {"name": quantity, "original": quantity, "dtype": "<f8", "shape": [len(chosen)]}
+            sources = (s.get(quantity, "") for s in joints.values())
+            own = {f"{quantity}[{i}]": unit_of(source, units or {}) for i, source in enumerate(sources)}
+            unit = _unit(quantity, len(chosen), own)
+            described.append({**entry, "unit": unit} if unit else entry)
+    metadata = {"role": "joint_states", "fields": json.dumps(described)}
     topic = Topic("/joint_states", "sensor_msgs/msg/JointState", _JOINT_STATE_TEXT, Layout(parts), metadata)
     return JointSource(topic, tuple(picks))
 
@@ -187,6 +213,23 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
             )
         taken[name] = original
     return {original: name for name, original in taken.items()}
+
+
+def unit_of(name: str, units: Mapping[str, str]) -> str:
+    """Return the unit of a field, or of an entry of one, or an empty string."""
+    return units.get(name, units.get(name.partition("[")[0], ""))
+
+
+def _unit(name: str, size: int, units: Mapping[str, str]) -> str | list[str]:
+    """Return the unit of a field; a list if its entries have different ones; empty if none is known."""
+    entries = [unit_of(f"{name}[{i}]", units) for i in range(size)]
+    return entries if len(set(entries)) > 1 else "".join(set(entries))
+
+
+def _scalars(units: Mapping[str, str]) -> str:
+    """Return ``fields`` of a channel whose fields are whole numbers."""
+    common = {"dtype": _INT64.str, "shape": list[int]()}
+    return json.dumps([{"name": name, "original": name, **common, "unit": unit} for name, unit in units.items()])
 
 
 def _field(entry: Mapping[str, Any]) -> CdrField:

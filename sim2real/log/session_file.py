@@ -69,7 +69,7 @@ class SessionFile:
         outputs: Node -> an example of its output.
         inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
-        units: Node -> field -> unit, for the channels' metadata.
+        units: Node -> field, or entry of one -> unit, for the channels' metadata.
 
     Attributes:
         counts: Topic -> number of messages written.
@@ -251,9 +251,10 @@ def _nodes(
     nodes, types = {}, {}
     for name, example in outputs.items():
         leaves = list(named_leaves(example).values())
-        joints = joint_source(name, example, joint_states[name]) if name in joint_states else None
+        own = units.get(name, {})
+        joints = joint_source(name, example, joint_states[name], own) if name in joint_states else None
         filled = [i for i, leaf in enumerate(leaves) if np.size(leaf)]
-        node = _Node(step_topic(name), output_topic(name, example, units.get(name, {})), filled, len(leaves), joints)
+        node = _Node(step_topic(name), output_topic(name, example, own), filled, len(leaves), joints)
         other = types.setdefault(node.output.schema, name)
         if other != name:
             raise Sim2RealError(

@@ -44,6 +44,7 @@ class McapRecorder:
         inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the node's output
             (``"th"``, ``"q[2]"``): also written as ``/joint_states``, which viewers plot without configuration.
+        units: Node -> field, or entry of one (``"aim[0]"``) -> unit, as far as known.
 
     Raises:
         Sim2RealError: When the file exists or cannot be created, the metadata cannot be written as JSON, two names get
@@ -58,12 +59,13 @@ class McapRecorder:
         outputs: Mapping[str, Any],
         inputs: Iterable[tuple[str, str]],
         joint_states: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None,
+        units: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         if "log" in metadata:
             raise Sim2RealError("the session's metadata has a key 'log', where the reader puts facts about the log")
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
-        self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {})
+        self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
         self._queue: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
         self._longest_queue = 0
         self._error: BaseException | None = None

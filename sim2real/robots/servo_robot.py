@@ -122,7 +122,13 @@ class ServoRobot(LoopRobot):
         return state.reward - 0.01 * jnp.mean((action / self.servos.speed) ** 2)
 
     def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
-        """Return what the policy sees of the present, in the order of ``features``."""
+        """Return what the policy sees of the present, in the order of ``features``.
+
+        Args:
+            reading: The newest measurement.
+            goal: The goals, shape ``(joints,)`` [rad].
+            aim: What the episode is about, shape ``(k,)``.
+        """
         return jnp.concatenate([reading.position, reading.velocity, goal, aim])
 
     # -- what the stages ask
@@ -251,12 +257,24 @@ class ServoRobot(LoopRobot):
         return params
 
     def rest_params(self, values: Mapping[str, Any], policy: Any, trial: int) -> dict[str, Any]:
-        """Return parameters for an episode from rest, with a policy and a trial's aim."""
+        """Return parameters for an episode from rest.
+
+        Args:
+            values: Parameters by name.
+            policy: The policy.
+            trial: Number of the trial, whose aim it has.
+        """
         rest = self.servos.at_rest
         return self.node_params(values, rest, np.zeros_like(rest), self.draw_aim(jax.random.key(trial)), policy)
 
     def agent_params(self, session: ServoSession, policy: Any, trial: int) -> AgentParams:
-        """Return the agent's parameters on hardware: goals start where the joints are."""
+        """Return the agent's parameters on hardware: goals start where the joints are.
+
+        Args:
+            session: The open robot.
+            policy: The policy.
+            trial: Number of the trial, whose aim it has.
+        """
         start = jnp.asarray(session.rig.measure().position_rad, jnp.float32)
         return AgentParams(policy=policy, aim=self.draw_aim(jax.random.key(trial)), start=start)
 

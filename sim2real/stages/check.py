@@ -27,6 +27,7 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
 from sim2real.robots.base import Robot
+from sim2real.robots.worlds import in_world
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
 from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
@@ -62,7 +63,7 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
     # A robust loss would hide what is wrong with the nominal model.
     fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)
@@ -97,12 +98,12 @@ def find_source(
     Raises:
         UsageError: When there is neither a recording nor an excitation to plan one with.
     """
-    paths = [Path(p) for p in config.log]
+    paths, robot = [Path(p) for p in config.log], pipeline.load()
     if not paths and not config.plan:
         try:
             recorded = newest(config.runs, pipeline.name, "record")
         except Sim2RealError as error:
-            if not isinstance(pipeline.load(), Robot):
+            if not isinstance(robot, Robot):
                 raise UsageError(
                     f"there is no recording of {pipeline.name!r} in {shown(config.runs)}, and the pipeline has no "
                     "excitation to plan one with",
@@ -112,8 +113,8 @@ def find_source(
         else:
             paths = [recorded.output("log")]
     if paths:
-        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline).episode for p in paths], False)
-    if not isinstance(pipeline.load(), Robot):
+        return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline, robot).episode for p in paths], False)
+    if not isinstance(robot, Robot):
         raise UsageError(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",

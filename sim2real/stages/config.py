@@ -84,6 +84,8 @@ class IdentifyConfig(FitConfig):
     """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
     """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
+    world: str | None = None
+    """World of an installed package to identify in; default: the robot's own."""
     reveal: bool = True
     """Show the embedded robot's true parameters beside the estimates; the search never sees them."""
 
@@ -123,6 +125,8 @@ class TrainConfig:
     """Parameters to train on: what identify found, or the nominal ones without any delay."""
     parameters: str | None = None
     """parameters.json to train on; default: the newest identification of the pipeline."""
+    world: str | None = None
+    """World of an installed package to train in; default: the one that was identified, or the robot's own."""
     timelines: int = 32
     """Timelines drawn from the recorded timing."""
     episode_s: float = 5.0
@@ -264,6 +268,8 @@ class CheckConfig:
     """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
     """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
+    world: str | None = None
+    """World of an installed package whose parameters are judged; default: the robot's own."""
     json: bool = False
     """Print JSON instead of tables."""
     runs: Path = Path("runs")

@@ -18,7 +18,7 @@ from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.gap import compare
 from sim2real.stages.parameters import check_parameters, open_identification
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -27,7 +27,7 @@ from sim2real.train.networks import Policy
 
 def deploy(
     bundle: Bundle,
-    pipeline: Pipeline,
+    robot: Robot | Pipeline,
     folder: Path,
     config: DeployConfig | None = None,
     identification: Identification | None = None,
@@ -36,9 +36,9 @@ def deploy(
 
     Args:
         bundle: The policy.
-        pipeline: The robot.
+        robot: The robot, or its pipeline.
         folder: Takes the logs.
-        config: How; default: the pipeline's own. The bundle that it may name is not read.
+        config: How; default: that of the pipeline that loaded the robot. The bundle that it may name is not read.
         identification: What to simulate with; without one nothing is compared.
 
     Returns:
@@ -47,6 +47,7 @@ def deploy(
     Raises:
         Sim2RealError: When the policy does not fit the robot, or what stopped the robot.
     """
+    pipeline = pipeline_of(robot)
     config = config or pipeline.deploy
     robot = moving_robot(pipeline)
     policy = _load_policy(robot, bundle)
@@ -60,8 +61,10 @@ def deploy(
         nothing = tuple(Scores({}) for _ in recordings)
         none: tuple[dict[str, np.ndarray], ...] = tuple({} for _ in recordings)
         return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
-    values = None if identification is None else identification.values
-    return compare(robot, recordings, policy, values, config.duration_s), sessions
+    if identification is None:
+        return compare(robot, recordings, policy, None, config.duration_s), sessions
+    simulated = moving_robot(pipeline, identification.world)
+    return compare(simulated, recordings, policy, identification.values, config.duration_s), sessions
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:

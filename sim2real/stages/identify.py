@@ -24,14 +24,16 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, beyond
 from sim2real.identify.verdict import NO_DELAY
+from sim2real.robots.base import RecordedRobot
+from sim2real.robots.worlds import in_world
 from sim2real.stages import advice, identified, left_out
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import progress
 from sim2real.stages.cutting import reach, spans, split_of
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
-from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.recordings import open_recording
+from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.recordings import open_recording, require_units
 from sim2real.stages.truth import true_values
 
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
@@ -40,7 +42,7 @@ _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 
 def identify(
     recording: Recording | Sequence[Recording],
-    pipeline: Pipeline,
+    robot: RecordedRobot | Pipeline,
     config: IdentifyConfig | None = None,
     hold_out: Sequence[Recording] = (),
     best: Best | None = None,
@@ -49,8 +51,8 @@ def identify(
 
     Args:
         recording: What is fitted: one recording, or several.
-        pipeline: The robot.
-        config: How; default: the pipeline's own. The files that it may name are not read.
+        robot: The robot, or its pipeline.
+        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
 
@@ -59,13 +61,17 @@ def identify(
 
     Raises:
         UsageError: When the recordings are too short, or the model does not fit them.
-        Sim2RealError: When a recording holds no numbers where the model reads some.
+        Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
     """
+    pipeline = pipeline_of(robot)
     config = config or pipeline.identify
     fitted = [recording] if isinstance(recording, Recording) else list(recording)
     logs = [*fitted, *hold_out]
     episodes = [log.episode for log in logs]
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
+    for log in logs:
+        require_units(log, robot)
+    units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
     table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
@@ -89,9 +95,10 @@ def identify(
         document = replace(document, left_out=without, terms=terms)
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
-        identified.judged(document, findings, robot.units, config.max_delay_s, outside),
+        identified.judged(document, findings, units, config.max_delay_s, outside),
         logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
-        units=dict(robot.units),
+        units=units,
+        world=config.world,
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
     )
@@ -106,9 +113,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), config.world)
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
-    logs = [open_recording(path, pipeline) for path in paths]
+    logs = [open_recording(path, pipeline, robot) for path in paths]
     fitted = len(logs) - len(config.hold_out)
     model = robot.identifiable(config.max_delay_s)
     table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)

@@ -9,22 +9,26 @@ from typing import Any
 
 from sim2real.artifacts.manifest import plain, versions
 from sim2real.artifacts.run_folder import STAGES, attempts, run_folders
+from sim2real.hardware import entries
 from sim2real.stages.console import pairs, shown, table
 from sim2real.stages.flags import flag_names
 from sim2real.stages.pipeline import available, load_pipeline
 
 
 def installation() -> str:
-    """Return versions and the pipelines found."""
+    """Return versions, and the pipelines, devices and worlds found."""
     rows = []
     for name, source in sorted(available().items()):
-        origin = shown(source) if isinstance(source, Path) else f"entry point {source.value}"
         try:
             summary = load_pipeline(name).summary
         except Exception as error:  # one broken pipeline must not hide the others
             summary = f"cannot be imported: {type(error).__name__}: {error}"
-        rows.append([name, summary, origin])
-    return f"{pairs(versions())}\n\n{table(rows, ['pipeline', 'summary', 'from'])}"
+        rows.append([name, summary, _origin(source)])
+    blocks = [pairs(versions()), table(rows, ["pipeline", "summary", "from"])]
+    for what, group in (("device", entries.DEVICES), ("world", entries.WORLDS)):
+        if found := entries.available(group):
+            blocks.append(table([[name, _origin(found[name])] for name in sorted(found)], [what, "from"]))
+    return "\n\n".join(blocks)
 
 
 def pipeline(name: str, root: Path) -> str:
@@ -89,6 +93,13 @@ def log(path: Path) -> str:
         values = {name: _one_line(value) for name, value in (facts[title] or {}).items()}
         blocks.append(f"{title}\n{pairs(values) or '-'}")
     return "\n\n".join(blocks)
+
+
+def _origin(source: Any) -> str:
+    """Return where something that goes by a name comes from: a folder, a module, or an installed package."""
+    if isinstance(source, Path):
+        return shown(source)
+    return source if isinstance(source, str) else f"entry point {source.value}"
 
 
 def _one_line(value: Any) -> str:

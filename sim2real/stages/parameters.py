@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sim2real.artifacts.identification import Identification
 from sim2real.errors import Sim2RealError
+from sim2real.robots.worlds import in_world
 from sim2real.stages.pipeline import Pipeline
 
 
@@ -29,6 +30,7 @@ def check_parameters(found: Identification, pipeline: Pipeline) -> None:
 
     Raises:
         Sim2RealError: When it is of another pipeline, lacks parameters, or was interrupted.
+        UsageError: When the world that it was identified in is not installed.
     """
     hint = f"make them with `sim2real identify {pipeline.name}`"
     if found.pipeline != pipeline.name:
@@ -37,7 +39,7 @@ def check_parameters(found: Identification, pipeline: Pipeline) -> None:
         raise Sim2RealError(
             "this identification was interrupted: it says nothing about how sure its estimates are", hint=hint
         )
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), found.world)
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
     there = {p.name for p in found.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:

@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, overload
+from weakref import WeakKeyDictionary
 
 from sim2real.errors import UsageError
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
@@ -71,7 +72,42 @@ class Pipeline:
             return found
         from sim2real.robots.base import checked  # imports JAX
 
-        return checked(getattr(found, "ROBOT", None), f"pipeline {self.name!r} ({found.__file__})")
+        robot = checked(getattr(found, "ROBOT", None), f"pipeline {self.name!r} ({found.__file__})")
+        _LOADED[robot] = self
+        return robot
+
+
+_LOADED: WeakKeyDictionary[RecordedRobot, Pipeline] = WeakKeyDictionary()
+"""Robot -> the pipeline that has loaded it."""
+
+
+@dataclass(frozen=True)
+class _OfRobot(Pipeline):
+    """A robot that no pipeline has loaded, such as one made in a notebook, with the stages' own defaults."""
+
+    made: Any = None
+
+    def load(self, module: str | None = None) -> Any:
+        return super().load(module) if module else self.made
+
+
+def pipeline_of(robot: RecordedRobot | Pipeline) -> Pipeline:
+    """Return the pipeline that has loaded a robot; one with its class's name and the stages' defaults if none has.
+
+    Raises:
+        UsageError: It is neither a robot nor a pipeline, or not a complete robot.
+    """
+    if isinstance(robot, Pipeline):
+        return robot
+    from sim2real.robots.base import RecordedRobot, checked  # imports JAX
+
+    if not isinstance(robot, RecordedRobot):
+        raise UsageError(
+            f"{robot!r} is neither a robot nor a pipeline",
+            hint="sim2real.load_pipeline(NAME) is a pipeline, and its load() a robot",
+        )
+    kind = type(robot)
+    return _LOADED.get(robot) or _OfRobot(kind.__name__, "", kind.__module__, made=checked(robot, kind.__module__))
 
 
 def available() -> dict[str, Any]:

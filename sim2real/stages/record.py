@@ -7,22 +7,25 @@ from typing import Any
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, open_stage
+from sim2real.robots.base import Robot
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 
 
-def record(pipeline: Pipeline, folder: Path, config: RecordConfig | None = None) -> tuple[Recording, dict[str, Any]]:
+def record(
+    robot: Robot | Pipeline, folder: Path, config: RecordConfig | None = None
+) -> tuple[Recording, dict[str, Any]]:
     """Play the excitation on the robot and record it.
 
     Args:
-        pipeline: The robot.
+        robot: The robot, or its pipeline.
         folder: Takes the log.
-        config: How; default: the pipeline's own.
+        config: How; default: that of the pipeline that loaded the robot.
 
     Returns:
         The recording, and the summary of its session.
@@ -30,6 +33,7 @@ def record(pipeline: Pipeline, folder: Path, config: RecordConfig | None = None)
     Raises:
         Sim2RealError: What stopped the robot; the log holds everything up to then.
     """
+    pipeline = pipeline_of(robot)
     config = config or pipeline.record
     robot = moving_robot(pipeline)
     signal = excitation(config, robot.rate_hz, len(robot.action))

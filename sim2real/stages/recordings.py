@@ -8,24 +8,30 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.identify.segments import require_moved
 from sim2real.log.importer import import_file, load_mapping
+from sim2real.log.schema import unit_of
+from sim2real.robots.base import RecordedRobot
 from sim2real.stages.console import note
 from sim2real.stages.pipeline import Pipeline
 
 
-def open_recording(path: Path, pipeline: Pipeline) -> Recording:
+def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None = None) -> Recording:
     """Read a log of a pipeline; a log that was cut is used as far as it goes.
 
     A file of another recorder is imported in memory, where the pipeline has a mapping for it.
 
     Args:
         path: The file.
-        pipeline: The robot that it must be of.
+        pipeline: The pipeline that it must be of.
+        robot: Its robot, in whose units the log must be; None: any units.
 
     Raises:
-        Sim2RealError: When it is no log, of another pipeline, or of a dry run, or has holes.
+        Sim2RealError: When it is no log, of another pipeline, or of a dry run, in other units, or has holes.
     """
     if path.suffix != ".mcap" and path.is_file() and (mapping := pipeline.folder / "import.toml").is_file():
-        return Recording(path, import_file(path, load_mapping(mapping)))
+        recording = Recording(path, import_file(path, load_mapping(mapping)))
+        if robot is not None:
+            require_units(recording, robot)
+        return recording
     recording = Recording.load(path)
     for warning in recording.warnings:
         note(f"warning: {warning}; what is there is used")
@@ -39,7 +45,25 @@ def open_recording(path: Path, pipeline: Pipeline) -> Recording:
             f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
         )
     require_moved(recording.episode, str(path))
+    if robot is not None:
+        require_units(recording, robot)
     holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
     if holes:
         raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
     return recording
+
+
+def require_units(recording: Recording, robot: RecordedRobot) -> None:
+    """Check that what the robot's sensor and actuator sent is in the units that the robot computes in.
+
+    Raises:
+        Sim2RealError: When a log is in other ones.
+    """
+    said = recording.episode.units or dict.fromkeys((robot.roles.sensor, robot.roles.actuator), recording.units)
+    for node in (robot.roles.sensor, robot.roles.actuator):
+        for field, unit in said.get(node, {}).items():
+            if unit != (own := unit_of(field, robot.units) or unit):
+                raise Sim2RealError(
+                    f"{field!r} of {node!r} is in {unit} in the log {recording.path}, the robot computes in {own}",
+                    hint="convert it: `scale` in the mapping of an import, or the robot's `units`",
+                )

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from sim2real.errors import UsageError
 from sim2real.robots.base import Robot
+from sim2real.robots.worlds import in_world
 from sim2real.stages.pipeline import Pipeline
 
 
-def moving_robot(pipeline: Pipeline) -> Robot:
+def moving_robot(pipeline: Pipeline, world: str | None = None) -> Robot:
     """Return a pipeline's robot for the stages that need hardware or training.
 
+    Args:
+        pipeline: The pipeline.
+        world: World that it is simulated in; None: its own.
+
     Raises:
-        UsageError: When the pipeline is for recordings only, and has just what identification needs.
+        UsageError: When the pipeline is for recordings only, and has just what identification needs; or there is no
+            such world.
     """
-    robot = pipeline.load()
+    robot = in_world(pipeline.load(), world)
     if not isinstance(robot, Robot):
         name = pipeline.name
         raise UsageError(

@@ -184,14 +184,14 @@ def _recorder(
         "config": plain(asdict(config)),
         "graph": topology,
         "roles": asdict(robot.roles),
-        "units": dict(robot.units),
         "versions": plain(versions()),
         "git": plain(git_state()),
         "seed": config.seed,
         "port": config.port,
     }
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, {robot.roles.sensor: robot.joints})
+    joints, units = {robot.roles.sensor: robot.joints}, dict.fromkeys(graph.nodes, robot.units)
+    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
     if dry:
         recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
     return recorder

@@ -28,7 +28,7 @@ from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.robot import moving_robot
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
@@ -44,7 +44,7 @@ _DRAWS = 1024
 
 
 def train(
-    pipeline: Pipeline,
+    robot: Robot | Pipeline,
     config: TrainConfig | None = None,
     identification: Identification | None = None,
     timing: Timing | None = None,
@@ -52,8 +52,8 @@ def train(
     """Train a policy.
 
     Args:
-        pipeline: The robot.
-        config: How; default: the pipeline's own. The file that it may name is not read.
+        robot: The robot, or its pipeline.
+        config: How; default: that of the pipeline that loaded the robot. The file that it may name is not read.
         identification: What identify found; the nominal model needs none.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
             nominal model has no delays.
@@ -62,16 +62,17 @@ def train(
         The policy with what it expects and promises, and numbers about the training.
 
     Raises:
-        UsageError: When the identified model is asked for without an identification.
+        UsageError: When the identified model is asked for without an identification, or in another world.
         Sim2RealError: When the identification is of another robot, or its timing cannot be trained with.
     """
+    pipeline = pipeline_of(robot)
     config = config or pipeline.train
-    robot = moving_robot(pipeline)
     delays = config.model == "identified"
     if delays and identification is None:
         raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
     if identification is not None and delays:
         check_parameters(identification, pipeline)
+    robot = moving_robot(pipeline, _world(config, identification if delays else None))
     values, draws = model_values(robot, identification, config)
     computation, dropped = _computation(robot, identification, timing) if delays else ({}, {})
     nodes, task = robot.training(values, draws, computation, delays)
@@ -121,6 +122,21 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
             print(table(*_rows(bundle.history)))
         stage.summary(about)
     return stage.result
+
+
+def _world(config: TrainConfig, identified: Identification | None) -> str | None:
+    """Return the world to train in.
+
+    Raises:
+        UsageError: When another one is asked for than was identified.
+    """
+    if identified is not None and config.world not in (None, identified.world):
+        own = repr(identified.world) if identified.world else "the robot's own"
+        raise UsageError(
+            f"these parameters are of another world, {own}, than {config.world!r}",
+            hint=f"identify with --world {config.world}, or train with --model nominal",
+        )
+    return config.world if identified is None else identified.world
 
 
 def model_values(

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Quantity
 from sim2real.artifacts.run_folder import StageFolder
+from sim2real.log.schema import unit_of
 from sim2real.view import identify_figures, intervals, residuals
 from sim2real.view.about import about
 from sim2real.view.blocks import (
@@ -27,7 +28,6 @@ from sim2real.view.blocks import (
     pretty_unit,
 )
 from sim2real.view.readable import in_readable_unit
-from sim2real.view.signals import unit_of
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from sim2real.log.schema import unit_of
 from sim2real.view import style
-from sim2real.view.signals import unit_of
 from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, to_svg
 
 

@@ -13,6 +13,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
+from sim2real.log.schema import unit_of
 from sim2real.view import figures, timing
 from sim2real.view.about import about
 from sim2real.view.blocks import (
@@ -29,7 +30,7 @@ from sim2real.view.blocks import (
 )
 from sim2real.view.identify_section import identify_section
 from sim2real.view.servos import DRY, servo_blocks
-from sim2real.view.signals import Signals, signals_of, simulated_series, unit_of
+from sim2real.view.signals import Signals, signals_of, simulated_series
 
 
 def record_section(artifact: StageFolder) -> PageSection:

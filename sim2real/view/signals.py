@@ -38,7 +38,7 @@ class Signals:
         measured: Outputs of nodes without inputs, at the time of the sample.
         commanded: Outputs of the other nodes, at the time of sending.
         truth: True states by name, of an embedded robot.
-        units: Field -> unit, where the session names them.
+        units: Field -> unit, where the log says it.
         warnings: What the log lacks.
     """
 
@@ -120,11 +120,6 @@ def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> l
     if flat.shape[1] == 1:
         return [Series(name, source, t_s, flat[:, 0])]
     return [Series(f"{name}[{i}]", source, t_s, flat[:, i]) for i in range(flat.shape[1])]
-
-
-def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Return the unit of a series by the name of its field, or an empty string."""
-    return units.get(name, units.get(name.partition("[")[0], ""))
 
 
 def _node_series(node: str, times_s: np.ndarray, outputs: Mapping[str, np.ndarray]) -> list[Series]:

@@ -1,8 +1,10 @@
 """The four stages, one after the other and one by one, with tiny budgets."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 
 pytestmark = pytest.mark.realtime
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "guides" / "notebook.md"
 
 
 def strict_json(path):
@@ -89,24 +93,35 @@ def test_a_run_that_was_copied_goes_on_without_its_origin(completed, tmp_path, m
     assert all(np.array_equal(before.weights[n], after.weights[n]) for n in before.weights)
 
 
-def test_the_stages_are_functions_of_what_others_left(completed, tmp_path):
-    """Each takes the artifact of another one, opened from Python."""
-    pendulum = sim2real.load_pipeline("pendulum")
-    recording = sim2real.Recording.load(completed / "record")
-    brief = replace(pendulum.identify, generations=10, population=8, refine=1, free_run_s=0.0)
-    found = sim2real.identify(recording, pendulum, brief)
+def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
+    """Each stage is a function of a robot and of the artifact of another one, opened from Python."""
+    text = "\n".join(re.findall(r"^```python\n(.*?)^```", NOTEBOOK.read_text(), re.DOTALL | re.MULTILINE))
+    monkeypatch.chdir(tmp_path)
+    had: dict = {}
+    text = text.replace("runs/pendulum/TIME/record", str(completed / "record"))
+    patient = (
+        "pendulum = sim2real.load_pipeline('pendulum')\nGATE = replace(pendulum.record.gate, servo_watchdog_s=0.4)\n"
+    )
+    text = re.sub(r"^pendulum = .*$", patient, text, flags=re.MULTILINE)  # a busy machine is not what is tested
+    exec(re.sub(r"duration_s=2.0", "duration_s=2.0, gate=GATE", text), had)
+    pendulum, recording, found = had["pendulum"], had["recording"], had["found"]
+    assert (tmp_path / "notebook" / "session.mcap").is_file()
+    assert recording.units["th"] == "rad"
     assert found.values.keys() == sim2real.Identification.load(completed / "identify").values.keys()
+    assert (found.pipeline, found.world) == ("pendulum", None)
     assert found.timing.nodes["sensor"].steps == len(recording.episode.steps["sensor"])
     recorded = manifest_of(completed / "record")["outputs"]["log"]
     assert [vars(log) for log in found.logs] == [{"path": "session.mcap", "sha256": recorded["sha256"]}]
-    small = replace(pendulum.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1, eval_envs=4)
-    config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=small)
-    bundle, _ = sim2real.train(pendulum, config, found)
-    assert bundle.contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
+    assert had["bundle"].contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
+    assert len(had["deployment"].recordings) == len(had["summaries"]) == 1
+    ppo = replace(had["small"], total_steps=256)
+    config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=ppo)
     nominal, about = sim2real.train(pendulum, replace(config, model="nominal"))
     assert (nominal.contract.delays_s, about["hiccups left out"]) == ({}, 0)
     with pytest.raises(UsageError, match="needs an identification"):
-        sim2real.train(pendulum, config)
+        sim2real.train(had["robot"], config)
+    with pytest.raises(UsageError, match="another world, the robot's own, than 'moon'"):
+        sim2real.train(had["robot"], replace(config, world="moon"), found)
 
 
 def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):

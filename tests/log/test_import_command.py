@@ -118,7 +118,7 @@ def test_the_unbalanced_disk():
     assert episode.outputs["sensor"]["th"].shape == (30_000,)
     assert episode.duration_s == 749.975
     assert set(episode.metadata["stamps"].values()) == {"generated"}
-    assert episode.metadata["units"] == {"action": "V", "th": "rad"}
+    assert episode.units == {"actuator": {"action": "V"}, "sensor": {"th": "rad"}}
 
 
 def test_bams_xl330():

@@ -44,7 +44,7 @@ def test_npz_with_stamps_columns_scale_and_shape(file):
         np.testing.assert_array_equal(getattr(steps, name), STAMPS_US)
     assert set(steps.ts_overwrite) == {-1}
     assert episode.metadata["stamps"] == {"actuator": "recorded", "sensor": "recorded"}
-    assert episode.metadata["units"] == {"action": "V", "th": "rad", "q": "rad"}
+    assert episode.units == {"actuator": {"action": "V"}, "sensor": {"th": "rad", "q": "rad"}}
 
 
 def test_stamps_are_generated_from_a_rate_and_marked(file):

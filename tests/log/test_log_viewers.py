@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+
+from sim2real.artifacts.recording import Recording
+from sim2real.graph.episode import StepRecord
+from sim2real.log.writer import McapRecorder
 
 
 def test_rosbags_reads_every_topic(session_log):
@@ -65,3 +70,32 @@ def test_rerun_checks_the_file(session_log):
         pytest.skip("the rerun command is not installed (extra: view)")
     result = subprocess.run([rerun, "mcap", "check", str(session_log)], capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_a_reader_that_has_only_the_file_gets_every_fields_unit_and_shape(tmp_path):
+    path = tmp_path / "units.mcap"
+    arm = {"q": np.zeros(3), "aim": np.zeros(2), "pose": np.zeros((2, 3), np.float32), "count": np.int32(0)}
+    units = {"arm": {"q": "rad", "aim[0]": "m", "aim[1]": "rad", "pose": "mm"}}
+    joints = {"arm": {"hip": {"position": "q[0]"}, "knee": {"position": "q[2]"}}}
+    recorder = McapRecorder(path, {}, {}, {"arm": arm, "eye": {"q": np.float64(0)}}, [("arm", "eye")], joints, units)
+    recorder.start(0, 0)
+    for node, output in (("arm", arm), ("eye", {"q": np.float64(1)})):
+        recorder.step(StepRecord(node, 0, 0, 0, 0, -1, 5, 0), output)
+    recorder.close()
+    with open(path, "rb") as stream:
+        summary = make_reader(stream).get_summary()
+    channels = {c.topic: c for c in summary.channels.values()}
+    said = {topic: json.loads(c.metadata["fields"]) for topic, c in channels.items() if topic != "/rosout"}
+    found = {topic: {f["name"]: (f.get("unit"), f["shape"]) for f in fields} for topic, fields in said.items()}
+    assert found["/arm/output"] == {
+        "q": ("rad", [3]), "aim": (["m", "rad"], [2]), "pose": ("mm", [2, 3]), "count": (None, [])
+    }  # fmt: skip
+    assert found["/eye/output"] == {"q": (None, [])}
+    assert found["/joint_states"] == {"position": ("rad", [2])}
+    assert found["/arm/inputs/eye"] == {"seq_out": ("1", []), "seq_in": ("1", [])}
+    times = {name: ("us", []) for name in ("scheduled", "start", "woken", "ts_overwrite", "end", "drift")}
+    assert found["/arm/step"] == {"seq": ("1", []), **times}
+    text = summary.schemas[channels["/arm/output"].schema_id].data.decode()
+    assert "float32[6] pose  # pose, shape (2, 3) [mm]\n" in text
+    assert "float64[2] aim  # [m, rad]\n" in text
+    assert Recording.load(path).units == {"q": "rad", "aim[0]": "m", "aim[1]": "rad", "pose": "mm"}

@@ -3,7 +3,8 @@
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline import available, load_pipeline
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.pipeline import available, load_pipeline, pipeline_of
 
 ROBOT = """
 from sim2real.robots.base import RecordedRobot
@@ -90,3 +91,21 @@ def test_pipelines_that_are_none(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match=message):
         load_pipeline(name)
+
+
+def test_a_robot_stands_for_the_pipeline_that_has_loaded_it():
+    disk = load_pipeline("disk")
+    assert pipeline_of(disk) is disk
+    assert pipeline_of(disk.load()) is disk
+
+
+def test_a_robot_of_ones_own_goes_by_the_name_of_its_class():
+    own = type("Spare", (type(load_pipeline("disk").load()),), {})()
+    found = pipeline_of(own)
+    assert (found.name, found.load(), found.identify) == ("Spare", own, IdentifyConfig())
+
+
+@pytest.mark.parametrize("robot", ["disk", None, 3])
+def test_what_is_no_robot_is_refused(robot):
+    with pytest.raises(UsageError, match=rf"{robot!r} is neither a robot nor a pipeline(.|\n)*load_pipeline\(NAME\)"):
+        pipeline_of(robot)

@@ -1,0 +1,14 @@
+"""The ODrive keeps what sim2real asks of a device."""
+
+from turntable.odrive import ODrive, SpeedLoop
+from turntable.odrive_emulation import ODriveEmulation
+
+from sim2real.hardware.testing import DeviceConformance
+
+
+class TestODrive(DeviceConformance):
+    emulation = ODriveEmulation
+    plant = "turntable.plant:Turntable"
+
+    def make_device(self, port):
+        return ODrive(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=0.6)

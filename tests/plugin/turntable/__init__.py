@@ -1,0 +1,17 @@
+"""A turntable on an ODrive motor controller, which keeps its speed."""
+
+from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
+from sim2real.stages.pipeline import Pipeline
+from sim2real.train.config import PPOConfig
+
+GATE = GateLimits(limit=12.0, slew_per_s=200.0, max_speed_rad_s=30.0, servo_watchdog_s=0.3)  # rad/s, rad/s^2, rad/s
+
+PIPELINE = Pipeline(
+    name="turntable",
+    summary="a turntable on an ODrive: turn as fast as it is told",
+    package=__name__,
+    record=RecordConfig(duration_s=20.0, amplitude=10.0, low_hz=0.2, high_hz=3.0, gate=GATE),
+    identify=IdentifyConfig(population=16, generations=20, refine=1),
+    train=TrainConfig(episode_s=2.0, ppo=PPOConfig(total_steps=200_000)),
+    deploy=DeployConfig(episodes=3, duration_s=3.0, gate=GATE),
+)

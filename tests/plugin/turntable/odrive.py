@@ -1,0 +1,330 @@
+"""One axis of an ODrive v3 on a serial line, commanded by speed: its ASCII protocol, as of firmware 0.5."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import termios
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import reduce
+from operator import xor
+
+import numpy as np
+import serial
+
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.device import Alone, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
+
+SPEED = CommandKind("speeds", "rad/s", stale="zero")
+TURN = 2.0 * math.pi  # the board counts in turns
+IDLE, CLOSED_LOOP = 1, 8  # axis states
+STATE, WATCHDOG = "axis0.current_state", "axis0.config.enable_watchdog"
+
+_ANSWER_S = 0.02  # longest wait for an answer, besides its time on the wire
+_LATE_S = 0.004  # an answer that took so much longer does not say well when it was asked for
+_LOSSES = 5  # missing answers in a row that mean: it is gone
+_CHANGE_S = 0.5  # longest wait for the axis to change its state
+
+
+def framed(text: str) -> bytes:
+    """Return a text with its checksum; the board ignores a line whose checksum is wrong, and puts one on its answer."""
+    return f"{text}*{reduce(xor, text.encode(), 0)}\n".encode()
+
+
+def unframed(line: bytes) -> str | None:
+    """Return the text of a line; None if it has no checksum, or another one."""
+    text, star, checksum = line.strip().rpartition(b"*")
+    return text.decode("ascii", "replace") if star and checksum == str(reduce(xor, text, 0)).encode() else None
+
+
+_OFF = b"\n" + framed(f"w axis0.requested_state {IDLE}")  # the first end of line closes what was being written
+
+
+@dataclass(frozen=True)
+class SpeedLoop:
+    """How the board keeps a speed.
+
+    Attributes:
+        gain: Torque per error of speed [N m s/rad].
+        torque: Largest torque [N m].
+        speed: Largest speed [rad/s].
+    """
+
+    gain: float = 0.05
+    torque: float = 2.0
+    speed: float = 20.0
+
+    def properties(self) -> dict[str, float]:
+        """Return what is written to the board, name -> value: 2 is speed control, 1 takes speeds as they come."""
+        control = "axis0.controller.config"
+        return {
+            f"{control}.control_mode": 2,
+            f"{control}.input_mode": 1,
+            f"{control}.vel_gain": self.gain * TURN,
+            f"{control}.vel_integrator_gain": 0,
+            f"{control}.vel_limit": self.speed / TURN,
+            "axis0.motor.config.torque_lim": self.torque,
+        }
+
+
+class ODrive(Device):
+    """Axis 0 of an ODrive, with torque off until `enable`.
+
+    A speed is not answered: one that is lost is followed by the next. Whether the axis still turns, `check` asks.
+
+    Args:
+        port: Device file of the port.
+        ids: The axes: (0,).
+        drive: How it keeps a speed.
+        baud_rate: Bits per second.
+        silence_s: Time without a command after which the board takes the torque off [s]; 0: never.
+
+    Raises:
+        UsageError: Another axis is asked for.
+    """
+
+    def __init__(self, port: str, ids: Sequence[int], drive: SpeedLoop, *, baud_rate: int, silence_s: float) -> None:
+        if tuple(ids) != (0,):
+            raise UsageError(f"axes {list(ids)}: this driver knows axis 0 alone")
+        self._port, self._loop, self._baud_rate, self._silence_s = port, drive, baud_rate, silence_s
+        self._serial: serial.Serial | None = None
+        self._lock = threading.Lock()
+        self._halted = self._withheld = self._on = False
+        self._speed = np.zeros(1)
+        self._answers = self._losses = self._late = self._kept = 0
+        self._late_s: list[float] = []
+
+    # -- what it says about itself
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Its name."""
+        return ("axis 0",)
+
+    @property
+    def commanded(self) -> CommandKind:
+        """Speeds."""
+        return SPEED
+
+    @property
+    def silence_s(self) -> float:
+        """Time without a command after which the board takes the torque off [s]."""
+        return self._silence_s
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """Position and velocity: the board's answer has no more."""
+        return {"position": "rad", "velocity": "rad/s"}
+
+    def without_host(self) -> tuple[WithoutHost, ...]:
+        """Return what the board does: it disarms an axis that is not fed."""
+        if not self._silence_s:
+            return (WithoutHost("ODrive v3", self.motors, Alone.GOES_ON, math.inf, "its watchdog is not enabled"),)
+        source = "ODrive firmware 0.5: axis.config.watchdog_timeout, read back when it is set"
+        return (WithoutHost("ODrive v3", self.motors, Alone.TORQUE_OFF, self._silence_s, source),)
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the board's limit of speed, either way [rad/s]."""
+        return np.array([-self._loop.speed]), np.array([self._loop.speed])
+
+    @property
+    def counters(self) -> Counters:
+        """What went over the line so far."""
+        late_s = np.array(self._late_s)
+        return Counters(self._answers, self._losses, self._losses, self._late, late_s, self._kept)
+
+    # -- from open to close
+
+    def open(self) -> None:
+        """Open the port, find the board, take the torque off, and write the settings."""
+        try:
+            self._serial = serial.Serial(self._port, self._baud_rate, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:
+            raise HardwareLost(f"the port {self._port} cannot be opened: {error}") from error
+        self._halted = self._withheld = self._on = False
+        try:
+            self.disable()
+            self._tell("sc")  # errors of an earlier session
+            for name, value in self._loop.properties().items():
+                self._set(name, value)
+            if self._silence_s:
+                self._set("axis0.config.watchdog_timeout", self._silence_s)
+        except BaseException:
+            self.close()
+            raise
+
+    def withhold_torque(self) -> None:
+        """Move nothing from now on: neither "closed loop" nor a speed is sent."""
+        if self._on:
+            raise UsageError("torque is on: a dry run is decided before")
+        self._withheld = True
+
+    @property
+    def torque_withheld(self) -> bool:
+        """Whether nothing can move the motor."""
+        return self._withheld
+
+    def enable(self) -> None:
+        """Switch the torque on at speed 0; from then on the board wants to be fed."""
+        if self._halted:
+            raise SafetyStop("the torque was taken off for good", hint="open the device anew")
+        self._require_no_error()
+        if self._withheld:
+            return
+        self._on = True
+        self._tell("v 0 0 0")  # feeds the watchdog too, which is not enabled before
+        self._set(WATCHDOG, bool(self._silence_s))
+        self._tell(f"w axis0.requested_state {CLOSED_LOOP}")
+        self._await(CLOSED_LOOP)
+        if self._halted:
+            self.make_safe()  # it may have come just before
+
+    def rest(self) -> np.ndarray:
+        """Return speed 0."""
+        return np.zeros(1)
+
+    def measure(self) -> Reading:
+        """Ask for position and velocity."""
+        values, transaction = self._ask("f 0", 2)
+        self._speed = np.array([TURN * values[1]])
+        return Reading(np.array([TURN * values[0]]), self._speed, np.full(1, np.nan), transaction)
+
+    def command(self, values: np.ndarray) -> Transaction:
+        """Send a speed, which also feeds the watchdog."""
+        if self._halted:
+            raise SafetyStop("the torque was taken off for good", hint="open the device anew")
+        if not np.isfinite(values).all() or np.abs(values).max() > self._loop.speed:
+            raise SafetyStop(f"{values} rad/s is no speed that the board would take")
+        if self._withheld:
+            self._kept += 1
+            return self._ask("r axis0.controller.input_vel", 1)[1]  # takes as long, and moves nothing
+        return self._tell(f"v 0 {values[0] / TURN:.6f} 0")
+
+    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
+        """Return the share of the largest torque: what the loop makes of the last error of speed."""
+        del position_rad
+        return np.clip(self._loop.gain * (command - self._speed) / self._loop.torque, -1.0, 1.0)
+
+    def check(self) -> None:
+        """Ask whether the axis has stopped itself, which an answer to `f` does not tell."""
+        self._require_no_error()
+        if self._on and self._read(STATE) != CLOSED_LOOP:
+            raise SafetyStop("the axis has left its speed loop", hint="was it switched off from elsewhere?")
+
+    # -- the ways out
+
+    def disable(self) -> None:
+        """Switch the torque off, and wait until the axis says so."""
+        self._on = False
+        self._tell(f"w axis0.requested_state {IDLE}")
+        self._await(IDLE)
+        self._set(WATCHDOG, 0)  # an idle axis that is not fed would report an error
+
+    def make_safe(self) -> None:
+        """Take the torque off: no lock and no answer, as the code that was interrupted may hold the one and wait for
+        the other.
+        """
+        self._halted = True
+        port = self._serial
+        if port is not None and port.is_open:
+            with suppress(OSError, TypeError):  # closed meanwhile
+                for _ in range(3):
+                    os.write(port.fileno(), _OFF)
+
+    def close(self) -> None:
+        """Take the torque off, if the board still listens, and close the port."""
+        port = self._serial
+        if port is None or not port.is_open:
+            return
+        self.make_safe()
+        with suppress(HardwareLost, SafetyStop):
+            self.disable()
+        with self._lock:
+            port.close()
+
+    # -- lines and answers
+
+    def _tell(self, text: str) -> Transaction:
+        """Send what is not answered."""
+        asked_ns = time.monotonic_ns()
+        with self._lock:
+            sent_ns, _ = self._send(text)
+            self._answers += 1
+            return Transaction(sent_ns, sent_ns - asked_ns, time.monotonic_ns() - sent_ns, 0)
+
+    def _ask(self, text: str, count: int) -> tuple[list[float], Transaction]:
+        """Ask until there is an answer with so many numbers."""
+        asked_ns = time.monotonic_ns()
+        with self._lock:
+            began_ns = time.monotonic_ns()
+            for losses in range(_LOSSES):
+                sent_ns, fd = self._send(text)
+                line = self._receive(fd, sent_ns)
+                now_ns = time.monotonic_ns()
+                numbers = _numbers(unframed(line))
+                if len(numbers) == count:
+                    wire_ns = 1e10 * (len(framed(text)) + len(line)) / self._baud_rate
+                    late_ns = max(0, round(now_ns - sent_ns - wire_ns))
+                    self._answers += 1
+                    self._late += late_ns > 1e9 * _LATE_S
+                    self._late_s.append(1e-9 * late_ns)
+                    return numbers, Transaction(sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
+                self._losses += 1
+                # Answers have no numbers: one that comes too late must not pass for that to the next question.
+                time.sleep(_ANSWER_S)
+        raise HardwareLost(f"no answer to {text!r} on {self._port}, {_LOSSES} times", hint="check power and cable")
+
+    def _send(self, text: str) -> tuple[int, int]:
+        """Forget what has come, send a line, and return when [ns], and the port's file descriptor."""
+        port = self._serial
+        if port is None or not port.is_open:
+            raise HardwareLost(f"the ODrive on {self._port} is not open", hint="call open first")
+        try:
+            port.reset_input_buffer()
+            sent_ns = time.monotonic_ns()
+            os.write(port.fileno(), framed(text))
+        except (OSError, termios.error) as error:
+            raise HardwareLost(f"{self._port} failed: {error}") from error
+        return sent_ns, port.fileno()
+
+    def _receive(self, fd: int, sent_ns: int) -> bytes:
+        """Return what comes up to the end of a line; less if that is late."""
+        end_ns, heard = sent_ns + round(1e9 * _ANSWER_S), b""
+        while not heard.endswith(b"\n") and (left_ns := end_ns - time.monotonic_ns()) > 0:
+            if select.select([fd], [], [], 1e-9 * left_ns)[0]:
+                if not (came := os.read(fd, 4096)):
+                    raise HardwareLost(f"{self._port} is gone", hint="was it unplugged?")
+                heard += came
+        return heard
+
+    def _read(self, name: str) -> float:
+        return self._ask(f"r {name}", 1)[0][0]
+
+    def _set(self, name: str, value: float) -> None:
+        """Write a property, and read it back: the board answers only if it does not know it."""
+        self._tell(f"w {name} {float(value):.6f}" if isinstance(value, float) else f"w {name} {int(value)}")
+        if abs((found := self._read(name)) - value) > 1e-5 + 1e-4 * abs(value):
+            raise HardwareLost(f"the ODrive does not keep its settings: {name} is {found}, not {value}")
+
+    def _await(self, state: int) -> None:
+        end = time.monotonic() + _CHANGE_S
+        while self._read(STATE) != state:
+            if time.monotonic() > end:
+                self._require_no_error()
+                raise HardwareLost(f"axis 0 does not reach state {state}", hint="is it calibrated?")
+
+    def _require_no_error(self) -> None:
+        if error := int(self._read("axis0.error")):
+            raise SafetyStop(f"axis 0 has stopped itself: error {error:#x}", hint="odrivetool: dump_errors(odrv0)")
+
+
+def _numbers(text: str | None) -> list[float]:
+    try:
+        return [float(word) for word in (text or "").split()]
+    except ValueError:  # such as "invalid property"
+        return []
