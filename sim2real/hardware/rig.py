@@ -4,16 +4,36 @@ from __future__ import annotations
 
 import threading
 import time
+from array import array
+from dataclasses import dataclass, field
 from typing import Final, Self
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
-from sim2real.hardware.device import Device, Reading
+from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.gate import GateConfig, SafetyGate
 from sim2real.hardware.plausibility import Plausibility
 
 _CHECK_PERIOD_S: Final = 0.5
+
+
+@dataclass(frozen=True)
+class BusUse:
+    """How long transactions of one kind took, in their order.
+
+    Attributes:
+        transfer_us: From getting the bus to having the answer, retries included [us].
+        wait_us: How long each waited before for another's use of the bus [us].
+    """
+
+    transfer_us: array[int] = field(default_factory=lambda: array("q"))
+    wait_us: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, transaction: Transaction) -> None:
+        """Note a transaction."""
+        self.transfer_us.append(transaction.transfer_ns // 1000)
+        self.wait_us.append(transaction.lock_wait_ns // 1000)
 
 
 class Rig:
@@ -27,6 +47,10 @@ class Rig:
     Args:
         device: The device, not opened yet.
         gate: Limits of the commands, in the device's unit.
+
+    Attributes:
+        measuring: The bus's use by `measure` since `start`.
+        commanding: The bus's use by `command` since then.
 
     Raises:
         UsageError: Gate and device do not fit together.
@@ -46,6 +70,7 @@ class Rig:
         self._done = threading.Event()
         self._failure: Sim2RealError | None = None
         self.timeouts = 0
+        self.measuring, self.commanding = BusUse(), BusUse()
         device.open()
         try:
             self._require_reach()
@@ -72,9 +97,11 @@ class Rig:
         Commands pass the gate, and `command` returns what would have been sent.
 
         Raises:
-            UsageError: Torque is on.
+            UsageError: Torque is on, or the device does not say that it withholds it.
         """
         self.device.withhold_torque()
+        if not self.device.torque_withheld:
+            raise UsageError(f"{type(self.device).__name__} cannot do a dry run: it does not withhold its torque")
 
     @property
     def suspects(self) -> list[str]:
@@ -86,6 +113,7 @@ class Rig:
         self._done.set()
         self._done = threading.Event()  # a watcher that has not noticed yet that it is over must not go on
         self._commanded_s = self._speed_rad_s = self._failure = None
+        self.measuring, self.commanding = BusUse(), BusUse()
         self._require_reach()
         self.device.enable()
         self.gate.reset(self.device.rest())
@@ -122,6 +150,7 @@ class Rig:
         sent = self._sent
         reading = self.device.measure()
         position, asked = reading.position_rad, reading.transaction
+        self.measuring.add(asked)
         effort = np.zeros(len(position))
         if sent is not None and not self.torque_withheld:
             effort = self.device.effort(sent, position)
@@ -144,7 +173,7 @@ class Rig:
         self._check()
         with self._lock:
             allowed = self.gate.apply(command, age_s, now_s, self._speed_rad_s)
-            self.device.command(allowed)
+            self.commanding.add(self.device.command(allowed))
             self._sent = allowed
             self._commanded_s = time.monotonic()
         return allowed
