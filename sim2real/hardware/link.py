@@ -1,7 +1,7 @@
 """Transactions on a half-duplex bus of servos, one at a time: port, lock, retries, late answers, withheld torque.
 
 Written by hand, as the makers' packages cannot time their reads. They poll for an answer, for which PyPI's
-feetech-servo-sdk 1.0.0 takes 0.61 ms of processor time a read, and this module 0.03; they notice a missing one after 34
+feetech-servo-sdk 1.0.0 takes 0.61 ms of processor time a read, and this module 0.05; they notice a missing one after 34
 ms, fixed, by the wall clock; they keep neither when an instruction was sent nor the error bytes of a synchronised read;
 and as they do not drop late answers, the one to an earlier instruction passes for that to the next.
 """

@@ -181,6 +181,8 @@ def test_configurations_that_make_no_sense():
         BusConfig("/dev/null", silence_s=3.0)
     with pytest.raises(UsageError, match=r"baud rate 1234 .* Available: \[9600"):
         BusConfig("/dev/null", baud_rate=1234)
+    with pytest.raises(UsageError, match="an id is a number from 0 to 253"):
+        ServoBus(BusConfig("/dev/null"), [1, 254])
 
 
 def test_threads_share_the_bus(start_robot, open_bus):
@@ -310,6 +312,24 @@ def test_make_safe_needs_no_lock(start_robot, open_bus):
     with pytest.raises(SafetyStop, match="made safe"):
         bus.torque(True)
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
+
+
+def test_make_safe_while_torque_goes_on_wins(start_robot, open_bus, monkeypatch):
+    robot = start_robot()
+    bus = open_bus(robot)
+    bus.setup(PWM)
+    write = bus.link.write
+
+    def after_make_safe(servo_id, register, value):
+        if register == reg.TORQUE_ENABLE:
+            bus.make_safe()
+        return write(servo_id, register, value)
+
+    monkeypatch.setattr(bus.link, "write", after_make_safe)
+    bus.torque(True)
+    assert bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert not bus.armed
     assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
 
 
