@@ -127,7 +127,7 @@ class PendulumRobot(LoopRobot):
 
     def make_device(self, port: str, silence_s: float) -> DynamixelServos:
         """Return the servo, driven by voltage."""
-        return DynamixelServos(BusConfig(port, watchdog_s=silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
+        return DynamixelServos(BusConfig(port, silence_s=silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
     def gate(self, limits: GateLimits) -> GateConfig:
         """Return a gate that falls back to 0 V."""

@@ -1,6 +1,6 @@
 """How long everything took on the robot: what training draws its timing from, so that it needs no log.
 
-``timing.npz`` has every node's computation times and every connection's transport times, in their order.
+``timing.npz`` has every node's computation times and bus transfers, and every connection's transport times, in order.
 ``timing.json`` has their quantiles for people, and what else the session counted: lost answers, overruns, the clock.
 """
 
@@ -21,8 +21,10 @@ from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.graph.fitting import resample
 from sim2real.log.ages import input_ages
 
-FORMAT = 1
+FORMAT = 2
+_READ = (1, FORMAT)  # 1: without the times of the bus
 TIMING, SAMPLES = "timing.json", "timing.npz"
+_ARRAYS = ("steps_s", "bus_s", "transport_s")
 _AGAIN = "record again, or run `sim2real identify` again on the log"
 
 
@@ -41,6 +43,9 @@ class Spread:
         return Spread(*np.quantile(there, [0.5, 0.99, 1.0]).tolist()) if there.size else Spread(None, None, None)
 
 
+NONE = Spread(None, None, None)
+
+
 @dataclass(frozen=True)
 class NodeTiming:
     """The timing of one node.
@@ -50,6 +55,9 @@ class NodeTiming:
         period: From one step's awakening to the next.
         lateness: From a step's start to when its thread really ran.
         computation: From a step's start to its end, the thread's awakening and the bus included.
+        bus: The part of it from getting the bus to having the device's answer, questions asked again included; without
+            any sample for a node that talks to no device, and where that was not recorded.
+        bus_wait: How long a step waited before for another node's use of the bus.
         age: Input -> how long before a step's start the newest message that it used was sent.
         overruns: Steps that ended after the next was due; None where they were not counted.
     """
@@ -60,6 +68,8 @@ class NodeTiming:
     computation: Spread
     age: Mapping[str, Spread]
     overruns: int | None = None
+    bus: Spread = NONE
+    bus_wait: Spread = NONE
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,7 @@ class Timing:
         stamps: Node -> ``recorded`` or, in a log that was imported, ``generated`` from a rate.
         monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None where it is not known.
         steps_s: Node -> how long each of its steps took ``(N,)`` [s], in their order.
+        bus_s: Node -> how long each of its transactions on the bus took ``(T,)`` [s], in their order.
         transport_s: (reader, input) -> how long each message was under way ``(M,)`` [s], in their order.
         format: Version of the files.
     """
@@ -121,6 +132,7 @@ class Timing:
     stamps: Mapping[str, str] = field(default_factory=dict)
     monotonic_ns: int | None = None
     steps_s: Mapping[str, np.ndarray] = field(default_factory=dict)
+    bus_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     transport_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     format: int = FORMAT
 
@@ -132,13 +144,19 @@ class Timing:
         # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
         stamps = episode.metadata.get("stamps", {})
+        bus = {
+            n: {kind: np.asarray(us, np.float64) * 1e-6 for kind, us in use.items()}
+            for n, use in end.get("bus", {}).items()
+            if n in episode.steps
+        }
         return Timing(
-            nodes={n: _node(episode, n, counted.get(n, {}).get("overruns")) for n in names},
+            nodes={n: _node(episode, n, counted.get(n, {}).get("overruns"), bus.get(n, {})) for n in names},
             connections=tuple(_connection(episode, *key) for key in episode.messages),
             bus=_bus(end) if "transactions" in end else None,
             stamps={n: stamps.get(n, "recorded") for n in names},
             monotonic_ns=end.get("monotonic_ns"),
             steps_s={n: (s.end - s.start) / TICKS_PER_S for n, s in episode.steps.items()},
+            bus_s={n: use["transfer_us"] for n, use in bus.items()},
             transport_s={f"{r}/{i}": (m.received - m.sent) / TICKS_PER_S for (r, i), m in episode.messages.items()},
         )
 
@@ -178,10 +196,9 @@ class Timing:
         Returns:
             Output -> name of the file in the folder.
         """
-        arrays = ("steps_s", "transport_s")
         document, samples = f"{name}.json", f"{name}.npz"
-        write_json(folder / document, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
-        write_arrays(folder / samples, {f"{kind}/{n}": v for kind in arrays for n, v in getattr(self, kind).items()})
+        write_json(folder / document, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS})
+        write_arrays(folder / samples, {f"{kind}/{n}": v for kind in _ARRAYS for n, v in getattr(self, kind).items()})
         return {name: document, f"{name}_samples": samples}
 
     @staticmethod
@@ -197,20 +214,21 @@ class Timing:
         file = path / TIMING if path.is_dir() else path
         with malformed(file, _AGAIN):
             found = read_json(file, Timing)
-            if found.format != FORMAT:
+            if found.format not in _READ:
                 raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):
-            kinds: dict[str, dict[str, np.ndarray]] = {"steps_s": {}, "transport_s": {}}
+            kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
             for name, values in read_arrays(samples).items():
                 kind, _, of = name.partition("/")
                 check(kind in kinds and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of times")
                 kinds[kind][of] = values
             check(set(kinds["steps_s"]) == set(found.nodes), "its nodes are others than those of the JSON file")
-        return replace(found, **kinds)
+            check(set(kinds["bus_s"]) <= set(found.nodes), "a node on the bus is none of the JSON file's")
+        return replace(found, format=FORMAT, **kinds)
 
 
-def _node(episode: Episode, name: str, overruns: int | None) -> NodeTiming:
+def _node(episode: Episode, name: str, overruns: int | None, bus: Mapping[str, np.ndarray]) -> NodeTiming:
     steps = episode.steps[name]
     return NodeTiming(
         steps=len(steps),
@@ -219,6 +237,8 @@ def _node(episode: Episode, name: str, overruns: int | None) -> NodeTiming:
         computation=Spread.of((steps.end - steps.start) / TICKS_PER_S),
         age={n: Spread.of(ages) for n, ages in input_ages(episode, name).items()},
         overruns=overruns,
+        bus=Spread.of(bus["transfer_us"]) if bus else NONE,
+        bus_wait=Spread.of(bus["wait_us"]) if bus else NONE,
     )
 
 

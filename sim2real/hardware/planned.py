@@ -13,7 +13,7 @@ import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from sim2real.hardware.emulation import Emulation
 from sim2real.hardware.plant import OperatingMode, Plant, PlantClock
@@ -287,10 +287,12 @@ class PlannedBus(ABC):
 
 
 @dataclass(frozen=True)
-class BusEmulation(Emulation, ABC):
+class BusEmulation(Emulation):
     """Settings that know which bus they are for; see `Emulation` for what they are."""
 
-    @abstractmethod
+    bus_type: ClassVar[Callable[..., PlannedBus]]
+    """What makes the bus: called with plant, settings, truth, ``send`` and ``start_ns``."""
+
     def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
         """Return the emulated bus with these settings.
 
@@ -300,6 +302,7 @@ class BusEmulation(Emulation, ABC):
             send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
             start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
         """
+        return type(self).bus_type(plant, self, truth, send, start_ns)
 
 
 def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, Any]:

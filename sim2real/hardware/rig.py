@@ -4,18 +4,38 @@ from __future__ import annotations
 
 import threading
 import time
+from array import array
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final, Self
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
-from sim2real.hardware.device import Device, Reading
+from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.gate import GateConfig, SafetyGate
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.plausibility import Plausibility
 
 _CHECK_PERIOD_S: Final = 0.5
+
+
+@dataclass(frozen=True)
+class BusUse:
+    """How long transactions of one kind took, in their order.
+
+    Attributes:
+        transfer_us: From getting the bus to having the answer, retries included [us].
+        wait_us: How long each waited before for another's use of the bus [us].
+    """
+
+    transfer_us: array[int] = field(default_factory=lambda: array("q"))
+    wait_us: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, transaction: Transaction) -> None:
+        """Note a transaction."""
+        self.transfer_us.append(transaction.transfer_ns // 1000)
+        self.wait_us.append(transaction.lock_wait_ns // 1000)
 
 
 class Rig:
@@ -33,6 +53,10 @@ class Rig:
         device: The device, not opened yet.
         gate: Limits of the commands, in the device's unit.
         joints: How each motor's joint is mounted; none: as the device measures and commands it.
+
+    Attributes:
+        measuring: The bus's use by `measure` since `start`.
+        commanding: The bus's use by `command` since then.
 
     Raises:
         UsageError: Gate, joints and device do not fit together.
@@ -53,6 +77,7 @@ class Rig:
         self._done = threading.Event()
         self._failure: Sim2RealError | None = None
         self.timeouts = 0
+        self.measuring, self.commanding = BusUse(), BusUse()
         device.open()
         try:
             self._require_reach()
@@ -79,9 +104,11 @@ class Rig:
         Commands pass the gate, and `command` returns what would have been sent.
 
         Raises:
-            UsageError: Torque is on.
+            UsageError: Torque is on, or the device does not say that it withholds it.
         """
         self.device.withhold_torque()
+        if not self.device.torque_withheld:
+            raise UsageError(f"{type(self.device).__name__} cannot do a dry run: it does not withhold its torque")
 
     @property
     def suspects(self) -> list[str]:
@@ -93,6 +120,7 @@ class Rig:
         self._done.set()
         self._done = threading.Event()  # a watcher that has not noticed yet that it is over must not go on
         self._commanded_s = self._speed_rad_s = self._failure = None
+        self.measuring, self.commanding = BusUse(), BusUse()
         self._require_reach()
         self.device.enable()
         self.gate.reset(self._mounting.to_joints(self.device.rest()))
@@ -129,6 +157,7 @@ class Rig:
         sent = self._sent
         measured = self.device.measure()
         reading, asked = self._mounting.reading(measured), measured.transaction
+        self.measuring.add(asked)
         effort = np.zeros(len(measured.position_rad))
         if sent is not None and not self.torque_withheld:
             # Of the motors, whose direction does not matter to what is plausible.
@@ -152,7 +181,7 @@ class Rig:
         self._check()
         with self._lock:
             allowed = self.gate.apply(command, age_s, now_s, self._speed_rad_s)
-            self.device.command(self._mounting.to_motors(allowed))
+            self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
             self._sent = allowed
             self._commanded_s = time.monotonic()
         return allowed

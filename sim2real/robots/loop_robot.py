@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
+from sim2real.graph.base import GraphState
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
@@ -87,13 +88,17 @@ class LoopRobot(Robot):
             draw: Draws dynamics and delays: key -> values by name.
         """
 
+    def judged(self, graph_state: GraphState) -> Any:
+        """Return what ``reward`` and ``success`` are functions of: the world's state."""
+        return graph_state.state[self.roles.world]
+
     @abstractmethod
     def reward(self, state: Any, action: jax.Array) -> jax.Array:
-        """Return the reward of a policy step, from the world's state after it and the action ``(actions,)``."""
+        """Return the reward of a policy step, from what ``judged`` returns after it and the action ``(actions,)``."""
 
     @abstractmethod
     def success(self, state: Any) -> jax.Array:
-        """Return whether a state of the world is one that the task wants, bool."""
+        """Return whether what ``judged`` returns is what the task wants, bool."""
 
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:

@@ -37,6 +37,10 @@ class TrainableLoop(Protocol):
         """Return parameters of the nodes for a random episode."""
         ...
 
+    def judged(self, graph_state: GraphState) -> Any:
+        """Return what reward and success are functions of."""
+        ...
+
     def reward(self, state: Any, action: jax.Array) -> jax.Array:
         """Return the reward of a policy step."""
         ...
@@ -87,11 +91,11 @@ class LoopTask:
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
         """Return the robot's reward of a row."""
-        return self.robot.reward(graph_state.state[self.robot.roles.world], action)
+        return self.robot.reward(self.robot.judged(graph_state), action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
-        return self.robot.success(graph_state.state[self.robot.roles.world])
+        return self.robot.success(self.robot.judged(graph_state))
 
     def _draw(self, key: jax.Array) -> dict[str, Any]:
         return draw_values(key, self.values, self.draws, self.delay_spread_s)

@@ -13,16 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.base import GraphState
+from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.entries import WORLDS
 from sim2real.hardware.registry import load_entry
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.base import RecordedRobot
-from sim2real.robots.loop import DELAYS, DelayParams, draw_values
+from sim2real.robots.loop import DELAYS, DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.recorded import LoggedRobot
+from sim2real.robots.training import Draw
 from sim2real.train.env import TrainingTask
 from sim2real.worlds.recorded import RecordedActuator
 
@@ -137,11 +139,40 @@ class _LoopInWorld(LoopRobot):
         own: Any = self.model.robot
         return self._placed(own.rest_params(self._own(values), policy, trial), values)
 
-    def training_task(
-        self, agent: BaseNode, values: Mapping[str, float], draws: Mapping[str, np.ndarray], spread_s: float
-    ) -> TrainingTask:
+    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
         own: Any = self.model.robot
-        return _TaskInWorld(self, own.training_task(agent, self._own(values), {}, spread_s), values, draws)
+        of_task, of_world = jax.random.split(key)
+        drawn = draw(of_world)
+        return self._placed(own.random_params(of_task, lambda _: self._own(drawn)), drawn)
+
+    def training(
+        self,
+        values: Mapping[str, float],
+        draws: Mapping[str, np.ndarray],
+        computation: Mapping[str, DelayDistribution],
+        delays: bool,
+    ) -> tuple[dict[str, BaseNode], TrainingTask]:
+        nodes, task = super().training(values, draws, computation, delays)
+        self._require_judgement(task)
+        return nodes, task
+
+    def _require_judgement(self, task: TrainingTask) -> None:
+        """Refuse a world whose state lacks what the task reads of the robot's own."""
+        node = self.make_world()
+
+        def judged() -> Any:
+            gs = GraphState(params=task.params(jax.random.key(0)))
+            gs = gs.replace(state={node.name: node.init_state(None, gs)})
+            return task.reward(gs, jnp.asarray(task.action_low)), task.success(gs)
+
+        try:
+            jax.eval_shape(judged)
+        except (AttributeError, KeyError) as error:
+            raise UsageError(
+                f"no policy can be trained in world {self.world!r}: the task reads of the world's state what it "
+                f"does not have: {error}",
+                hint="give the world's state the fields that the robot's own has",
+            ) from error
 
     def _own(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the data sheet's values of the robot's own model, and the delays."""
@@ -158,59 +189,6 @@ class _LoopInWorld(LoopRobot):
         moving = [jnp.zeros(()) if c.velocity is None else c.of(first[c.velocity]) for c in self.channels]
         start = jnp.stack([jnp.asarray(x).reshape(()) for x in (*at, *moving)])
         return {**params, node.name: self.model.params(values, start)}
-
-
-class _TaskInWorld:
-    """A robot's training task in another world: starts, aims, delays, reward and success are the robot's own."""
-
-    def __init__(
-        self,
-        robot: _LoopInWorld,
-        task: TrainingTask,
-        values: Mapping[str, float],
-        draws: Mapping[str, np.ndarray],
-    ) -> None:
-        self._robot, self._task = robot, task
-        self._values = {n: v for n, v in values.items() if n not in DELAYS}
-        self._draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
-        self.supervisor, self.observation_size = task.supervisor, task.observation_size
-        self.action_low, self.action_high = task.action_low, task.action_high
-        self._require_judgement()
-
-    def params(self, key: jax.Array) -> dict[str, Any]:
-        of_task, of_world = jax.random.split(key)
-        drawn = draw_values(of_world, self._values, self._draws, 0.0)
-        return self._robot._placed(self._task.params(of_task), drawn)
-
-    def observe(self, step_state: StepState) -> jax.Array:
-        return self._task.observe(step_state)
-
-    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, Any]:
-        return self._task.act(step_state, action)
-
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        return self._task.reward(graph_state, action)
-
-    def success(self, graph_state: GraphState) -> jax.Array:
-        return self._task.success(graph_state)
-
-    def _require_judgement(self) -> None:
-        """Refuse a world whose state lacks what the task's reward reads of the robot's own."""
-        node = self._robot.make_world()
-
-        def judged() -> Any:
-            gs = GraphState(params=self.params(jax.random.key(0)))
-            gs = gs.replace(state={node.name: node.init_state(None, gs)})
-            return self.reward(gs, jnp.asarray(self.action_low)), self.success(gs)
-
-        try:
-            jax.eval_shape(judged)
-        except (AttributeError, KeyError) as error:
-            raise UsageError(
-                f"no policy can be trained in world {self._robot.world!r}: the task reads of the world's state what it "
-                f"does not have: {error}",
-                hint="give the world's state the fields that the robot's own has",
-            ) from error
 
 
 class _LogInWorld(LoggedRobot):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,31 +32,25 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
         truth_path: File for the emulated robot's account of itself.
 
     Raises:
-        UsageError: The robot's device cannot do a dry run.
+        UsageError: The session has no rig, or its device moves in a dry run.
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
     with robot.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+        _require_rig(session.rig)
         if config.dry_run:
-            _withhold_torque(session.rig)
+            session.rig.withhold_torque()
         announce(session)
         yield session
 
 
-def _withhold_torque(rig: Any) -> None:
-    """Have the device move nothing, or say that it cannot: one that is not of ours may not know how."""
-    if callable(withhold := getattr(rig, "withhold_torque", None)):
-        withhold()
-    if not is_dry(rig):
+def _require_rig(rig: object) -> None:
+    """Refuse what has no safety gate, no guardian and no dry run: sessions come from plug-ins too."""
+    if not isinstance(rig, Rig):
         raise UsageError(
-            f"this robot's device, {type(rig).__name__}, cannot do a dry run: it cannot withhold its torque",
-            hint="give it `withhold_torque()` and `torque_withheld`, as sim2real.hardware.rig.Rig has them",
+            f"this robot's session has a {type(rig).__name__} for a rig",
+            hint="make its `rig` a sim2real.hardware.rig.Rig of a sim2real.hardware.device.Device",
         )
-
-
-def is_dry(rig: Any) -> bool:
-    """Return whether a rig moves nothing: what it says itself counts, not what was asked for."""
-    return getattr(rig, "torque_withheld", False) is True
 
 
 def announce(session: Session) -> None:
@@ -75,6 +70,12 @@ def rig_summary(rig: Rig) -> dict[str, Any]:
     counters = rig.device.counters
     quantiles = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
     return {"late_replies": counters.late_replies, "late_s": quantiles, "suspects": list(rig.suspects)}
+
+
+def bus_use(robot: Robot, rig: Rig) -> dict[str, dict[str, list[int]]]:
+    """Return for each node that talks to the device how long its transactions took; see ``BusUse`` [us]."""
+    users = {robot.roles.sensor: rig.measuring, robot.roles.actuator: rig.commanding}
+    return {name: {kind: values.tolist() for kind, values in asdict(use).items()} for name, use in users.items()}
 
 
 def answer_rows(summary: Mapping[str, Any]) -> list[list[Any]]:

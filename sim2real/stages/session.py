@@ -23,7 +23,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
 from sim2real.stages.pipeline import Pipeline
-from sim2real.stages.rig import answer_rows, is_dry, rig_summary, sent_rows
+from sim2real.stages.rig import answer_rows, bus_use, rig_summary, sent_rows
 
 LATE_SHARE = 0.01
 """Share of late steps above which ``--strict-timing`` ends with code 5."""
@@ -97,7 +97,7 @@ def run_episode(
     graph = AsyncGraph(nodes, nodes[robot.roles.supervisor])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
-    recorder = _recorder(pipeline, robot, graph, state, log, config, is_dry(session.rig))
+    recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig.torque_withheld)
     watch = Watch(recorder)
     graph.recorder = watch
     try:
@@ -212,6 +212,7 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
     return {
         "monotonic_ns": watch.monotonic_ns,
         "timing": timing,
+        "bus": bus_use(robot, rig),
         "transactions": counters.transactions,
         "lost_replies": counters.lost_replies,
         "retries": counters.retries,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment, Scores
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import StageFolder
+from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
 from sim2real.log.schema import unit_of
@@ -160,7 +162,7 @@ def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
 def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
     """Return figures and table about an episode's timing."""
     end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
-    rows = []
+    rows, measured = [], Timing.of(episode)
     for node in timing.in_order(episode):
         steps = episode.steps[node]
         if len(steps) < 2:
@@ -170,10 +172,11 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
         for values in (taken.period, taken.lateness, taken.computation):
             p50, p99 = np.quantile(values, [0.5, 0.99])
             row += [fixed(float(v), 2) for v in (p50, p99, values.max())]
+        row += [MISSING if t is None else fixed(1e3 * t, 2) for t in astuple(measured.nodes[node].bus)]
         ages = 1e3 * oldest_input(episode, node)
         row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
         rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
-    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "age") for k in ("p50", "p99", "max")]
+    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "bus", "age") for k in ("p50", "p99", "max")]
     table = TableBlock(
         f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}",
         ("node", "steps", *heads, "overruns"),

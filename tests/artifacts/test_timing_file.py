@@ -1,14 +1,20 @@
 """The timing of a session: what it says, and what training draws from it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.timing import Timing
+from sim2real.artifacts.timing import Spread, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Messages, Steps
 from sim2real.graph.fitting import resample
+
+BUS = {
+    "sensor": {"transfer_us": [400] * 98 + [9000, 500], "wait_us": [0] * 99 + [300]},
+    "unknown": {"transfer_us": [1], "wait_us": [1]},
+}
 
 
 @pytest.fixture
@@ -25,7 +31,7 @@ def episode():
     messages = Messages(np.arange(100), used, sent, sent + 250)
     end = {"transactions": 200, "lost_replies": 3, "retries": 3, "late_replies": 5, "late_s": [0.0, 0.001, 0.004]}
     counted = {"agent": {"overruns": 2}, "sensor": {"overruns": 0}}
-    metadata = {"log": {"session_end": {**end, "timing": counted, "monotonic_ns": 12}}}
+    metadata = {"log": {"session_end": {**end, "timing": counted, "monotonic_ns": 12, "bus": BUS}}}
     return Episode({"sensor": quick, "agent": late}, {("agent", "sensor"): messages}, {}, metadata)
 
 
@@ -42,6 +48,14 @@ def test_it_says_what_happened(episode):
     assert connection.transport.p99 == pytest.approx(0.00025)
     assert (timing.bus.lost, timing.bus.late, timing.bus.lateness.max) == (3, 5, 0.004)
     assert timing.monotonic_ns == 12
+    sensor = timing.nodes["sensor"]
+    assert (sensor.bus.p50, sensor.bus.max, sensor.bus_wait.max) == (
+        pytest.approx(4e-4),
+        pytest.approx(9e-3),
+        pytest.approx(3e-4),
+    )
+    assert agent.bus == agent.bus_wait == Spread(None, None, None), "it talks to no device"
+    assert list(timing.bus_s) == ["sensor"]
 
 
 def test_it_comes_back_to_the_last_bit(episode, tmp_path):
@@ -49,7 +63,7 @@ def test_it_comes_back_to_the_last_bit(episode, tmp_path):
     assert timing.save(tmp_path) == {"timing": "timing.json", "timing_samples": "timing.npz"}
     back = Timing.load(tmp_path)
     assert (back.nodes, back.connections, back.bus) == (timing.nodes, timing.connections, timing.bus)
-    for name in ("steps_s", "transport_s"):
+    for name in ("steps_s", "bus_s", "transport_s"):
         ours, theirs = getattr(timing, name), getattr(back, name)
         assert set(ours) == set(theirs)
         assert all(np.array_equal(ours[n], theirs[n]) for n in ours)
@@ -74,3 +88,25 @@ def test_samples_of_other_nodes_are_refused(episode, tmp_path):
         Timing.load(tmp_path)
     with pytest.raises(Sim2RealError, match="cannot read"):
         Timing.load(tmp_path / "nowhere.json")
+
+
+def test_what_was_written_before_the_bus_was_timed_is_read(episode, tmp_path):
+    del episode.metadata["log"]["session_end"]["bus"]
+    timing = Timing.of(episode)
+    timing.save(tmp_path)
+    document = json.loads((tmp_path / "timing.json").read_text())
+    document["format"] = 1
+    for node in document["nodes"].values():
+        del node["bus"], node["bus_wait"]
+    (tmp_path / "timing.json").write_text(json.dumps(document))
+    assert Timing.load(tmp_path).nodes == timing.nodes
+    (tmp_path / "timing.json").write_text(json.dumps(document | {"format": 3}))
+    with pytest.raises(Sim2RealError, match="has format 3, this version reads 2"):
+        Timing.load(tmp_path)
+
+
+def test_a_node_on_the_bus_that_is_none_of_the_sessions_is_refused(episode, tmp_path):
+    timing = Timing.of(episode)
+    replace(timing, bus_s={"other": np.ones(3)}).save(tmp_path)
+    with pytest.raises(Sim2RealError, match="a node on the bus"):
+        Timing.load(tmp_path)

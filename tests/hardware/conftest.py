@@ -34,9 +34,10 @@ def open_bus():
     buses = []
 
     def open_(robot, ids=(1,), mode=None, **config):
-        patience = {"max_silence_s": 1.0, "watchdog_s": 1.0}
+        patience = {"max_silence_s": 1.0, "silence_s": 1.0}
         bus = ServoBus(BusConfig(robot.port, **{**patience, **config}))
         buses.append(bus)
+        bus.open()
         bus.handshake(dict.fromkeys(ids))
         if mode is not None:
             bus.setup(mode)

@@ -14,6 +14,8 @@ from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.protocol import PROTOCOL
+from sim2real.hardware.packets import Instruction
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 
@@ -41,7 +43,7 @@ def test_handshake_checks_ids_and_models(start_robot):
 
 def test_setup_prepares_the_servo_and_torque_arms_the_watchdog(start_robot, open_bus):
     robot = start_robot()
-    bus = open_bus(robot, mode=PWM, watchdog_s=0.1)
+    bus = open_bus(robot, mode=PWM, silence_s=0.1)
     values = {r.name: bus.read(1, r) for r in (reg.OPERATING_MODE, reg.RETURN_DELAY_TIME, reg.TORQUE_ENABLE)}
     assert values == {"operating_mode": 16, "return_delay_time": 0, "torque_enable": 1}
     assert bus.read(1, reg.BUS_WATCHDOG) == 5
@@ -69,7 +71,7 @@ def test_pwm_turns_and_state_tells(start_robot, open_bus, ids):
 
 def test_velocity_and_position_goals(start_robot, open_bus):
     robot = start_robot(ids=[1, 2])
-    bus = open_bus(robot, (1, 2), OperatingMode.EXTENDED_POSITION, watchdog_s=0.0)
+    bus = open_bus(robot, (1, 2), OperatingMode.EXTENDED_POSITION, silence_s=0.0)
     bus.write_goal_position({1: 0.5, 2: -0.5})
     time.sleep(0.8)
     assert bus.read_state().position_rad == pytest.approx([0.5, -0.5], abs=0.01)
@@ -143,13 +145,13 @@ def test_unplugged_port_is_lost(start_robot, open_bus):
 
 def test_missing_port():
     with pytest.raises(HardwareLost, match=r"(?s)/dev/ttyNONE cannot be opened.*hint: serial ports here:"):
-        ServoBus(BusConfig("/dev/ttyNONE"))
+        ServoBus(BusConfig("/dev/ttyNONE")).open()
 
 
 def test_port_in_use(start_robot, open_bus):
     robot = start_robot()
     open_bus(robot)
-    code = f"from sim2real.hardware.dynamixel.bus import *; ServoBus(BusConfig({robot.port!r}))"
+    code = f"from sim2real.hardware.dynamixel.bus import *; ServoBus(BusConfig({robot.port!r})).open()"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "HardwareLost" in result.stderr
     assert "cannot be opened" in result.stderr
@@ -175,10 +177,12 @@ def test_reading_needs_servos(start_robot):
 
 
 def test_configurations_that_make_no_sense():
-    with pytest.raises(UsageError, match="watchdog_s"):
-        BusConfig("/dev/null", watchdog_s=3.0)
+    with pytest.raises(UsageError, match="silence_s"):
+        BusConfig("/dev/null", silence_s=3.0)
     with pytest.raises(UsageError, match=r"baud rate 1234 .* Available: \[9600"):
-        ServoBus(BusConfig("/dev/null", baud_rate=1234))
+        BusConfig("/dev/null", baud_rate=1234)
+    with pytest.raises(UsageError, match="an id is a number from 0 to 253"):
+        ServoBus(BusConfig("/dev/null"), [1, 254])
 
 
 def test_threads_share_the_bus(start_robot, open_bus):
@@ -201,7 +205,7 @@ def test_threads_share_the_bus(start_robot, open_bus):
 
 def test_servo_watchdog_stops_the_motor_and_is_named(start_robot, open_bus):
     robot = start_robot(config=EmulatorConfig(actuation_latency_s=0.005))
-    bus = open_bus(robot, mode=PWM, watchdog_s=0.06, guardian=False)
+    bus = open_bus(robot, mode=PWM, silence_s=0.06, guardian=False)
     sent_ns = bus.write_goal_pwm({1: 1.0}).t_sent_ns
     time.sleep(0.2)
     with pytest.raises(SafetyStop, match="bus watchdog of servo 1 has tripped"):
@@ -227,7 +231,8 @@ def test_a_servo_that_can_stops_by_itself_within_200_ms_of_the_hosts_kill(start_
 import time
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.plant import OperatingMode
-bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.1, guardian=False))
+bus = ServoBus(BusConfig({robot.port!r}, silence_s=0.1, guardian=False))
+bus.open()
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)
 bus.torque(True)
@@ -281,8 +286,8 @@ def test_one_lost_answer_of_several_is_asked_for_again(start_robot, open_bus):
 def test_a_servo_that_restarted_is_noticed(start_robot, open_bus):
     bus = open_bus(start_robot("Joints"), (1, 2, 3), OperatingMode.POSITION)
     bus.check()
-    with bus._link.hold():
-        bus._link.packets.reboot(bus._link.port, 2)
+    with bus.link.hold():
+        os.write(bus.link.fd, PROTOCOL.build(2, Instruction.REBOOT))
     with pytest.raises(SafetyStop, match="servo 2 has lost its settings: its bus watchdog holds 0, not 50"):
         bus.check()
     bus.torque(False)
@@ -291,7 +296,7 @@ def test_a_servo_that_restarted_is_noticed(start_robot, open_bus):
 
 def test_close_takes_torque_off_through_lost_replies(start_robot, open_bus):
     robot = start_robot(config=EmulatorConfig(reply_loss=0.3, seed=2))
-    bus = open_bus(robot, mode=PWM, watchdog_s=0.0)
+    bus = open_bus(robot, mode=PWM, silence_s=0.0)
     bus.write_goal_pwm({1: 0.5})
     bus.close()
     bus.close()
@@ -302,11 +307,29 @@ def test_make_safe_needs_no_lock(start_robot, open_bus):
     robot = start_robot()
     bus = open_bus(robot, mode=PWM)
     bus.write_goal_pwm({1: 0.5})
-    with bus._link.hold():
+    with bus.link.hold():
         bus.make_safe()
     with pytest.raises(SafetyStop, match="made safe"):
         bus.torque(True)
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
+
+
+def test_make_safe_while_torque_goes_on_wins(start_robot, open_bus, monkeypatch):
+    robot = start_robot()
+    bus = open_bus(robot)
+    bus.setup(PWM)
+    write = bus.link.write
+
+    def after_make_safe(servo_id, register, value):
+        if register == reg.TORQUE_ENABLE:
+            bus.make_safe()
+        return write(servo_id, register, value)
+
+    monkeypatch.setattr(bus.link, "write", after_make_safe)
+    bus.torque(True)
+    assert bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert not bus.armed
     assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
 
 
@@ -317,7 +340,8 @@ def test_signals_end_with_torque_off(start_robot, number):
 import signal, sys, time
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.plant import OperatingMode
-bus = ServoBus(BusConfig({robot.port!r}, watchdog_s=0.0))
+bus = ServoBus(BusConfig({robot.port!r}, silence_s=0.0))
+bus.open()
 bus.handshake({{1: None}})
 bus.setup(OperatingMode.PWM)
 bus.torque(True)

@@ -20,7 +20,7 @@ class TestOneServoByVoltage(DeviceConformance):
 
     def make_device(self, port):
         # Patient with lost answers, for the machine may be busy.
-        return DynamixelServos(BusConfig(port, max_silence_s=0.5, watchdog_s=0.6), [1], VoltageDrive(5.0))
+        return DynamixelServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), [1], VoltageDrive(5.0))
 
 
 @pytest.mark.realtime
@@ -29,5 +29,5 @@ class TestThreeServosByAngle(DeviceConformance):
     plant = f"{PLANTS}:Joints"
 
     def make_device(self, port):
-        bus = BusConfig(port, max_silence_s=0.5, watchdog_s=0.6)
+        bus = BusConfig(port, max_silence_s=0.5, silence_s=0.6)
         return DynamixelServos(bus, (1, 2, 3), PositionDrive(p_gain=800, profile_velocity_rad_s=20.0))

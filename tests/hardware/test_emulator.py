@@ -16,8 +16,9 @@ from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware import emulator
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.dynamixel.protocol import Instruction, Parser, StatusError, build
+from sim2real.hardware.dynamixel.protocol import PROTOCOL, StatusError
 from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.packets import Instruction, Parser
 from sim2real.hardware.plant import load_plant
 from sim2real.hardware.truth import Kind, TruthLog, read_truth
 
@@ -50,7 +51,7 @@ class Sdk:
         self.port.clearPort()
         self.port.writePort(packet)
         time.sleep(wait_s)
-        return [found for found, _ in Parser().feed(bytes(self.port.readPort(1000)))]
+        return [found for found, _ in Parser(PROTOCOL).feed(bytes(self.port.readPort(1000)))]
 
 
 @pytest.fixture(scope="module")
@@ -107,13 +108,13 @@ def test_errors_as_the_sdk_reports_them(sdk):
 
 
 def test_broken_checksum_and_unknown_instruction(sdk):
-    packet = bytearray(build(1, Instruction.PING))
+    packet = bytearray(PROTOCOL.build(1, Instruction.PING))
     packet[-1] ^= 1
     (answer,) = sdk.raw(bytes(packet))
     assert answer.parameters[0] == StatusError.CRC
-    (answer,) = sdk.raw(build(1, 0x77))
+    (answer,) = sdk.raw(PROTOCOL.build(1, 0x77))
     assert answer.parameters[0] == StatusError.INSTRUCTION
-    assert sdk.raw(build(1, Instruction.ACTION))[0].parameters[0] == StatusError.INSTRUCTION
+    assert sdk.raw(PROTOCOL.build(1, Instruction.ACTION))[0].parameters[0] == StatusError.INSTRUCTION
 
 
 def test_sync_write_and_sync_read(sdk):

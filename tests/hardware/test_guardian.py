@@ -27,10 +27,11 @@ from sim2real.errors import Sim2RealError
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.plant import OperatingMode
 
-bus = ServoBus(BusConfig({port!r}, watchdog_s={watchdog_s}, max_silence_s=1.0, guardian={guardian}))
+bus = ServoBus(BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0, guardian={guardian}))
+bus.open()
 
 def die_in_the_middle_of_a_packet(number, frame):
-    os.write(bus._link.port.fd, bus._torque_off_packet[:9] + bytes(3))
+    os.write(bus.link.fd, bus._off_packet[:9] + bytes(3))
     os.kill(os.getpid(), signal.SIGKILL)
 
 signal.signal(signal.SIGUSR1, die_in_the_middle_of_a_packet)
@@ -57,9 +58,9 @@ def start_host(start_robot):
     """Start servos and a process that turns them; return robot, process and the guardian's process."""
     hosts = []
 
-    def start(guardian=True, watchdog_s=0.5, **config):
+    def start(guardian=True, silence_s=0.5, **config):
         robot = start_robot(config=EmulatorConfig(model_number=XL330, actuation_latency_s=0.01, **config), ids=IDS)
-        code = HOST.format(port=robot.port, guardian=guardian, watchdog_s=watchdog_s)
+        code = HOST.format(port=robot.port, guardian=guardian, silence_s=silence_s)
         host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         hosts.append(host)
         pid = host.stdout.readline().strip()
@@ -93,7 +94,7 @@ def assert_off_soon(robot, since_ns, within_s=0.2):
 
 
 def test_without_a_guardian_this_firmware_goes_on_when_its_host_is_killed(start_host):
-    robot, host, _ = start_host(guardian=False, watchdog_s=0.2)
+    robot, host, _ = start_host(guardian=False, silence_s=0.2)
     host.kill()
     time.sleep(0.4)
     for _, modes, goals in modes_of(robot):
@@ -112,7 +113,7 @@ def test_without_a_guardian_this_firmware_goes_on_when_its_host_is_killed(start_
     ids=["killed", "stopped", "half a packet", "bad line"],
 )
 def test_torque_is_off_within_200_ms(start_host, number, faults):
-    robot, host, _ = start_host(watchdog_s=0.1 if number == signal.SIGSTOP else 0.5, **faults)
+    robot, host, _ = start_host(silence_s=0.1 if number == signal.SIGSTOP else 0.5, **faults)
     since_ns = time.monotonic_ns()
     host.send_signal(number)
     time.sleep(0.5)
@@ -124,7 +125,7 @@ def test_torque_is_off_within_200_ms(start_host, number, faults):
 
 
 def test_a_process_that_wakes_again_ends_with_torque_off(start_host):
-    robot, host, _ = start_host(watchdog_s=0.3)
+    robot, host, _ = start_host(silence_s=0.3)
     since_ns = time.monotonic_ns()
     host.send_signal(signal.SIGSTOP)
     time.sleep(0.6)
@@ -149,7 +150,7 @@ def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
 @pytest.mark.parametrize("way", ["it acted", "it died"])
 def test_torque_is_taken_off_in_order_whatever_became_of_it(start_robot, open_bus, way):
     robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM, watchdog_s=0.1)
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
     bus.write_goal_pwm({1: 0.5})
     if way == "it died":
         os.kill(bus.guardian_pid, signal.SIGKILL)
@@ -164,7 +165,7 @@ def test_torque_is_taken_off_in_order_whatever_became_of_it(start_robot, open_bu
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_without_it_the_control_process_stops(start_robot, open_bus, number):
     robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM, watchdog_s=0.4)
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.4)
     bus.write_goal_pwm({1: 0.5})
     os.kill(bus.guardian_pid, number)
     end = time.monotonic() + 10.0
@@ -179,7 +180,7 @@ def test_without_it_the_control_process_stops(start_robot, open_bus, number):
 
 def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_bus):
     robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM, watchdog_s=0.1)
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
     first = bus.guardian_pid
     bus.torque(False)
     time.sleep(0.3)

@@ -2,22 +2,24 @@
 
 from pathlib import Path
 
+from sim2real.hardware import models
 from sim2real.hardware.device import Alone
-from sim2real.hardware.dynamixel import models
+from sim2real.hardware.dynamixel import models as dynamixel
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.feetech import device as feetech
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"
 
 
 def test_the_guide_has_the_table():
-    assert models.table() in GUIDE.read_text()
+    assert models.table([*dynamixel.MODELS.values(), *feetech.MODELS.values()]) in GUIDE.read_text()
 
 
 def test_of_an_unknown_model_the_worst_is_assumed():
-    assert models.model(99).without_host(0.1).does is Alone.GOES_ON
-    assert models.model(99).name == "model 99"
-    assert models.model(1060).without_host(0.0).words == "goes on as commanded last (its bus watchdog is off)"
+    assert dynamixel.model(99).without_host(0.1).does is Alone.GOES_ON
+    assert dynamixel.model(99).name == "model 99"
+    assert dynamixel.model(1060).without_host(0.0).words == "goes on as commanded last (its bus watchdog is off)"
 
 
 def test_an_open_bus_says_what_its_servos_do_alone(start_robot):

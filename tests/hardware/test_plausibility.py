@@ -101,7 +101,7 @@ def open_rig(start_robot):
 
     def open_(plant, drive, gate, config, ids):
         robot = start_robot(plant, config)
-        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
+        bus = BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)
         rigs.append(Rig(DynamixelServos(bus, ids, drive), gate))
         return rigs[-1]
 

@@ -1,6 +1,7 @@
 """Three position servos on one bus, through the rig, on a real emulator."""
 
 import math
+import os
 import subprocess
 import sys
 import time
@@ -13,7 +14,10 @@ from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
+from sim2real.hardware.dynamixel.link import BusLink
+from sim2real.hardware.dynamixel.protocol import PROTOCOL
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.packets import Instruction
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import Rig
 from sim2real.hardware.truth import Kind
@@ -31,9 +35,9 @@ COUNT_RAD = reg.RAD_PER_COUNT
 def open_arm(start_robot):
     rigs = []
 
-    def open_(drive=DRIVE, watchdog_s=1.0, robot=None, guardian=True, **gate):
+    def open_(drive=DRIVE, silence_s=1.0, robot=None, guardian=True, **gate):
         robot = robot or start_robot("Joints")
-        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s, guardian=guardian)
+        bus = BusConfig(robot.port, max_silence_s=1.0, silence_s=silence_s, guardian=guardian)
         rigs.append(Rig(DynamixelServos(bus, IDS, drive), GateConfig(**{**GATE, **gate})))
         return rigs[-1], robot
 
@@ -107,8 +111,8 @@ def test_gains_and_profile_reach_servos_and_plant(open_arm):
     drive = PositionDrive(p_gain=1000, profile_velocity_rad_s=1.0, d_gain=7)
     rig, robot = open_arm(drive)
     registers = (reg.POSITION_P_GAIN, reg.POSITION_I_GAIN, reg.POSITION_D_GAIN, reg.PROFILE_ACCELERATION)
-    assert [rig.device.bus.read(2, register) for register in registers] == [1000, 0, 7, 0]
-    assert rig.device.bus.read(2, reg.OPERATING_MODE) == OperatingMode.POSITION
+    assert [rig.device.read(2, register) for register in registers] == [1000, 0, 7, 0]
+    assert rig.device.read(2, reg.OPERATING_MODE) == OperatingMode.POSITION
     rig.start()
     speeds = []
     for _ in range(15):
@@ -126,15 +130,15 @@ def test_gains_and_profile_reach_servos_and_plant(open_arm):
 
 def test_a_rebooted_servo_gets_its_settings_again(open_arm):
     rig, _ = open_arm()
-    with rig.device.bus._link.hold():
-        rig.device.bus._link.packets.reboot(rig.device.bus._link.port, 3)
-    assert rig.device.bus.read(3, reg.POSITION_P_GAIN) == 640
+    with rig.device.link.hold():
+        os.write(rig.device.link.fd, PROTOCOL.build(3, Instruction.REBOOT))
+    assert rig.device.read(3, reg.POSITION_P_GAIN) == 640
     rig.start()
-    assert rig.device.bus.read(3, reg.POSITION_P_GAIN) == 800
+    assert rig.device.read(3, reg.POSITION_P_GAIN) == 800
 
 
 def test_a_setting_that_a_servo_does_not_keep_ends_it(open_arm, start_robot, monkeypatch):
-    write = ServoBus.write
+    write = BusLink.write
 
     def forgetful(self, servo_id, register, value):
         if (servo_id, register) != (2, reg.POSITION_P_GAIN):
@@ -143,7 +147,7 @@ def test_a_setting_that_a_servo_does_not_keep_ends_it(open_arm, start_robot, mon
 
     robot = start_robot("Joints")
     with monkeypatch.context() as patched:
-        patched.setattr(ServoBus, "write", forgetful)
+        patched.setattr(BusLink, "write", forgetful)
         with pytest.raises(HardwareLost, match=r"servo 2 .* position_p_gain is 640 after 800 was written"):
             open_arm(robot=robot)
     open_arm(robot=robot)  # the port is free again
@@ -180,7 +184,7 @@ def test_a_stale_command_holds(open_arm):
 
 
 def test_a_stalled_policy_leaves_the_joints_where_they_were_sent(open_arm):
-    rig, robot = open_arm(watchdog_s=0.3)
+    rig, robot = open_arm(silence_s=0.3)
     rig.start()
     run(rig, [0.1, -0.2, 0.9], 0.4)
     stalled_ns = time.monotonic_ns()
@@ -201,10 +205,10 @@ def test_a_stalled_policy_leaves_the_joints_where_they_were_sent(open_arm):
 
 
 def test_a_tripped_servo_is_noticed_although_goals_are_not_confirmed(open_arm):
-    rig, robot = open_arm(watchdog_s=0.1, guardian=False)
+    rig, robot = open_arm(silence_s=0.1, guardian=False)
     rig.start()
     run(rig, [0.4, -0.7, 0.2], 0.3)
-    with rig.device.bus._link.hold():
+    with rig.device.link.hold():
         time.sleep(0.25)
     tripped_s = time.monotonic()
     rig.command(np.zeros(3), 0.0, tripped_s)  # nobody refuses
@@ -227,9 +231,10 @@ import numpy as np
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.drive import PositionDrive
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.packets import Instruction
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.rig import Rig
-servos = DynamixelServos(BusConfig({robot.port!r}, watchdog_s=0.1), {IDS!r}, PositionDrive(800, 20.0))
+servos = DynamixelServos(BusConfig({robot.port!r}, silence_s=0.1), {IDS!r}, PositionDrive(800, 20.0))
 rig = Rig(servos, GateConfig(**{GATE!r}))
 rig.start()
 print("ready", flush=True)
@@ -257,7 +262,7 @@ def test_a_joint_outside_of_what_servos_take_keeps_its_torque_off(open_arm, star
     rig, _ = open_arm(robot=robot)
     with pytest.raises(Sim2RealError, match=r"servo 2 refused write of .* to goal_position: the value is beyond"):
         rig.start()
-    assert rig.device.bus.read(2, reg.TORQUE_ENABLE) == 0
+    assert rig.device.read(2, reg.TORQUE_ENABLE) == 0
 
 
 def test_limits_beyond_the_servos_own_are_refused(open_arm, start_robot):
@@ -306,13 +311,20 @@ class FakeBus:
     ids = (1,)
 
     def __init__(self, **values):
-        self.values = {**{register.name: register.default for register in reg.TABLE.values()}, **values}
+        self.values = {**{register.name: register.default for register in reg.TABLE.registers.values()}, **values}
 
     def read(self, servo_id, register):
         return self.values[register.name]
 
     def write(self, servo_id, register, value):
         self.values[register.name] = value
+
+    @property
+    def link(self):
+        return self
+
+    def require(self, servo_id, register, value):
+        assert self.values[register.name] == value
 
 
 @pytest.mark.parametrize(("found", "wanted"), [(0, 0), (1, 1), (4, 0), (13, 1)])
@@ -331,4 +343,4 @@ def test_supplies_that_are_none(supply_v):
 @pytest.mark.parametrize(("speed_rad_s", "count"), [(math.inf, 0), (0.001, 1), (1.0, 42)])
 def test_a_slow_profile_is_not_rounded_to_none(open_arm, speed_rad_s, count):
     rig, _ = open_arm(PositionDrive(800, speed_rad_s))
-    assert rig.device.bus.read(1, reg.PROFILE_VELOCITY) == count
+    assert rig.device.read(1, reg.PROFILE_VELOCITY) == count

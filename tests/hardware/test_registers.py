@@ -7,7 +7,7 @@ from sim2real.hardware.dynamixel import registers as reg
 
 
 def test_registers_do_not_overlap():
-    ordered = [reg.TABLE[address] for address in sorted(reg.TABLE)]
+    ordered = list(reg.TABLE.registers.values())
     assert all(a.end <= b.address for a, b in itertools.pairwise(ordered))
     assert all(r.minimum <= r.default <= r.maximum for r in ordered if r.writable)
 

@@ -28,10 +28,10 @@ def open_rig(start_robot):
     """Open a rig on a servo whose speed follows its voltage: 6 rad/s at 5 V."""
     rigs = []
 
-    def open_(config=None, watchdog_s=0.4, **gate):
+    def open_(config=None, silence_s=0.4, **gate):
         robot = start_robot("FirstOrder", config)
         # Patient with lost answers, for the machine may be busy; not with the host itself.
-        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=watchdog_s)
+        bus = BusConfig(robot.port, max_silence_s=1.0, silence_s=silence_s)
         limits = GateConfig(**{"limit": 4.0, "command_timeout_s": TIMEOUT_S, **gate})
         rigs.append(Rig(DynamixelServos(bus, [1], VoltageDrive(SUPPLY_V)), limits))
         return rigs[-1], robot
@@ -68,13 +68,13 @@ def test_commands_are_volts_and_come_back_as_sent(open_rig):
     run(rig, 2.5, 0.4)
     assert rig.measure().velocity_rad_s[0] == pytest.approx(3.0, rel=0.1)
     rig.stop()
-    assert rig.device.bus.read(1, reg.TORQUE_ENABLE) == 0
+    assert rig.device.read(1, reg.TORQUE_ENABLE) == 0
     assert rig.gate.counts.clamped == 1
     assert rig.timeouts == 0
 
 
 def test_a_stalled_policy_gets_zero_while_measuring_goes_on(open_rig):
-    rig, _ = open_rig(watchdog_s=1.0)
+    rig, _ = open_rig(silence_s=1.0)
     rig.start()
     run(rig, 2.5, 0.3)
     stalled_s = time.monotonic()
@@ -83,7 +83,7 @@ def test_a_stalled_policy_gets_zero_while_measuring_goes_on(open_rig):
     while time.monotonic() - stalled_s < 0.5:
         rig.measure()
         reads += 1
-        if zero_s is None and rig.device.bus.read(1, reg.GOAL_PWM) == 0:
+        if zero_s is None and rig.device.read(1, reg.GOAL_PWM) == 0:
             zero_s = time.monotonic() - stalled_s
         time.sleep(0.005)
     # The watcher looks every fifth of the timeout; the rest is for a busy machine.
@@ -92,13 +92,13 @@ def test_a_stalled_policy_gets_zero_while_measuring_goes_on(open_rig):
     assert reads > 10
     assert 3 <= rig.timeouts <= 5
     assert abs(rig.measure().velocity_rad_s[0]) < 0.1
-    assert rig.device.bus.read(1, reg.BUS_WATCHDOG) != reg.WATCHDOG_TRIPPED
+    assert rig.device.read(1, reg.BUS_WATCHDOG) != reg.WATCHDOG_TRIPPED
     assert volts(rig, 2.5) == 2.5  # a loop that comes back goes on
 
 
 @pytest.mark.parametrize("timeout_s", [TIMEOUT_S, 2.0])
 def test_a_slow_start_does_not_trip_the_servos_watchdog(open_rig, timeout_s):
-    rig, robot = open_rig(watchdog_s=0.2, command_timeout_s=timeout_s)
+    rig, robot = open_rig(silence_s=0.2, command_timeout_s=timeout_s)
     rig.start()
     time.sleep(0.8)  # a graph that takes its time between torque on and the first command
     volts(rig, 1.0)

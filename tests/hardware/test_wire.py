@@ -9,12 +9,14 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.dynamixel.protocol import BROADCAST_ID, Instruction, build
+from sim2real.hardware.dynamixel.protocol import PROTOCOL
+from sim2real.hardware.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.plant import ConfigurablePlant
 from sim2real.hardware.truth import Kind
 
 MS = 1_000_000
 STEP_NS = 500_000
+build = PROTOCOL.build
 READ_POSITION = build(1, Instruction.READ, b"\x84\x00\x04\x00")
 
 

@@ -26,7 +26,7 @@ def open_rig(start_robot):
 
     def open_(drive, plant, ids, withhold=True, **gate):
         robot = start_robot(plant)
-        bus = BusConfig(robot.port, max_silence_s=1.0, watchdog_s=1.0)
+        bus = BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)
         rigs.append(Rig(DynamixelServos(bus, ids, drive), GateConfig(command_timeout_s=0.1, **gate)))
         if withhold:
             rigs[-1].withhold_torque()
@@ -40,7 +40,7 @@ def open_rig(start_robot):
 def assert_untouched(robot, register, bus, ids):
     """The servos' own goals are as at power-up, and their motors were told nothing."""
     for servo_id in ids:
-        held = bus._link.read_bytes(servo_id, register.address, register.size, "read")[0]
+        held = bus.link.read_each((servo_id,), register.address, register.size, "read")[0][0]
         assert register.decode(held) == register.default
         assert bus.read(servo_id, reg.TORQUE_ENABLE) == 0
     assert robot.truth().of(Kind.EFFECT).size == 0
@@ -65,7 +65,7 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
     np.testing.assert_allclose(counts.total, np.sum(sent, axis=0))
     assert rig.device.counters.withheld >= 20 + 2 * 3
     rig.stop()
-    assert_untouched(robot, reg.GOAL_POSITION, rig.device.bus, (1, 2, 3))
+    assert_untouched(robot, reg.GOAL_POSITION, rig.device, (1, 2, 3))
 
 
 def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
@@ -79,7 +79,7 @@ def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
     assert rig.suspects == []
     assert rig.measure().velocity_rad_s[0] == 0.0
     rig.stop()
-    assert_untouched(robot, reg.GOAL_PWM, rig.device.bus, (1,))
+    assert_untouched(robot, reg.GOAL_PWM, rig.device, (1,))
 
 
 def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
@@ -89,13 +89,13 @@ def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
     time.sleep(0.3)
     assert rig.timeouts >= 1
     rig.stop()
-    assert_untouched(robot, reg.GOAL_PWM, rig.device.bus, (1,))
+    assert_untouched(robot, reg.GOAL_PWM, rig.device, (1,))
 
 
 def test_the_guardian_watches_as_well(start_robot, open_bus):
     """A process that is silent for too long is told so, as it would be with torque on."""
     robot = start_robot("FirstOrder")
-    bus = open_bus(robot, watchdog_s=0.2)
+    bus = open_bus(robot, silence_s=0.2)
     bus.setup(OperatingMode.PWM)
     bus.withhold_torque()
     bus.torque(True)

@@ -6,9 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
+import serial
 
 from sim2real import cli, errors
-from sim2real.hardware.dynamixel.port import WaitingPort
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import load_pipeline
 
@@ -111,11 +111,11 @@ def test_ports_that_are_none(fails, tmp_path, port):
 
 def test_two_runs_on_one_port(fails, tmp_path, lone_robot):
     port, _ = lone_robot
-    taken = WaitingPort(port, 1_000_000, 0.01)
+    taken = serial.Serial(port, 1_000_000, exclusive=True)
     try:
         said = fails(errors.HARDWARE_LOST, "record", "pendulum", "--port", port, "--runs", tmp_path)
     finally:
-        taken.closePort()
+        taken.close()
     assert f"serial port {port} cannot be opened" in said
 
 

@@ -49,7 +49,7 @@ def tapped(tmp_path_factory):
 
 def test_the_wiretap_hears_what_moves_a_motor(tapped):
     tap, _ = tapped()
-    with ServoBus(BusConfig(tap.port, max_silence_s=1.0, watchdog_s=1.0)) as bus:
+    with ServoBus(BusConfig(tap.port, max_silence_s=1.0, silence_s=1.0)) as bus:
         bus.handshake({1: None})
         bus.setup(OperatingMode.PWM)
         assert tap.motions() == []
@@ -216,7 +216,7 @@ def steady(robot, folder):
     return save_bundle(folder, weights, contract, np.zeros((1, size)))
 
 
-def test_a_device_that_cannot_do_it_says_so(make_pipeline, tmp_path):
+def test_a_session_without_a_rig_of_a_device_is_refused(make_pipeline, tmp_path):
     name = make_pipeline(
         "no_dry_run",
         """
@@ -237,5 +237,5 @@ def test_a_device_that_cannot_do_it_says_so(make_pipeline, tmp_path):
     )
     code, _, err = call("record", name, "--dry-run")
     assert code == 2
-    assert "this robot's device, Rig, cannot do a dry run" in err
-    assert "hint: give it `withhold_torque()`" in err
+    assert "this robot's session has a Rig for a rig" in err
+    assert "hint: make its `rig` a sim2real.hardware.rig.Rig" in err

@@ -6,7 +6,8 @@ import threading
 import tty
 
 from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.protocol import Instruction, Parser
+from sim2real.hardware.dynamixel.protocol import PROTOCOL
+from sim2real.hardware.packets import Instruction, Parser
 
 # Torque Enable, and Goal PWM, Goal Current, Goal Velocity, Goal Position: what makes a DYNAMIXEL X move.
 TORQUE = (reg.TORQUE_ENABLE.address, reg.TORQUE_ENABLE.end)
@@ -20,7 +21,7 @@ class Wiretap:
 
     def __init__(self, robot_port):
         self.packets = []
-        self._parser = Parser()
+        self._parser = Parser(PROTOCOL)
         self._host, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
@@ -52,11 +53,11 @@ class Wiretap:
         """Return (servo, address, bytes) of everything that was written."""
         found = []
         for p in self.packets:
-            assert p.instruction in (*_WRITES, *_READS), f"whether {p} moves a motor is not known here"
+            assert p.code in (*_WRITES, *_READS), f"whether {p} moves a motor is not known here"
             address = int.from_bytes(p.parameters[:2], "little")
-            if p.instruction == Instruction.WRITE:
+            if p.code == Instruction.WRITE:
                 found.append((p.servo_id, address, p.parameters[2:]))
-            elif p.instruction == Instruction.SYNC_WRITE:
+            elif p.code == Instruction.SYNC_WRITE:
                 length, rest = int.from_bytes(p.parameters[2:4], "little"), p.parameters[4:]
                 starts = range(0, len(rest), 1 + length)
                 found += [(rest[i], address, rest[i + 1 : i + 1 + length]) for i in starts]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flax import struct
 
+from sim2real.artifacts.timing import Timing
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.plant import OperatingMode
@@ -124,6 +125,20 @@ def test_the_sensor_shows_where_the_joints_are_and_when_it_asked(episodes):
         # A millisecond of jitter at a few rad/s, and half a count.
         np.testing.assert_allclose(log.outputs["sensor"]["position"][:, i], true, atol=0.02)
     assert np.ptp(log.outputs["sensor"]["position"], axis=0).min() > 0.2
+
+
+def test_the_time_on_the_bus_is_part_of_every_step_that_uses_it(episodes):
+    for log in (episodes.recorded, episodes.deployed):
+        found = Timing.of(log)
+        assert set(found.bus_s) == {"sensor", "actuator"}
+        for name, spent in found.bus_s.items():
+            steps = found.steps_s[name]
+            assert len(steps) <= len(spent) <= len(steps) + 2, "one transaction a step, the last may not be logged"
+            assert np.all(spent[: len(steps)] <= steps + 2e-6)
+            assert found.nodes[name].bus.max == pytest.approx(spent.max())
+        # An instruction of 17 bytes and three answers of 21 at 1 Mbaud; goals of three servos are not answered.
+        assert found.bus_s["sensor"].min() > (17 + 3 * 21) * 1e-5
+        assert found.nodes["agent"].bus.max is None
 
 
 def test_a_policy_moves_goals_from_where_the_robot_is(episodes):

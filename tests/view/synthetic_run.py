@@ -59,9 +59,12 @@ def write_log(path: Path, steps: int = STEPS, end: bool = True) -> None:
             at = end_at + 10
     timing = {n: {"steps": steps, "period_s": [0.02] * 3, "lateness_s": [0.0] * 3, "overruns": 1} for n in NODES}
     if end:
-        recorder.close("finished", 0, {"timing": timing, "lost_replies": 3, "monotonic_ns": MONOTONIC_NS})
+        recorder.close("finished", 0, {"timing": timing, "lost_replies": 3, "monotonic_ns": MONOTONIC_NS, "bus": BUS})
     else:
         recorder.close()
+
+
+BUS = {"sensor": {"transfer_us": [1230] * 3, "wait_us": [0] * 3}}
 
 
 def write_truth(path: Path) -> None:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
-from sim2real.errors import HardwareLost, UsageError
+from sim2real.errors import UsageError
 from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Reading, Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import ServoBus
-from sim2real.hardware.dynamixel.registers import Register
 from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.registers import Register
 
 
-class Drive(Protocol):
+class Drive(ABC):
     """A way to drive servos. Commands are float64 arrays of shape (n,), in the order of the bus's ids.
 
     Attributes:
@@ -29,35 +30,35 @@ class Drive(Protocol):
 
     def check(self, servos: int) -> None:
         """Check the number of servos before the port is opened; raise UsageError if the drive is for another one."""
-        ...
+        del servos
 
     def prepare(self, bus: ServoBus) -> None:
         """Write the servos' settings, with torque off; raise HardwareLost if a servo does not keep them."""
-        ...
+        del bus
 
     def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest command that the servos follow, each ``(n,)``."""
-        ...
+        """Return the lowest and the highest command that the servos follow, each ``(n,)``; inf: `send` refuses more."""
+        return np.full(len(bus.ids), -np.inf), np.full(len(bus.ids), np.inf)
 
+    @abstractmethod
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return the command that the servos follow right after torque goes on."""
-        ...
 
+    @abstractmethod
     def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write a command to the servos."""
-        ...
 
+    @abstractmethod
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the fraction of full torque that the servos apply, shape (n,) in [-1, 1], from command and angles."""
-        ...
 
     def reading(self, reading: Reading) -> Reading:
-        """Return a measurement with positions in this drive's angles."""
-        ...
+        """Return a measurement with positions in this drive's angles; here unchanged."""
+        return reading
 
 
 @dataclass(frozen=True)
-class VoltageDrive:
+class VoltageDrive(Drive):
     """Servos in PWM mode, commanded in volts, at rest 0 V. Angles are measured from each encoder's zero [rad].
 
     Args:
@@ -65,23 +66,13 @@ class VoltageDrive:
     """
 
     supply_v: float
-    mode: ClassVar[OperatingMode] = OperatingMode.PWM
-    kind: ClassVar[CommandKind] = VOLTAGE
+    mode = OperatingMode.PWM
+    kind = VOLTAGE
 
     def __post_init__(self) -> None:
         """Check the supply voltage."""
         if not 0.0 < self.supply_v < math.inf:
             raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
-
-    def check(self, servos: int) -> None:
-        """Do nothing: any number of servos will do."""
-
-    def prepare(self, bus: ServoBus) -> None:
-        """Do nothing: PWM mode has no settings."""
-
-    def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
-        """Return infinite limits: `send` refuses more than the supply voltage."""
-        return np.full(len(bus.ids), -np.inf), np.full(len(bus.ids), np.inf)
 
     def rest(self, bus: ServoBus) -> np.ndarray:
         """Return zero volts."""
@@ -96,13 +87,9 @@ class VoltageDrive:
         del position_rad
         return np.clip(command / self.supply_v, -1.0, 1.0)
 
-    def reading(self, reading: Reading) -> Reading:
-        """Return the measurement unchanged."""
-        return reading
-
 
 @dataclass(frozen=True)
-class PositionDrive:
+class PositionDrive(Drive):
     """Servos in position mode, commanded in joint angles [rad]; at rest they hold their position.
 
     A joint's angle is 0 where its encoder reads `zero_count`. The servos accept goals within one revolution, counts 0
@@ -120,8 +107,8 @@ class PositionDrive:
     profile_velocity_rad_s: float
     d_gain: int = 0
     zero_count: int | tuple[int, ...] = 2048
-    mode: ClassVar[OperatingMode] = OperatingMode.POSITION
-    kind: ClassVar[CommandKind] = POSITION
+    mode = OperatingMode.POSITION
+    kind = POSITION
 
     def __post_init__(self) -> None:
         """Check that the values fit the registers."""
@@ -146,13 +133,7 @@ class PositionDrive:
                 bus.write(servo_id, reg.DRIVE_MODE, drive_mode & reg.DRIVE_REVERSED)
             for register, value in self._settings().items():
                 bus.write(servo_id, register, value)
-                found = bus.read(servo_id, register)
-                if found != value:
-                    raise HardwareLost(
-                        f"servo {servo_id} does not keep its settings: {register.name} is {found} after {value} was "
-                        "written",
-                        hint="is its supply stable?",
-                    )
+                bus.link.require(servo_id, register, value)
 
     def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
         """Return the servos' own position limits, and half a count, which a goal is rounded by [rad].

@@ -7,8 +7,9 @@ addresses, and differ in limits, gains and in the meaning of address 126 (load o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final
+
+from sim2real.hardware.registers import TWOS_COMPLEMENT, MemoryTable, Register, eeprom, ram
 
 COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
@@ -21,7 +22,6 @@ LOAD_FULL_SCALE: Final = 1000  # load registers count in units of 0.1 %
 WATCHDOG_UNIT_S: Final = 0.020
 WATCHDOG_MAX_COUNT: Final = 127
 WATCHDOG_TRIPPED: Final = -1
-RETURN_DELAY_UNIT_S: Final = 2e-6
 DRIVE_REVERSED: Final = 1  # bit of Drive Mode; others: profiles by time instead of speed, goals that switch torque on
 
 # Bits of Hardware Error Status; the servo switches its own torque off when one of them is set.
@@ -34,91 +34,50 @@ HARDWARE_ERRORS: Final[dict[int, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Register:
-    """One entry of the control table.
-
-    Args:
-        name: The e-Manual's name, in lower case.
-        address: Address of the first byte.
-        size: Number of bytes, little endian: 1, 2 or 4.
-        minimum: Smallest value that may be written [counts].
-        maximum: Largest value that may be written [counts].
-        default: Value after power-up [counts].
-        signed: Whether the value is a two's complement.
-        writable: Whether it can be written.
-        eeprom: Whether it is in EEPROM, which cannot be written while torque is on.
-    """
-
-    name: str
-    address: int
-    size: int
-    minimum: int = 0
-    maximum: int = 0
-    default: int = 0
-    signed: bool = False
-    writable: bool = False
-    eeprom: bool = False
-
-    @property
-    def end(self) -> int:
-        """The address after the register's last byte."""
-        return self.address + self.size
-
-    def decode(self, data: bytes | bytearray) -> int:
-        """Return the value of `size` bytes [counts]."""
-        return int.from_bytes(data, "little", signed=self.signed)
-
-    def encode(self, value: int) -> bytes:
-        """Return the bytes of a value [counts], wrapped to the register's size."""
-        return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
-
-
-def _eeprom(name: str, address: int, size: int, low: int, high: int, default: int, signed: bool = False) -> Register:
-    return Register(name, address, size, low, high, default, signed, writable=True, eeprom=True)
-
-
-def _ram(name: str, address: int, size: int, low: int, high: int, default: int = 0, signed: bool = False) -> Register:
-    return Register(name, address, size, low, high, default, signed, writable=True)
-
-
 MODEL_NUMBER = Register("model_number", 0, 2, default=1060, eeprom=True)
 FIRMWARE_VERSION = Register("firmware_version", 6, 1, default=47, eeprom=True)
-ID = _eeprom("id", 7, 1, 0, 252, 1)
-BAUD_RATE = _eeprom("baud_rate", 8, 1, 0, 7, 3)
-RETURN_DELAY_TIME = _eeprom("return_delay_time", 9, 1, 0, 254, 250)
-DRIVE_MODE = _eeprom("drive_mode", 10, 1, 0, 13, 0)
-OPERATING_MODE = _eeprom("operating_mode", 11, 1, 0, 16, 3)
-HOMING_OFFSET = _eeprom("homing_offset", 20, 4, -1_044_479, 1_044_479, 0, signed=True)
-PWM_LIMIT = _eeprom("pwm_limit", 36, 2, 0, PWM_FULL_SCALE, PWM_FULL_SCALE)
-VELOCITY_LIMIT = _eeprom("velocity_limit", 44, 4, 0, 1023, 265)
-MAX_POSITION_LIMIT = _eeprom("max_position_limit", 48, 4, 0, 4095, 4095)
-MIN_POSITION_LIMIT = _eeprom("min_position_limit", 52, 4, 0, 4095, 0)
-TORQUE_ENABLE = _ram("torque_enable", 64, 1, 0, 1)
-LED = _ram("led", 65, 1, 0, 1)
-STATUS_RETURN_LEVEL = _ram("status_return_level", 68, 1, 0, 2, 2)
+ID = eeprom("id", 7, 1, 0, 252, 1)
+BAUD_RATE = eeprom("baud_rate", 8, 1, 0, 7, 3)
+RETURN_DELAY_TIME = eeprom("return_delay_time", 9, 1, 0, 254, 250)
+DRIVE_MODE = eeprom("drive_mode", 10, 1, 0, 13, 0)
+OPERATING_MODE = eeprom("operating_mode", 11, 1, 0, 16, 3)
+HOMING_OFFSET = eeprom("homing_offset", 20, 4, -1_044_479, 1_044_479, 0, sign=TWOS_COMPLEMENT)
+PWM_LIMIT = eeprom("pwm_limit", 36, 2, 0, PWM_FULL_SCALE, PWM_FULL_SCALE)
+VELOCITY_LIMIT = eeprom("velocity_limit", 44, 4, 0, 1023, 265)
+MAX_POSITION_LIMIT = eeprom("max_position_limit", 48, 4, 0, 4095, 4095)
+MIN_POSITION_LIMIT = eeprom("min_position_limit", 52, 4, 0, 4095, 0)
+TORQUE_ENABLE = ram("torque_enable", 64, 1, 0, 1)
+LED = ram("led", 65, 1, 0, 1)
+STATUS_RETURN_LEVEL = ram("status_return_level", 68, 1, 0, 2, 2)
 HARDWARE_ERROR_STATUS = Register("hardware_error_status", 70, 1)
-POSITION_D_GAIN = _ram("position_d_gain", 80, 2, 0, 16383, 4000)
-POSITION_I_GAIN = _ram("position_i_gain", 82, 2, 0, 16383, 0)
-POSITION_P_GAIN = _ram("position_p_gain", 84, 2, 0, 16383, 640)
-BUS_WATCHDOG = _ram("bus_watchdog", 98, 1, 0, WATCHDOG_MAX_COUNT, 0, signed=True)
-GOAL_PWM = _ram("goal_pwm", 100, 2, -PWM_FULL_SCALE, PWM_FULL_SCALE, 0, signed=True)
-GOAL_VELOCITY = _ram("goal_velocity", 104, 4, -1023, 1023, 0, signed=True)
-PROFILE_ACCELERATION = _ram("profile_acceleration", 108, 4, 0, 32767)
-PROFILE_VELOCITY = _ram("profile_velocity", 112, 4, 0, 32767)
-GOAL_POSITION = _ram("goal_position", 116, 4, -1_048_575, 1_048_575, 0, signed=True)
+POSITION_D_GAIN = ram("position_d_gain", 80, 2, 0, 16383, 4000)
+POSITION_I_GAIN = ram("position_i_gain", 82, 2, 0, 16383, 0)
+POSITION_P_GAIN = ram("position_p_gain", 84, 2, 0, 16383, 640)
+BUS_WATCHDOG = ram("bus_watchdog", 98, 1, 0, WATCHDOG_MAX_COUNT, 0, sign=TWOS_COMPLEMENT)
+GOAL_PWM = ram("goal_pwm", 100, 2, -PWM_FULL_SCALE, PWM_FULL_SCALE, 0, sign=TWOS_COMPLEMENT)
+GOAL_VELOCITY = ram("goal_velocity", 104, 4, -1023, 1023, 0, sign=TWOS_COMPLEMENT)
+PROFILE_ACCELERATION = ram("profile_acceleration", 108, 4, 0, 32767)
+PROFILE_VELOCITY = ram("profile_velocity", 112, 4, 0, 32767)
+GOAL_POSITION = ram("goal_position", 116, 4, -1_048_575, 1_048_575, 0, sign=TWOS_COMPLEMENT)
 REALTIME_TICK = Register("realtime_tick", 120, 2)
 MOVING = Register("moving", 122, 1)
-PRESENT_PWM = Register("present_pwm", 124, 2, signed=True)
-PRESENT_LOAD = Register("present_load", 126, 2, signed=True)
-PRESENT_VELOCITY = Register("present_velocity", 128, 4, signed=True)
-PRESENT_POSITION = Register("present_position", 132, 4, signed=True)
+PRESENT_PWM = Register("present_pwm", 124, 2, sign=TWOS_COMPLEMENT)
+PRESENT_LOAD = Register("present_load", 126, 2, sign=TWOS_COMPLEMENT)
+PRESENT_VELOCITY = Register("present_velocity", 128, 4, sign=TWOS_COMPLEMENT)
+PRESENT_POSITION = Register("present_position", 132, 4, sign=TWOS_COMPLEMENT)
 PRESENT_INPUT_VOLTAGE = Register("present_input_voltage", 144, 2, default=120)
 PRESENT_TEMPERATURE = Register("present_temperature", 146, 1, default=30)
 
-TABLE: Final[dict[int, Register]] = {r.address: r for r in list(globals().values()) if isinstance(r, Register)}
-TABLE_BYTES: Final = PRESENT_TEMPERATURE.end
-GOALS: Final = (GOAL_PWM, GOAL_VELOCITY, GOAL_POSITION)
+TABLE: Final = MemoryTable(
+    list(globals().values()),
+    PRESENT_TEMPERATURE.end,
+    TORQUE_ENABLE,
+    (GOAL_PWM, GOAL_VELOCITY, GOAL_POSITION),
+    MODEL_NUMBER,
+    ID,
+    RETURN_DELAY_TIME,
+    PRESENT_POSITION,
+)
 
 
 def rad_from_count(count: int) -> float:

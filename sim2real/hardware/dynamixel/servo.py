@@ -8,16 +8,17 @@ from typing import Final
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.models import model
 from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
-from sim2real.hardware.dynamixel.registers import Register
+from sim2real.hardware.firmware import ServoFirmware
 from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.registers import Register
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5
 _FIXED: Final = (reg.ID, reg.BAUD_RATE, reg.DRIVE_MODE)
-_MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS)
+_MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals)
 
 
-class EmulatedServo:
+class EmulatedServo(ServoFirmware):
     """Registers and firmware of one DYNAMIXEL X servo, without time, bus and physics.
 
     Args:
@@ -28,6 +29,8 @@ class EmulatedServo:
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 
+    table = reg.TABLE
+
     def __init__(
         self,
         servo_id: int,
@@ -36,25 +39,23 @@ class EmulatedServo:
         encoder_counts: int = 4096,
         watchdog_stops: bool | None = None,
     ) -> None:
-        self.servo_id = servo_id
-        self.watchdog_stops = model(model_number).stops_alone if watchdog_stops is None else watchdog_stops
-        self._encoder_counts = encoder_counts
-        self._memory = bytearray(reg.TABLE_BYTES)
-        self._registered: tuple[int, bytes] | None = None
-        self.heard_ns = 0
-        for register in reg.TABLE.values():
-            self.put(register, register.default)
-        self.put(reg.MODEL_NUMBER, model_number)
-        self.put(reg.ID, servo_id)
-        self.put(reg.RETURN_DELAY_TIME, round(return_delay_us * 1e-6 / reg.RETURN_DELAY_UNIT_S))
+        super().__init__(servo_id, model_number, return_delay_us, encoder_counts)
+        self.watchdog_stops = bool(model(model_number).stops_alone) if watchdog_stops is None else watchdog_stops
 
-    def get(self, register: Register) -> int:
-        """Return a register's value in counts."""
-        return register.decode(self._memory[register.address : register.end])
+    @property
+    def answers_reads(self) -> bool:
+        """Whether it answers when it is read."""
+        return self.get(reg.STATUS_RETURN_LEVEL) >= 1
 
-    def put(self, register: Register, value: int) -> None:
-        """Set a register, without the checks of a write from the bus."""
-        self._memory[register.address : register.end] = register.encode(value)
+    @property
+    def confirms(self) -> bool:
+        """Whether it answers when it is written."""
+        return self.get(reg.STATUS_RETURN_LEVEL) >= 2
+
+    @property
+    def identity(self) -> bytes:
+        """Model number and firmware version."""
+        return reg.MODEL_NUMBER.encode(self.get(reg.MODEL_NUMBER)) + bytes((self.get(reg.FIRMWARE_VERSION),))
 
     @property
     def alert(self) -> int:
@@ -107,7 +108,7 @@ class EmulatedServo:
 
     def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
         """Return the error and the bytes that a READ is answered with."""
-        if length == 0 or address + length > reg.TABLE_BYTES:
+        if length == 0 or address + length > reg.TABLE.size:
             return StatusError.ACCESS, b""
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
@@ -132,25 +133,12 @@ class EmulatedServo:
         moves = any(register in _MOTION for register, _ in pairs) and bool(torque_on or torque_was_on)
         return StatusError.NONE, moves
 
-    def register_write(self, address: int, data: bytes) -> StatusError:
-        """Store a REG_WRITE until the next ACTION."""
-        self._registered = (address, data)
-        return StatusError.NONE
-
     def action(self) -> tuple[StatusError, bool]:
-        """Execute the stored write; without one, the result is an instruction error."""
+        """Carry out the stored write; without one, the result is an instruction error."""
         if self._registered is None:
             return StatusError.INSTRUCTION, False
-        address, data = self._registered
-        self._registered = None
-        return self.write(address, data)
-
-    def reboot(self) -> None:
-        """Set every RAM register to its power-up value, which switches torque off."""
-        self._registered = None
-        for register in reg.TABLE.values():
-            if not register.eeprom:
-                self.put(register, register.default)
+        stored, self._registered = self._registered, None
+        return self.write(*stored)
 
     def watchdog_deadline_ns(self) -> int | None:
         """Return when the bus watchdog trips if no instruction comes before; None if it is not armed."""
@@ -180,7 +168,7 @@ class EmulatedServo:
         if not data:
             return StatusError.DATA_LENGTH
         while data:
-            register = reg.TABLE.get(address)
+            register = reg.TABLE.registers.get(address)
             if register is None:
                 return StatusError.ACCESS
             if len(data) < register.size:
@@ -201,7 +189,7 @@ class EmulatedServo:
             return StatusError.DATA_RANGE
         if register == reg.OPERATING_MODE and value not in list(OperatingMode)[1:]:
             return StatusError.DATA_RANGE
-        if register in reg.GOALS and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
+        if register in reg.TABLE.goals and self.get(reg.BUS_WATCHDOG) == reg.WATCHDOG_TRIPPED:
             # e-Manual, Bus Watchdog(98): goals become read-only, and writing them gives a range error.
             return StatusError.DATA_RANGE
         return StatusError.DATA_LIMIT if self._beyond_limit(register, value) else StatusError.NONE

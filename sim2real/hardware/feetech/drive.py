@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.feetech.registers import StsRegister
+from sim2real.hardware.registers import Register
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class StsDrive:
         if not 0.0 < self.torque <= 1.0:
             raise UsageError(f"torque = {self.torque} is no fraction in (0, 1]")
 
-    def registers(self, phase: int) -> dict[StsRegister, int]:
+    def registers(self, phase: int) -> dict[Register, int]:
         """Return the registers' values [counts] for a servo whose register Phase holds `phase`."""
         most = reg.ACCELERATION.maximum
         acceleration = self.acceleration_rad_s2 / (reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT)

@@ -6,16 +6,16 @@ import math
 from typing import Final
 
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.registers import StsRegister
+from sim2real.hardware.firmware import ServoFirmware
 from sim2real.hardware.plant import OperatingMode
 
 STALL_CURRENT_A: Final = 2.7  # data sheet of the STS3215-C018, 12 V
 _MOVING_COUNTS_PER_S: Final = 50
 _FIXED: Final = (reg.ID, reg.BAUD_RATE)
-_MOTION: Final = (reg.TORQUE_ENABLE, *reg.GOALS, reg.OPERATING_MODE)
+_MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals, reg.OPERATING_MODE)
 
 
-class StsServo:
+class StsServo(ServoFirmware):
     """Registers and firmware of one STS3215, without time, bus and physics.
 
     A value that does not fit is dropped without a word, as its status packets have no way to say so; so are writes to
@@ -35,6 +35,8 @@ class StsServo:
         alarms: The alarms that `overload` sets; bits of the error byte.
     """
 
+    table = reg.TABLE
+
     def __init__(
         self,
         servo_id: int,
@@ -44,41 +46,24 @@ class StsServo:
         goal_wakes: bool = True,
         alarms: int = 1 << 5,
     ) -> None:
-        self.servo_id = servo_id
-        self.heard_ns = 0
-        self.watchdog_stops = False
+        super().__init__(servo_id, model_number, return_delay_us, encoder_counts)
         self._goal_wakes = goal_wakes
         self._faults = alarms
-        self._encoder_counts = encoder_counts
-        self._memory = bytearray(reg.TABLE_BYTES)
-        self._registered: tuple[int, bytes] | None = None
-        for register in reg.TABLE.values():
-            self.put(register, register.default)
-        self.put(reg.MODEL_NUMBER, model_number)
-        self.put(reg.ID, servo_id)
-        self.put(reg.RETURN_DELAY_TIME, round(return_delay_us * 1e-6 / reg.RETURN_DELAY_UNIT_S))
         self._saved = bytes(self._memory)
 
-    def get(self, register: StsRegister) -> int:
-        """Return a register's value in counts."""
-        return register.decode(self._memory[register.address : register.end])
-
-    def put(self, register: StsRegister, value: int) -> None:
-        """Set a register, without the checks of a write from the bus."""
-        self._memory[register.address : register.end] = register.encode(value)
+    @property
+    def confirms(self) -> bool:
+        """Whether it answers when it is written."""
+        return bool(self.get(reg.RESPONSE_LEVEL))
 
     @property
-    def alarms(self) -> int:
-        """The error byte of its status packets."""
+    def alert(self) -> int:
+        """The error byte of its status packets: the alarms."""
         return self.get(reg.STATUS)
 
     def command(self) -> tuple[int, float]:
-        """Return what the motor is commanded to do, according to the registers.
-
-        Returns:
-            (mode, goal): PWM and a fraction in [-1, 1], POSITION [rad of the encoder], VELOCITY [rad/s], or OFF and 0.
-        """
-        if not self.get(reg.TORQUE_ENABLE) or self.alarms & self.get(reg.UNLOADING):
+        """Return what the motor is commanded to do, according to the registers; see `ServoFirmware.command`."""
+        if not self.get(reg.TORQUE_ENABLE) or self.alert & self.get(reg.UNLOADING):
             return OperatingMode.OFF, 0.0
         mode = self.get(reg.OPERATING_MODE)
         if mode == reg.Mode.PWM:
@@ -123,14 +108,14 @@ class StsServo:
         self.put(reg.PRESENT_CURRENT, round(load * STALL_CURRENT_A / reg.CURRENT_UNIT_A))
         self.put(reg.MOVING, abs(velocity_rad_s / reg.RAD_PER_COUNT) > _MOVING_COUNTS_PER_S)
 
-    def read(self, address: int, length: int) -> bytes:
-        """Return the bytes that a READ is answered with; beyond the table, zeros."""
-        return bytes(self._memory[address : address + length]).ljust(length, b"\0")
+    def read(self, address: int, length: int) -> tuple[int, bytes]:
+        """Return no error, and the bytes that a READ is answered with; beyond the table, zeros."""
+        return 0, bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
-    def write(self, address: int, data: bytes) -> bool:
-        """Write registers; return whether `command` may have changed."""
+    def write(self, address: int, data: bytes) -> tuple[int, bool]:
+        """Write registers; return no error, and whether `command` may have changed."""
         torque_was_on, moved = self.get(reg.TORQUE_ENABLE), False
-        for register in sorted(reg.TABLE.values(), key=lambda r: r.address):
+        for register in reg.TABLE.registers.values():
             begin = register.address - address
             if not 0 <= begin <= len(data) - register.size:
                 continue
@@ -144,38 +129,24 @@ class StsServo:
                 self._saved = self._saved[: place.start] + register.encode(value) + self._saved[place.stop :]
             if register == reg.GOAL_POSITION and self._goal_wakes:
                 self.put(reg.TORQUE_ENABLE, 1)
-        return moved and bool(torque_was_on or self.get(reg.TORQUE_ENABLE))
+        return 0, moved and bool(torque_was_on or self.get(reg.TORQUE_ENABLE))
 
     def register_write(self, address: int, data: bytes) -> None:
         """Store a REG_WRITE until the next ACTION."""
-        self._registered = (address, data)
+        super().register_write(address, data)
         self.put(reg.ASYNC_WRITE, 1)
 
-    def action(self) -> bool:
-        """Execute the stored write, if there is one; return whether `command` may have changed."""
-        if self._registered is None:
-            return False
-        address, data = self._registered
-        self._registered = None
+    def action(self) -> tuple[int, bool]:
+        """Carry out the stored write, if there is one."""
         self.put(reg.ASYNC_WRITE, 0)
-        return self.write(address, data)
+        return super().action()
 
-    def restart(self) -> None:
+    def reboot(self) -> None:
         """Begin again as after a loss of power, torque off: EEPROM registers as saved, all others at their defaults."""
-        self._registered = None
         self._memory[:] = self._saved
-        for register in reg.TABLE.values():
-            if not register.eeprom:
-                self.put(register, register.default)
+        super().reboot()
         self.put(reg.TORQUE_LIMIT, self.get(reg.MAX_TORQUE))
 
     def overload(self) -> None:
         """Report the alarms from now on; the motor is off as long as one of them is among the unloading conditions."""
         self.put(reg.STATUS, self._faults)
-
-    def watchdog_deadline_ns(self) -> int | None:
-        """Return None: it has no bus watchdog."""
-        return None
-
-    def trip_watchdog(self) -> None:
-        """Do nothing: it has no bus watchdog."""

@@ -41,7 +41,7 @@ class Served:
 
     def strike(self, **faults):
         """Let faults begin, or end."""
-        self.bus._config = self.bus._faults = replace(self.bus._config, **faults)
+        self.bus._config = self.bus.config = replace(self.bus.config, **faults)
 
     def stop(self):
         if self._thread.is_alive():

@@ -62,7 +62,7 @@ def test_settings_are_read_back_and_nothing_is_made_permanent(serve, connect):
     for servo_id in IDS:
         servo = robot.bus.servos[servo_id]
         assert {r: servo.get(r) for r in expected} == expected
-        servo.restart()
+        servo.reboot()
         assert servo.get(reg.RETURN_DELAY_TIME) == 250
     with pytest.raises(SafetyStop, match="servo 1 has lost its settings"):
         device.check()
@@ -171,7 +171,7 @@ def test_an_alarm_at_the_start_is_named(serve, connect):
 
 def test_a_setting_that_a_servo_does_not_keep(serve, connect):
     robot = serve()
-    robot.bus.servos[2].write = lambda address, data: False
+    robot.bus.servos[2].write = lambda address, data: (0, False)
     with pytest.raises(HardwareLost, match="servo 2 does not keep its settings: p_gain is 32 after 16 was written"):
         connect(robot, joints=[Joint("pan", 1), Joint("lift", 2)])
 

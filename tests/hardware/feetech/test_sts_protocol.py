@@ -6,19 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.off import torque_off_packet, torque_queries
-from sim2real.hardware.feetech.protocol import (
-    HEADER,
-    StsInstruction,
-    StsPacket,
-    StsParser,
-    build,
-    describe_alarms,
-    sync_write,
-)
+from sim2real.hardware.feetech.protocol import HEADER, PROTOCOL, describe_alarms
+from sim2real.hardware.packets import Instruction, Packet, Parser
+from sim2real.hardware.registers import Register
+
+build = PROTOCOL.build
 
 tricky = st.lists(st.sampled_from([0xFF, 0xFF, 0x01, 0x02]) | st.integers(0, 255), max_size=20).map(bytes)
-packets = st.builds(StsPacket, st.integers(0, 253), st.sampled_from(list(StsInstruction)).map(int), tricky)
+packets = st.builds(Packet, st.integers(0, 253), st.sampled_from(list(Instruction)).map(int), tricky)
 garbage = tricky.filter(lambda data: HEADER not in data and not data.endswith(b"\xff"))
 GOAL = b"\x00\x08\x00\x00\xe8\x03"
 
@@ -26,16 +21,16 @@ GOAL = b"\x00\x08\x00\x00\xe8\x03"
 @pytest.mark.parametrize(
     ("packet", "manual"),
     [
-        (build(1, StsInstruction.PING), "FF FF 01 02 01 FB"),
-        (build(1, StsInstruction.READ, b"\x38\x02"), "FF FF 01 04 02 38 02 BE"),
-        (build(0xFE, StsInstruction.WRITE, b"\x05\x01"), "FF FF FE 04 03 05 01 F4"),
-        (build(1, StsInstruction.WRITE, b"\x2a" + GOAL), "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5"),
-        (build(10, StsInstruction.REG_WRITE, b"\x2a" + GOAL), "FF FF 0A 09 04 2A 00 08 00 00 E8 03 CB"),
-        (build(0xFE, StsInstruction.ACTION), "FF FF FE 02 05 FA"),
-        (build(0xFE, StsInstruction.SYNC_READ, b"\x38\x08\x01\x02"), "FF FF FE 06 82 38 08 01 02 36"),
+        (build(1, Instruction.PING), "FF FF 01 02 01 FB"),
+        (build(1, Instruction.READ, b"\x38\x02"), "FF FF 01 04 02 38 02 BE"),
+        (build(0xFE, Instruction.WRITE, b"\x05\x01"), "FF FF FE 04 03 05 01 F4"),
+        (build(1, Instruction.WRITE, b"\x2a" + GOAL), "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5"),
+        (build(10, Instruction.REG_WRITE, b"\x2a" + GOAL), "FF FF 0A 09 04 2A 00 08 00 00 E8 03 CB"),
+        (build(0xFE, Instruction.ACTION), "FF FF FE 02 05 FA"),
+        (build(0xFE, Instruction.SYNC_READ, b"\x38\x08\x01\x02"), "FF FF FE 06 82 38 08 01 02 36"),
         (build(1, 0, b"\x18\x05"), "FF FF 01 04 00 18 05 DD"),
         (
-            sync_write(0x2A, dict.fromkeys(range(1, 5), GOAL)),
+            PROTOCOL.write_each(Register("goal", 0x2A, 6), dict.fromkeys(range(1, 5), int.from_bytes(GOAL, "little"))),
             "FF FF FE 20 83 2A 06 01 00 08 00 00 E8 03 02 00 08 00 00 E8 03 03 00 08 00 00 E8 03 04 00 08 00 00 E8 03"
             "58",
         ),
@@ -43,8 +38,8 @@ GOAL = b"\x00\x08\x00\x00\xe8\x03"
 )
 def test_packets_are_those_of_the_manuals_examples(packet, manual):
     assert packet == bytes.fromhex(manual)
-    ((found, end),) = StsParser().feed(packet)
-    assert found.checksum_ok
+    ((found, end),) = Parser(PROTOCOL).feed(packet)
+    assert found.intact
     assert end == len(packet)
     assert build(found.servo_id, found.code, found.parameters) == packet
 
@@ -54,21 +49,21 @@ def test_packets_are_those_of_the_manuals_examples(packet, manual):
 def test_packets_are_found_in_any_chunks_between_any_garbage(pairs, data):
     stream = b"".join(junk + build(p.servo_id, p.code, p.parameters) for junk, p in pairs)
     cuts = sorted(data.draw(st.sets(st.integers(0, len(stream)), max_size=8)) | {0, len(stream)})
-    parser = StsParser()
+    parser = Parser(PROTOCOL)
     found = [packet for begin, end in itertools.pairwise(cuts) for packet, _ in parser.feed(stream[begin:end])]
     assert found == [packet for _, packet in pairs]
 
 
 def test_a_flipped_bit_is_reported_and_the_next_packet_found():
-    broken = bytearray(build(1, StsInstruction.READ, b"\x38\x02"))
+    broken = bytearray(build(1, Instruction.READ, b"\x38\x02"))
     broken[5] ^= 1
-    found = [packet for packet, _ in StsParser().feed(bytes(broken) + build(2, StsInstruction.PING))]
-    assert [(p.servo_id, p.checksum_ok) for p in found] == [(1, False), (2, True)]
+    found = [packet for packet, _ in Parser(PROTOCOL).feed(bytes(broken) + build(2, Instruction.PING))]
+    assert [(p.servo_id, p.intact) for p in found] == [(1, False), (2, True)]
 
 
 def test_a_third_ff_is_no_id_and_a_length_below_2_no_packet():
-    stream = b"\xff" + build(3, StsInstruction.PING) + HEADER + b"\x01\x01" + build(4, StsInstruction.PING)
-    assert [p.servo_id for p, _ in StsParser().feed(stream)] == [3, 4]
+    stream = b"\xff" + build(3, Instruction.PING) + HEADER + b"\x01\x01" + build(4, Instruction.PING)
+    assert [p.servo_id for p, _ in Parser(PROTOCOL).feed(stream)] == [3, 4]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +82,7 @@ def test_numbers_are_a_magnitude_and_a_sign_bit(register, value, data):
 
 
 def test_registers_do_not_overlap_and_their_defaults_are_allowed():
-    ordered = [reg.TABLE[address] for address in sorted(reg.TABLE)]
+    ordered = list(reg.TABLE.registers.values())
     assert all(a.end <= b.address for a, b in itertools.pairwise(ordered))
     assert all(r.minimum <= r.default <= r.maximum for r in ordered if r.writable)
 
@@ -100,8 +95,8 @@ def test_units():
 
 
 def test_every_alarm_can_come_with_torque_off():
-    assert torque_off_packet((1, 7)) == build(0xFE, 0x83, b"\x28\x01\x01\x00\x07\x00")
-    ((query, answers),) = torque_queries((7,))
-    assert query == build(7, StsInstruction.READ, b"\x28\x01")
+    assert PROTOCOL.write_each(reg.TORQUE_ENABLE, {1: 0, 7: 0}) == build(0xFE, 0x83, b"\x28\x01\x01\x00\x07\x00")
+    ((query, answers),) = PROTOCOL.torque_queries(reg.TORQUE_ENABLE, (7,))
+    assert query == build(7, Instruction.READ, b"\x28\x01")
     assert len(set(answers)) == 32
     assert {build(7, 0, b"\0"), build(7, 0b100101, b"\0")} <= set(answers)

@@ -9,21 +9,23 @@ from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.feetech.profile import ProfiledPlant
-from sim2real.hardware.feetech.protocol import BROADCAST_ID, StsInstruction, build, sync_write
+from sim2real.hardware.feetech.protocol import PROTOCOL
+from sim2real.hardware.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
 
 MS = 1_000_000
-READ_STATE = build(1, StsInstruction.READ, b"\x38\x06")
+build = PROTOCOL.build
+READ_STATE = build(1, Instruction.READ, b"\x38\x06")
 OK = bytes.fromhex("FFFF010200FC")
 
 
 def write(register, value, servo_id=1):
-    return build(servo_id, StsInstruction.WRITE, bytes((register.address,)) + register.encode(value))
+    return build(servo_id, Instruction.WRITE, bytes((register.address,)) + register.encode(value))
 
 
 def read(bench, register, servo_id=1):
-    answer = bench.ask(build(servo_id, StsInstruction.READ, bytes((register.address, register.size))))
+    answer = bench.ask(build(servo_id, Instruction.READ, bytes((register.address, register.size))))
     return register.decode(answer[5:-1])
 
 
@@ -68,7 +70,7 @@ def test_an_answer_takes_the_time_of_its_bytes_and_the_return_delay(make_bench, 
 
 def test_several_servos_answer_one_after_the_other_in_the_order_asked(make_bench):
     bench = make_bench()
-    packet = build(BROADCAST_ID, StsInstruction.SYNC_READ, b"\x38\x02" + bytes([3, 9, 1]))
+    packet = build(BROADCAST_ID, Instruction.SYNC_READ, b"\x38\x02" + bytes([3, 9, 1]))
     bench.send(50 * MS, packet)
     bench.run_until(60 * MS)
     begin_ns = 50 * MS + len(packet) * 10_000
@@ -88,7 +90,7 @@ def test_a_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
 
 def test_a_goal_takes_effect_after_the_actuation_latency_at_all_servos_at_once(make_bench):
     bench = make_bench(config=StsEmulation(actuation_latency_s=0.006))
-    goal = sync_write(reg.GOAL_POSITION.address, {i: reg.GOAL_POSITION.encode(2000 + i) for i in (1, 2, 3)})
+    goal = PROTOCOL.write_each(reg.GOAL_POSITION, {i: 2000 + i for i in (1, 2, 3)})
     bench.send(50 * MS, goal)
     bench.run_until(100 * MS)
     effects = bench.truth().of(Kind.EFFECT)
@@ -117,7 +119,7 @@ def test_what_is_written_while_the_lock_is_on_is_forgotten_without_power(make_be
         bench.ask(write(reg.P_GAIN, p_gain))
         assert read(bench, reg.P_GAIN) == p_gain
     bench.ask(write(reg.GOAL_POSITION, 2000))
-    bench.ask(build(1, StsInstruction.RESTART))
+    bench.ask(build(1, Instruction.REBOOT))
     assert read(bench, reg.P_GAIN) == 20
     assert read(bench, reg.LOCK) == 1
     assert read(bench, reg.TORQUE_ENABLE) == 0
@@ -173,12 +175,12 @@ def test_the_response_level_and_broken_or_strange_instructions(make_bench):
     bench.ask(write(reg.RESPONSE_LEVEL, 0))
     assert bench.ask(write(reg.ACCELERATION, 3)) == b""
     assert read(bench, reg.ACCELERATION) == 3
-    broken = bytearray(build(2, StsInstruction.PING))
+    broken = bytearray(build(2, Instruction.PING))
     broken[-1] ^= 1
     assert bench.ask(bytes(broken)) == b""
     assert bench.ask(build(2, 0x77)) == b""
-    assert bench.ask(build(BROADCAST_ID, StsInstruction.PING)) == b""  # three at once
-    assert bench.ask(build(2, StsInstruction.PING)) == bytes.fromhex("FFFF020200FB")
+    assert bench.ask(build(BROADCAST_ID, Instruction.PING)) == b""  # three at once
+    assert bench.ask(build(2, Instruction.PING)) == bytes.fromhex("FFFF020200FB")
 
 
 def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(make_bench):
@@ -189,7 +191,7 @@ def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(
     assert answer[4] == 0x21
     assert read(bench, reg.TORQUE_ENABLE) == 1
     bench.ask(write(reg.GOAL_POSITION, 2060))
-    bench.ask(build(1, StsInstruction.RESTART))
+    bench.ask(build(1, Instruction.REBOOT))
     assert bench.ask(READ_STATE)[4] == 0
     modes = bench.truth().of(Kind.EFFECT)["values"][:, 0]
     assert modes.tolist() == [OperatingMode.POSITION] + [OperatingMode.OFF] * 3

@@ -17,7 +17,7 @@ from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.hardware import Embedded
-from sim2real.robots.loop import DelayParams, delay_of, draw_values
+from sim2real.robots.loop import DelayParams, delay_of
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.worlds.joint import Forces, JointState, JointWorld
@@ -73,32 +73,6 @@ class Table(JointWorld):
         return Forces(acceleration=params.loop * command, damping=params.loop, dry=params.friction)
 
 
-class Spin:
-    """The task: turn as fast as the aim says; see `sim2real.train.env.TrainingTask`."""
-
-    supervisor = "agent"
-    action_low, action_high = np.array([-HARDEST], np.float32), np.array([HARDEST], np.float32)
-
-    def __init__(self, robot: TurntableRobot, agent: Any, values: Any, draws: Any, spread_s: float) -> None:
-        self.robot, self.values, self.draws, self.spread_s = robot, dict(values), dict(draws), spread_s
-        self.observe, self.act, self.observation_size = agent.observe, agent.act, robot.observation_size
-
-    def params(self, key: jax.Array) -> dict[str, Any]:
-        """Draw a table, delays, and an aim."""
-        of_values, of_aim = jax.random.split(key)
-        aim = jax.random.uniform(of_aim, (1,), minval=-8.0, maxval=8.0)
-        return self.robot.node_params(draw_values(of_values, self.values, self.draws, self.spread_s), jnp.zeros(2), aim)
-
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        """Return less the further the speed is from the aim."""
-        off = graph_state.state["world"].velocity - graph_state.params["agent"].aim
-        return -jnp.abs(off).sum() - 1e-4 * jnp.abs(action).sum()
-
-    def success(self, graph_state: GraphState) -> jax.Array:
-        """Return whether the speed is within 0.5 rad/s of the aim."""
-        return jnp.all(jnp.abs(graph_state.state["world"].velocity - graph_state.params["agent"].aim) < 0.5)
-
-
 class TurntableRobot(LoopRobot):
     """A turntable whose motor controller keeps a speed."""
 
@@ -142,8 +116,19 @@ class TurntableRobot(LoopRobot):
 
         return GoalAgent("agent", self.rate_hz, (-FASTEST,), (FASTEST,), features, history=0, aims=1, **options)
 
-    def training_task(self, agent, values, draws, spread_s):
-        return Spin(self, agent, values, draws, spread_s)
+    def random_params(self, key, draw):
+        of_values, of_aim = jax.random.split(key)
+        aim = jax.random.uniform(of_aim, (1,), minval=-8.0, maxval=8.0)
+        return self.node_params(draw(of_values), jnp.zeros(2), aim)
+
+    def judged(self, graph_state):
+        return graph_state.state["world"].velocity - graph_state.params["agent"].aim
+
+    def reward(self, off, action):
+        return -jnp.abs(off).sum() - 1e-4 * jnp.abs(action).sum()
+
+    def success(self, off):
+        return jnp.all(jnp.abs(off) < 0.5)
 
     def node_params(self, values, start, aim, policy=None):
         return {

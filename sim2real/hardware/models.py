@@ -1,0 +1,46 @@
+"""Servo models of all families, and what each does by itself when the computer that controls it dies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sim2real.hardware.device import Alone, WithoutHost
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """A servo model.
+
+    Args:
+        name: The model's name, as printed on the servo.
+        stops_alone: Whether it stops by itself when its bus watchdog trips; None: it has no watchdog.
+        source: How that is known.
+    """
+
+    name: str
+    stops_alone: bool | None
+    source: str
+
+    def without_host(self, watchdog_s: float, motors: tuple[str, ...] = ()) -> WithoutHost:
+        """Return what the servo does by itself when its host dies.
+
+        Args:
+            watchdog_s: The time that its bus watchdog is set to [s]; 0: off.
+            motors: Names of the servos of this model.
+        """
+        if self.stops_alone is None or not watchdog_s:
+            why = "it has no bus watchdog" if self.stops_alone is None else "its bus watchdog is off"
+            return WithoutHost(self.name, motors, Alone.GOES_ON, math.inf, self.source, why)
+        does = Alone.STOPS if self.stops_alone else Alone.GOES_ON
+        return WithoutHost(self.name, motors, does, watchdog_s, self.source)
+
+
+def table(models: Iterable[ServoModel]) -> str:
+    """Return the Markdown table of docs/guides/safety.md: the models, and what they do by themselves."""
+    rows = [
+        (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source) for m in models
+    ]
+    lines = [("Servo", "By itself, when the computer dies", "Known from"), ("---",) * 3, *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -1,0 +1,92 @@
+"""The registers of a servo's memory, whatever family it is of: where they are, and how their bytes mean a number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
+
+TWOS_COMPLEMENT: Final = -1
+RETURN_DELAY_UNIT_S: Final = 2e-6
+
+
+@dataclass(frozen=True)
+class Register:
+    """One entry of a servo's memory table.
+
+    Args:
+        name: The manual's name, in lower case.
+        address: Address of the first byte.
+        size: Number of bytes, little endian: 1, 2 or 4.
+        minimum: Smallest value that may be written [counts].
+        maximum: Largest value that may be written [counts].
+        default: Value after power-up [counts].
+        sign: Bit that means "negative", the others being a magnitude; `TWOS_COMPLEMENT`; None: it is never negative.
+        writable: Whether it can be written.
+        eeprom: Whether its value outlives a loss of power.
+    """
+
+    name: str
+    address: int
+    size: int
+    minimum: int = 0
+    maximum: int = 0
+    default: int = 0
+    sign: int | None = None
+    writable: bool = False
+    eeprom: bool = False
+
+    @property
+    def end(self) -> int:
+        """The address after the register's last byte."""
+        return self.address + self.size
+
+    def decode(self, data: bytes | bytearray) -> int:
+        """Return the value of `size` bytes [counts]."""
+        value = int.from_bytes(data, "little", signed=self.sign == TWOS_COMPLEMENT)
+        if self.sign is None or self.sign == TWOS_COMPLEMENT or not value >> self.sign & 1:
+            return value
+        return -(value & ~(1 << self.sign))
+
+    def encode(self, value: int) -> bytes:
+        """Return the bytes of a value [counts], wrapped to the register's size; a magnitude is cut to what fits."""
+        if self.sign is not None and self.sign != TWOS_COMPLEMENT:
+            value = min(abs(value), (1 << self.sign) - 1) | (value < 0) << self.sign
+        return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
+
+
+ram = partial(Register, writable=True)
+eeprom = partial(Register, writable=True, eeprom=True)
+
+
+@dataclass(frozen=True)
+class MemoryTable:
+    """What the driver of any servo must know of its memory.
+
+    Args:
+        named: Whatever a module of registers defines; what is no register does not count.
+        size: Number of bytes.
+        torque: The register that holds 0 while torque is off.
+        goals: The registers that can move the motor while torque is on.
+        model_number: The register that says which model it is.
+        servo_id: The register that holds its id.
+        return_delay: The register that says how long it waits before it answers, in units of 2 us.
+        position: The register of the measured position.
+    """
+
+    named: Iterable[object]
+    size: int
+    torque: Register
+    goals: tuple[Register, ...]
+    model_number: Register
+    servo_id: Register
+    return_delay: Register
+    position: Register
+    registers: dict[int, Register] = field(init=False)
+    """Address -> register."""
+
+    def __post_init__(self) -> None:
+        """Keep the registers alone."""
+        registers = sorted((r for r in self.named if isinstance(r, Register)), key=lambda r: r.address)
+        object.__setattr__(self, "registers", {r.address: r for r in registers})
