@@ -11,8 +11,9 @@ PIPELINE = Pipeline(
     name="so101",
     summary="SO-101 arm of six Feetech servos: reach for a target, with the jaw as it is told",
     package=__name__,
+    # Slower motion cannot tell a delay from the rotors' inertia: these servos' motion lags as little by either.
     record=RecordConfig(amplitude=0.4, low_hz=0.2, high_hz=6.0, gate=GATE),
-    # The data sheet is near enough for refinement to start from; a search over 19 parameters would take minutes.
+    # The data sheet is near enough for refinement to start from; a search over 18 parameters would take minutes.
     identify=IdentifyConfig(
         initial_state="measured",
         skip_s=0.3,
