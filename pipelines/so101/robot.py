@@ -1,73 +1,184 @@
-"""The arm for the identify stage: what may be identified, and the graph that predicts the positions."""
+"""The SO-101 for the stages: its servos and their calibration, what is identified, its aim and its score."""
 
 from __future__ import annotations
 
+import os
+import random
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.graph.node import BaseNode
-from sim2real.identify.leaves import get_leaf
-from sim2real.identify.model import Channel
+from sim2real.errors import UsageError
+from sim2real.hardware.config import GateLimits
+from sim2real.hardware.device import Device
+from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
+from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.registry import load_device
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.recorded import LoggedRobot
-from sim2real.worlds.recorded import RecordedActuator
+from sim2real.robots import standard
+from sim2real.robots.hardware import Embedded, ServoSession
+from sim2real.robots.messages import JointReading
+from sim2real.robots.servo_robot import ServoRobot, Servos
 
-from .model import JOINTS, ArmWorld, Goal, Sensor, nominal
+from .parts import JOINTS, SHEET
+from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
-RATE_HZ, WORLD_HZ = 1 / 0.02006, 4 / 0.02006
-_SATURATES = ("rotation", "wrist_roll", "jaw")
-"""The other servos never came to their limit in the recordings."""
+LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
+"""Joint angles between which targets are drawn [rad]: whatever is drawn can be reached."""
+CALIBRATION = "SO101_CALIBRATION"
+"""Environment variable that names the calibration of the arm on the port."""
+SATURATES = ("wrist_roll", "gripper")
+"""Joints whose servos may push no harder from a smaller error on than the data sheet says."""
 
 
-class SO101(LoggedRobot):
-    """Six position servos."""
+class SO101Robot(ServoRobot):
+    """An SO-101 on a table.
 
-    units = {"position": "rad", "goal": "rad"}
-    channels = tuple(Channel("position", None, 0.002, 0.1, i, joint, "goal") for i, joint in enumerate(JOINTS))
-    delayed = "goal to position"
-    tick_s = 1 / WORLD_HZ
-    burst = 1
+    Its goals stay in a box of joint angles that keeps the arm 4 cm above the table. In a corner of the box it is folded
+    away: the upper arm lies back on its stop, the forearm above it, the hand points up. There it stays without torque;
+    wherever else it loses its torque, it sinks to the table.
+    """
+
+    servos = Servos(
+        joints=JOINTS,
+        ids=(1, 2, 3, 4, 5, 6),
+        low=(-1.4, -1.65, 0.2, -1.6, -1.5, -0.8),
+        high=(1.4, -0.3, 1.6, -1.0, 1.5, 0.8),
+        sheet=SHEET,
+        speed=1.5,
+        rest=(0.0, -1.65, 1.6, -1.4, 0.0, -0.6),
+        middle=(0.0, -0.95, 0.9, -1.3, 0.0, 0.0),
+        device="feetech",
+    )
+    aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
+    features = (
+        ("position", ("rad",) * 6),
+        ("velocity / 5", ("rad/s",) * 6),
+        ("goal less position", ("rad",) * 6),
+        ("10 x target less tip: outwards, sideways, up", ("m",) * 3),
+        ("opening less the jaw's", ("rad",)),
+    )
+
+    @property
+    def embedded(self) -> Embedded:
+        """The robot inside the computer, with latencies that no stage is told."""
+        draw = random.Random("an SO-101 of its own")
+        emulator = StsEmulation(
+            sensing_latency_s=draw.uniform(0.004, 0.008),
+            sensing_jitter_s=draw.uniform(0.0005, 0.001),
+            actuation_latency_s=draw.uniform(0.008, 0.016),
+            actuation_jitter_s=draw.uniform(0.001, 0.002),
+            reply_loss=0.001,
+            homing_offset=85,
+        )
+        return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
 
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified."""
-        linear: Any = "linear"
-        rows = []
-        for i, joint in enumerate(JOINTS):
-            about = {
-                "stiffness": ("1/s^2", 20.0, 10000.0, "log", "firmware's gain over inertia"),
-                "damping": ("1/s", 1.0, 800.0, "log", "damping over inertia"),
-                "friction.static": ("rad", 0.0005, 0.1, "log", "dry friction at rest, over the stiffness"),
-                "friction.stribeck_rad_s": ("rad/s", 0.02, 20.0, "log", "speed over which friction wears off"),
-                "bias": ("rad", -0.06, 0.06, linear, "goal to encoder"),
-            }
-            if joint in _SATURATES:
-                about["saturation"] = ("rad", 0.02, 3.0, "log", "error at which the servo pushes hardest")
-            for leaf, (unit, low, high, transform, text) in about.items():
-                value = float(np.asarray(get_leaf(nominal(), leaf))[i])
-                name = f"{joint}_{leaf.rpartition('.')[2].removesuffix('_rad_s')}"
-                rows.append(Parameter(name, unit, value, low, high, transform, about=text, leaf=f"world.{leaf}[{i}]"))
-        rows += [
-            # Read off single_joint_wrist_roll, where the joint stops short of its goal.
-            Parameter("wrist_roll_low", "rad", -1.034, -3.0, -0.5, linear, leaf="world.low[4]", about="stop"),
-            Parameter(
-                "weight_upper", "rad", 0.005, -0.1, 0.2, linear, leaf="world.gravity.shoulder", about="upper arm"
-            ),
-            Parameter("weight_forearm", "rad", 0.01, -0.1, 0.2, linear, leaf="world.gravity.forearm", about="forearm"),
-            Parameter("weight_hand", "rad", 0.001, -0.1, 0.2, linear, leaf="world.gravity.hand", about="hand"),
-            Parameter("table_height", "rad", 0.95, 0.6, 1.6, linear, leaf="world.table.height", about="contact"),
-            Parameter(
-                "table_ratio", "1", 0.85, 0.1, 2.6, leaf="world.table.ratio", about="pitch's share of the contact"
-            ),
-            Parameter("table_stiffness", "1", 0.8, 0.05, 4.0, leaf="world.table.stiffness", about="contact over servo"),
-        ]
-        return rows
+        """Return what may be identified: servos of one model, each with friction and brake of its own."""
+        found = standard.parameters(SHEET, JOINTS, own=("damping", "friction"))
+        full, about = SHEET.full_rad, "error from which on it pushes no harder"
+        return found + [Parameter(f"saturation_{j}", "rad", full, full / 10, full * 2, about=about) for j in SATURATES]
 
-    def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        """Return sensor, actuator and world."""
-        actuator = RecordedActuator("actuator", RATE_HZ, Goal(goal=jnp.zeros(6)))
-        return Sensor("sensor", RATE_HZ), actuator, ArmWorld("world", WORLD_HZ, substep_s=0.0051)
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+        """Open the arm with the calibration of the one on this port, with torque off; see ``Robot.connect``."""
+        joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else find())
+
+        def device(port: str) -> Device:
+            s = self.servos
+            drive = replace(SHEET.drive, joints=joints)
+            return load_device(s.device)(port, s.ids, drive, baud_rate=s.baud_rate, silence_s=limits.servo_watchdog_s)
+
+        return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
+
+    def make_task(self) -> Reach:
+        """Return the task; where the target is, the graph's parameters say."""
+        return Reach()
+
+    def aim_fields(self, task: Reach) -> Mapping[str, tuple[Any, str]]:
+        """Return where target and opening stand in the model."""
+        return {"target": (task.table.target, "pos"), "opening": (task.table.opening, "pos")}
+
+    def place_aim(self, aim: Any) -> dict[str, Any]:
+        """Return the target's position ``(3,)`` [m], and the opening [rad] as the first of ``(3,)``."""
+        aim = jnp.asarray(aim, jnp.float32)
+        return {"target": aim[:3], "opening": jnp.zeros(3).at[0].set(aim[3])}
+
+    def draw_aim(self, key: jax.Array) -> jax.Array:
+        """Return a target [m] and an opening [rad], ``(4,)``."""
+        angles = jax.random.uniform(key, (6,), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
+        return jnp.append(tip_of(jnp, angles), angles[5])
+
+    def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
+        """Return what the policy sees: joints, and the way to the target, seen from the arm."""
+        q = reading.position
+        gap = aim[:3] - tip_of(jnp, q)
+        c, s = jnp.cos(q[0]), -jnp.sin(q[0])  # pan turns clockwise
+        way = jnp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+        return jnp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
+
+    def success(self, state: Any) -> jax.Array:
+        """Return whether the tip is at the target, and the jaw as it is told."""
+        return (state.variables["distance"] < CLOSE_M) & (state.variables["ajar"] < CLOSE_RAD)
+
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return how near tip and jaw came.
+
+        ``success`` is the share of the second half in which both are there, ``reached`` 1 where they are at the end.
+        """
+        position = np.stack([states[f"position[{i}]"] for i in range(6)], axis=-1)
+        aim = np.array([states[f"aim[{i}]"][-1] for i in range(4)])
+        distance = np.linalg.norm(tip_of(np, position) - aim[:3], axis=-1)
+        ajar = np.abs(position[:, 5] - aim[3])
+        there = (distance < CLOSE_M) & (ajar < CLOSE_RAD)
+        second_half, end = t_s >= (t_s[0] + t_s[-1]) / 2, t_s >= t_s[-1] - 0.5
+        first = np.flatnonzero(there)
+        return {
+            "success": float(there[second_half].mean()),
+            "reached": float(distance[end].mean() < CLOSE_M and ajar[end].mean() < CLOSE_RAD),
+            "distance_m": float(distance[end].mean()),
+            "opening_off_rad": float(ajar[end].mean()),
+            "first_reached_s": float(t_s[first[0]] - t_s[0]) if first.size else float("nan"),
+        }
 
 
-ROBOT = SO101()
+def read(path: Path) -> tuple[CalibratedJoint, ...]:
+    """Return the joints of LeRobot's calibration file, in the order of the arm.
+
+    Raises:
+        UsageError: It is no calibration of an SO-101.
+    """
+    joints = {joint.name: joint for joint in read_calibration(path)}
+    if lacking := [name for name in JOINTS if name not in joints]:
+        raise UsageError(
+            f"calibration file {path} has no motor {lacking[0]!r}. There are: {', '.join(joints)}",
+            hint="is it an SO-101's?",
+        )
+    return tuple(joints[name] for name in JOINTS)
+
+
+def find() -> Path:
+    """Return the calibration of the arm on the port: the one that SO101_CALIBRATION names, else LeRobot's only one.
+
+    Raises:
+        UsageError: There is none, or there are several.
+    """
+    if named := os.environ.get(CALIBRATION):
+        return Path(named).expanduser()
+    home = os.environ.get("HF_LEROBOT_HOME", "~/.cache/huggingface/lerobot")
+    folder = Path(os.environ.get("HF_LEROBOT_CALIBRATION", f"{home}/calibration")).expanduser() / "robots"
+    found = [path for kind in ("so101_follower", "so_follower") for path in sorted((folder / kind).glob("*.json"))]
+    if len(found) != 1:
+        there = f"several calibrations: {', '.join(path.name for path in found)}" if found else "no calibration"
+        raise UsageError(
+            f"there is {there} in {folder}",
+            hint=f"set {CALIBRATION} to the file of this arm; lerobot-calibrate writes one",
+        )
+    return found[0]
+
+
+ROBOT = SO101Robot()

@@ -1,6 +1,7 @@
-"""The arm's whole run for several seeds, and beside it the same training on the nominal model without delays.
+"""Whole runs of an arm that reaches for targets, ``arm`` or ``so101``, for several seeds.
 
-On an accelerator, the training alone, in a run folder that holds a recording and an identification:
+Beside each stands the same training on the nominal model without delays. On an accelerator, the training alone, in a
+run folder that holds a recording and an identification:
 
     python scripts/bench.py arm --train RUN -- --ppo.num-envs 1024
 """
@@ -28,25 +29,25 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     stages.add_flags(parser, seeds=[0])
     parser.add_argument("--train", type=Path, metavar="RUN", help="only train, on an accelerator, in this run folder")
-    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run arm`, with --train of `train arm`")
+    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run`, with --train of `train`")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Run the arm once a seed, or train it; return the rows and a record of every seed."""
     if options.train:
-        return {"rows": train_rows(options.train.resolve(), options.flags)}
+        return {"rows": train_rows(options.bench, options.train.resolve(), options.flags)}
     seeds = stages.run_seeds(options, run_seed)
-    return {"rows": rows(seeds), "seeds": seeds}
+    return {"rows": rows(options.bench, seeds), "seeds": seeds}
 
 
 def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Run the arm, and the baseline where that is asked for, and collect what the stages measured."""
-    run_dir, result = stages.whole_run("arm", seed, runs, options.flags)
+    run_dir, result = stages.whole_run(options.bench, seed, runs, options.flags)
     result["mae_mrad"] = held_out_mae_mrad(stages.done(run_dir, "identify").output("predictions"))
     # How far the tip was from the target in the last half second of each deployment.
     result["distances_m"] = stages.deployed(run_dir, "distance_m")
     if not options.no_nominal:
-        baseline = stages.nominal_run("arm", seed, runs, run_dir)
+        baseline = stages.nominal_run(options.bench, seed, runs, run_dir)
         result["nominal_distances_m"] = stages.deployed(baseline, "distance_m")
     return result
 
@@ -60,12 +61,12 @@ def held_out_mae_mrad(predictions: Path) -> float:
     return 1e3 * float(np.mean(errors))
 
 
-def train_rows(run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
-    """Train in a run folder that holds a recording and an identification; return how long that took."""
+def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
+    """Train an arm in a run folder that holds a recording and an identification; return how long that took."""
     import jax
 
     begin = time.monotonic()
-    stages.sim2real("train", "arm", "--run", str(run_dir), "--runs", str(run_dir.parent.parent), *flags)
+    stages.sim2real("train", arm, "--run", str(run_dir), "--runs", str(run_dir.parent.parent), *flags)
     total_s = time.monotonic() - begin
     history = json.loads(stages.done(run_dir, "train").output("history").read_text())
     success = np.max(history["success"], axis=1)
@@ -80,21 +81,21 @@ def train_rows(run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
         ("env_steps_per_s", history["env_steps_per_s"], "1/s", ""),
     ]
     how = f"{jax.devices()[0].device_kind} {' '.join(flags)}"
-    return [row(f"arm/train/{n}", v, unit, how, goal) for n, v, unit, goal in found]
+    return [row(f"{arm}/train/{n}", v, unit, how, goal) for n, v, unit, goal in found]
 
 
-def rows(seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return every figure, one value a seed."""
-    found = stages.rows("arm", seeds, {"total_s": "< 900"})
+def rows(arm: str, seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return every figure of an arm, one value a seed."""
+    found = stages.rows(arm, seeds, {"total_s": "< 900"})
     mae = [round(s["mae_mrad"], 2) for s in seeds]
-    found.append(row("arm/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
+    found.append(row(f"{arm}/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
     for key, label in (("distances_m", "identified"), ("nominal_distances_m", "nominal")):
         if key in seeds[0]:
             reached = [int(np.sum(np.array(s[key]) < CLOSE_M)) for s in seeds]
             goal = "9 of 10" if label == "identified" else ""
             found.append(
-                row(f"arm/reached/{label}", reached, f"of {len(seeds[0][key])}", "within 2 cm at the end", goal)
+                row(f"{arm}/reached/{label}", reached, f"of {len(seeds[0][key])}", "within 2 cm at the end", goal)
             )
             middle = [round(1e3 * float(np.median(s[key])), 1) for s in seeds]
-            found.append(row(f"arm/distance/{label}", middle, "mm", "median"))
+            found.append(row(f"{arm}/distance/{label}", middle, "mm", "median"))
     return found

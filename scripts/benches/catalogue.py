@@ -56,6 +56,7 @@ BENCHES = {
         ),
     ),
     "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
+    "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
 }
 

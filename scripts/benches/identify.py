@@ -70,7 +70,7 @@ class Case:
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings, or one of their files")
-    parser.add_argument("--case", choices=["disk", "xl330", "so101"], default="disk")
+    parser.add_argument("--case", choices=["disk", "xl330", "so101_log"], default="disk")
     parser.add_argument("--fit", help="what to fit on; see benches/recordings.py")
     parser.add_argument("--test", help="what to judge on")
     parser.add_argument("--seeds", type=int, nargs="+", help="seeds of the search (xl330: 0 1 2, else 0)")

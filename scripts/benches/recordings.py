@@ -14,12 +14,12 @@ from sim2real.log.importer import import_file
 from sim2real.log.mapping import load_mapping
 from sim2real.stages.pipeline import load_pipeline
 
-FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101": "so101"}
+FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101_log": "so101"}
 SPECS = {
     "disk": ":25000", "disk_test": "25000:30000",
     "xl330": "kp=100,800", "xl330_test": "kp=200",
-    "so101": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
-    "so101_test": "step_response single_joint_*[0.5:1]",
+    "so101_log": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
+    "so101_log_test": "step_response single_joint_*[0.5:1]",
 }  # fmt: skip
 PAST = 20
 """Samples of the disk before a test part that its initial state may be estimated from."""
@@ -29,10 +29,10 @@ def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
     """Return the recordings of a case that a text selects, by name.
 
     Args:
-        case: ``disk``, ``xl330`` or ``so101``.
+        case: ``disk``, ``xl330`` or ``so101_log``.
         data: Folder with the case's files, or with its folder, or one of the files.
-        spec: disk: ``[FILE@]A:B``, samples. xl330: ``kp=100,800 motion=sin_sin,up_and_down``, or ``all``. so101: names
-            of motions, with ``*``, and with ``[a:b]`` for a part, in shares of its length.
+        spec: disk: ``[FILE@]A:B``, samples. xl330: ``kp=100,800 motion=sin_sin,up_and_down``, or ``all``. so101_log:
+            names of motions, with ``*``, and with ``[a:b]`` for a part, in shares of its length.
         past: Further samples of the disk before ``A``.
 
     Raises:
@@ -45,7 +45,7 @@ def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
         raise UsageError(
             f"{data} is no file {pattern} and no folder with such files", hint=f"--data: {case}'s recordings"
         )
-    found = {"disk": _disk, "xl330": _xl330, "so101": _so101}[case](files, spec, past)
+    found = {"disk": _disk, "xl330": _xl330, "so101_log": _so101}[case](files, spec, past)
     if not found:
         names = ", ".join(f.name for f in files)
         raise UsageError(f"{spec!r} selects nothing of {names}", hint="say with --fit and --test what to take of them")
@@ -90,6 +90,6 @@ def _so101(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
                     count = len(content["t_meas_s"])
                 samples = slice(round(a * count), round(b * count))
                 found[f"{file.stem}[{a:g}:{b:g}]" if share else file.stem] = import_file(
-                    file, load_mapping(_mapping("so101")), samples
+                    file, load_mapping(_mapping("so101_log")), samples
                 )
     return found

@@ -15,7 +15,7 @@ Row = tuple[str, float, str, str, str]
 
 def rows(case: str, fitted: Mapping[str, Episode], test: Mapping[str, Episode], ours: Mapping[str, float]) -> list[Row]:
     """Return name, value, unit, yardstick and goal of each figure; ``ours`` are those of our model by name."""
-    return {"disk": _disk, "xl330": _xl330, "so101": _so101}[case](list(fitted.values()), test, ours)
+    return {"disk": _disk, "xl330": _xl330, "so101_log": _so101}[case](list(fitted.values()), test, ours)
 
 
 def recording(episode: Episode, command: str, field: str, **constants: object) -> sysid.Recording:

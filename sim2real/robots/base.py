@@ -165,6 +165,10 @@ class Robot(RecordedRobot):
             signal: Shape ``(N,)`` or ``(N, actions)``: one command per step.
         """
 
+    def around(self, signal: np.ndarray) -> np.ndarray:
+        """Return an excitation ``(N, actions)`` as this robot plays it; default: around 0, as it is."""
+        return signal
+
     @abstractmethod
     def deployment_nodes(self, session: Any, policy: Any, trial: int = 0) -> tuple[dict[str, BaseNode], dict[str, Any]]:
         """Return the graph on hardware that runs a policy, and parameters of its nodes.

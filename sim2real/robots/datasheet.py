@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 from sim2real.hardware.dynamixel.drive import PositionDrive
 from sim2real.hardware.dynamixel.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COUNT
+from sim2real.hardware.feetech.drive import StsDrive
+from sim2real.hardware.feetech.registers import P_GAIN_UNIT_PER_RAD
 
 
 @dataclass(frozen=True)
 class DataSheet:
-    """Data of a position-controlled servo, and its settings.
+    """Data of a position-controlled servo, and its settings; of a DYNAMIXEL, where no subclass says otherwise.
 
     Attributes:
         stall: Torque at full duty and standstill [N m].
@@ -41,6 +45,25 @@ class DataSheet:
         return self.stall / self.full_rad
 
     @property
-    def drive(self) -> PositionDrive:
-        """The drive with these settings."""
+    def drive(self) -> Any:
+        """The drive with these settings, for the robot's device."""
         return PositionDrive(self.p_gain, self.profile_rad_s)
+
+
+@dataclass(frozen=True)
+class StsSheet(DataSheet):
+    """Data of a Feetech STS servo; its device is ``feetech``. Default settings are LeRobot's."""
+
+    p_gain: int = 16
+    profile_rad_s: float = math.inf
+    model_number: int = 777
+
+    @property
+    def full_rad(self) -> float:
+        """Position error at which the duty is full [rad]."""
+        return 1.0 / (self.p_gain * P_GAIN_UNIT_PER_RAD)
+
+    @property
+    def drive(self) -> StsDrive:
+        """The drive with these settings; its joints are those of a calibration."""
+        return StsDrive(self.p_gain, speed_rad_s=self.profile_rad_s)

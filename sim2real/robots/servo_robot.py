@@ -36,7 +36,7 @@ from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
 from sim2real.robots.training import Draw
 
-_AT_HOME_RAD, _HOME_RAD_S, _HOLD_S = 0.1, 1.0, 0.5
+_AT_HOME_RAD, _HOME_RAD_S, _HOLD_S, _AFTER_S = 0.1, 1.0, 0.5, 1.0
 
 
 class ServoRobot(LoopRobot):
@@ -333,10 +333,16 @@ class ServoRobot(LoopRobot):
         A joint that stands elsewhere comes to its signal slowly, at 1 rad/s, instead of in a leap.
         """
         signal = np.asarray(signal, np.float64).reshape(-1, len(self.servos.joints))
+        # Behind its end an excitation is 0, where these joints may not be: they wait where it ended.
+        signal = self.around(np.vstack([signal, np.repeat(signal[-1:], round(_AFTER_S * self.rate_hz), axis=0)]))
         away = session.rig.measure().position_rad - signal[0]
         gone = np.arange(len(signal))[:, None] * _HOME_RAD_S / self.rate_hz
         signal = signal + np.sign(away) * np.maximum(np.abs(away) - gone, 0.0)
         return super().recording_nodes(session, signal)
+
+    def around(self, signal: np.ndarray) -> np.ndarray:
+        """Return goals ``(N, joints)`` [rad] of an excitation: around the middle."""
+        return signal + np.asarray(self.servos.middle or 0.0)
 
     def identified_mjcf(self, values: Mapping[str, Any]) -> str:
         """Return the robot's model with what was found, as MJCF."""

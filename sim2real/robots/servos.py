@@ -23,6 +23,7 @@ class Servos:
         speed: The fastest that a policy moves goals [rad/s].
         rest: Where the joints hang without torque [rad]; default: 0.
         rest_tolerance: How far from there an episode may start [rad].
+        middle: What excitations are around [rad]; default: 0.
         baud_rate: Of the bus.
         device: Name of the device that they are; see `sim2real.hardware.registry`.
     """
@@ -35,6 +36,7 @@ class Servos:
     speed: float = 1.5
     rest: tuple[float, ...] = ()
     rest_tolerance: float = 0.4
+    middle: tuple[float, ...] = ()
     baud_rate: int = 1_000_000
     device: str = "dynamixel"
 

@@ -1,4 +1,4 @@
-"""The parameters of a robot whose servos are all of one model: shared ones, and the friction of each joint.
+"""The parameters of a robot whose servos are all of one model: shared ones, and those of each joint.
 
 They are a servo's, at its shaft, as in its data sheet. A joint with a gear feels torque and friction times the gear,
 and gain, damping and inertia times its square.
@@ -18,19 +18,46 @@ from sim2real.identify.parameters import Parameter
 from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.parts import ServoDriven
 
+_NAMES = ("gain", "damping", "armature", "friction")
 
-def parameters(sheet: DataSheet, joints: Sequence[Joint | str]) -> list[Parameter]:
-    """Return gain, damping, rotor inertia and each joint's friction, bounded to factors of 3 to 8 of the data sheet."""
-    s = sheet
-    return [
-        Parameter("gain", "N m/rad", s.gain, s.gain / 3, s.gain * 3, about="torque per error, at the P gain in use"),
-        Parameter("damping", "N m s/rad", s.damping, s.damping / 4, s.damping * 4, about="back-EMF, viscous friction"),
-        Parameter("armature", "kg m^2", s.armature, s.armature / 4, s.armature * 4, about="rotor behind the gears"),
-        *(
-            Parameter(f"friction_{j.name}", "N m", s.friction, s.friction / 8, s.friction * 8, about="dry friction")
-            for j in map(Joint.of, joints)
-        ),
-    ]
+
+def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
+    """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 8 of the data sheet.
+
+    Args:
+        sheet: The servo's data sheet.
+        joints: The joints, or their names.
+        own: Which of these each joint has for itself, named as ``friction_JOINT``; joints share the others.
+    """
+    found = []
+    for name, (unit, factor, about) in {
+        "gain": ("N m/rad", 3, "torque per error, at the P gain in use"),
+        "damping": ("N m s/rad", 4, "back-EMF, viscous friction"),
+        "armature": ("kg m^2", 4, "rotor behind the gears"),
+        "friction": ("N m", 8, "dry friction"),
+    }.items():
+        value = getattr(sheet, name)
+        names = [f"{name}_{j.name}" for j in map(Joint.of, joints)] if name in own else [name]
+        found += [Parameter(n, unit, value, value / factor, value * factor, about=about) for n in names]
+    return found
+
+
+def of_joints(
+    values: Mapping[str, Any], name: str, joints: Sequence[Joint | str], otherwise: float | None = None
+) -> list[Any]:
+    """Return the value of every joint's servo: its own, else the shared one.
+
+    Args:
+        values: Parameters by name.
+        name: Such as ``gain``; a joint's own is ``gain_JOINT``.
+        joints: The joints, or their names.
+        otherwise: The value where there is neither; None: one of them must be there.
+    """
+    shared, labels = values.get(name, otherwise), [f"{name}_{j.name}" for j in map(Joint.of, joints)]
+    found = [values.get(label, shared) for label in labels]
+    if lacking := [label for label, value in zip(labels, found, strict=True) if value is None]:
+        raise KeyError(lacking[0])
+    return found
 
 
 def fields(robot: ServoDriven) -> dict[str, tuple[Any, str]]:
@@ -54,20 +81,22 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         joints: The joints, or their names.
         step_s: The physics' time step [s].
     """
-    joints = [Joint.of(joint) for joint in joints]
-    n, gear = len(joints), np.array([joint.gear for joint in joints], np.float32)
-    gain, damping = (jnp.asarray(values[name], jnp.float32) for name in ("gain", "damping"))
+    n, gear = len(joints), np.array([Joint.of(joint).gear for joint in joints], np.float32)
+    gain, damping, inertia, friction, full = (
+        jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
+        for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad))
+    )
     # MuJoCo's implicit integration of damping acts like an additional inertia of half a step times the damping, which
     # is subtracted here. At 2.5 ms it is 6 % of the rotors' inertia of pipelines/arm.
-    armature = jnp.maximum(jnp.asarray(values["armature"]) - 0.5 * step_s * damping, 0.0)
+    armature = jnp.maximum(inertia - 0.5 * step_s * damping, 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
         "bias": jnp.zeros((n, 10)).at[:, 1].set(-gain * gear**2),
         # The torque limit is that at full duty, so it is proportional to the gain.
-        "most": gain * sheet.full_rad * gear[:, None] * jnp.tile(jnp.array([[-1.0, 1.0]]), (n, 1)),
+        "most": (gain * full * gear)[:, None] * jnp.array([-1.0, 1.0]),
         "damping": damping * gear**2,
         "armature": armature * gear**2,
-        "friction": gear * jnp.stack([jnp.asarray(values[f"friction_{j.name}"], jnp.float32) for j in joints]),
+        "friction": friction * gear,
     }
 
 
@@ -84,14 +113,17 @@ def identified_mjcf(
         joints: The joints, or their names.
     """
     spec: Any = mj.MjSpec.from_string(mjcf)
-    for mounted, element, actuator in zip(map(Joint.of, joints), robot.joints, robot.actuators, strict=True):
-        gear = mounted.gear
-        gain, friction = float(values["gain"]) * gear**2, float(values[f"friction_{mounted.name}"]) * gear
+    found = [of_joints(values, name, joints) for name in _NAMES]
+    found.append(of_joints(values, "saturation", joints, sheet.full_rad))
+    rows = zip(joints, robot.joints, robot.actuators, zip(*found, strict=True), strict=True)
+    for mounted, element, actuator, numbers in rows:
+        gear = Joint.of(mounted).gear
+        gain, damping, armature, friction, full = (float(n) for n in numbers)
         joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
-        joint.damping = [float(values["damping"]) * gear**2, *joint.damping[1:]]
-        joint.armature, joint.frictionloss = float(values["armature"]) * gear**2, friction
-        motor.gainprm, motor.biasprm = [gain, *motor.gainprm[1:]], [0.0, -gain, *motor.biasprm[2:]]
-        most = gain * sheet.full_rad / gear
+        joint.damping = [damping * gear**2, *joint.damping[1:]]
+        joint.armature, joint.frictionloss = armature * gear**2, friction * gear
+        stiffness, most = gain * gear**2, gain * full * gear
+        motor.gainprm, motor.biasprm = [stiffness, *motor.gainprm[1:]], [0.0, -stiffness, *motor.biasprm[2:]]
         motor.forcerange = [-most, most]
     spec.compile()
     return spec.to_xml()

@@ -250,7 +250,8 @@ def simulate(
     """
     nodes = model.nodes(config.max_delay_s)
     node, field = robot.roles.actuator, robot.command
-    signal = command_signal(record, robot.rate_hz, len(robot.action))
+    signal = command_signal(record, robot.rate_hz, len(robot.action)).reshape(-1, len(robot.action))
+    signal = robot.around(signal)
     timeline = draw(nodes, record.duration_s, rng=record.seed)
     given, outputs = {}, {}
     for name in model.given:

@@ -218,7 +218,7 @@ def test_bundles_of_another_robot(fails, tmp_path, completed, what):
     assert not (tmp_path / "pendulum").exists()
 
 
-@pytest.mark.parametrize("pipeline", ["disk", "so101", "xl330"])
+@pytest.mark.parametrize("pipeline", ["disk", "so101_log", "xl330"])
 @pytest.mark.parametrize("stage", ["record", "train", "deploy", "run"])
 def test_robots_that_are_known_from_recordings_alone(fails, tmp_path, pipeline, stage):
     said = fails(errors.USAGE, stage, pipeline, "--runs", tmp_path / "runs")

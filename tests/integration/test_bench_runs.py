@@ -59,16 +59,17 @@ def test_demo_beside_the_nominal_model(commands, tmp_path):
     assert (keep / "seed4" / "nominal").is_dir()
 
 
-def test_arm(commands, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["arm", "so101"])
+def test_arm(name, commands, tmp_path, monkeypatch):
     # The run at hand is the pendulum's: it has a success where the arm has a distance.
     monkeypatch.setattr(arm.stages, "deployed", lambda folder, quantity: [0.01, 0.03])
     path = tmp_path / "report.json"
-    assert bench.main(["arm", "--quick", "--json", str(path)]) == 0
+    assert bench.main([name, "--quick", "--json", str(path)]) == 0
     _, rows = report_of(path)
-    assert commands[0][:2] == ["run", "arm"]
-    assert rows["arm/held_out_mae_mrad"][0] > 0
-    assert rows["arm/reached/identified"] == [1]
-    assert rows["arm/distance/identified"] == [20.0]
+    assert commands[0][:2] == ["run", name]
+    assert rows[f"{name}/held_out_mae_mrad"][0] > 0
+    assert rows[f"{name}/reached/identified"] == [1]
+    assert rows[f"{name}/distance/identified"] == [20.0]
 
 
 def test_the_arms_training_alone(commands, completed, tmp_path):

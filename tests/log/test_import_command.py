@@ -139,7 +139,7 @@ def test_bams_xl330():
 
 def test_sages_so101(tmp_path):
     name = "so101/single_joint_rotation.npz"
-    episode = imported(name, "so101")
+    episode = imported(name, "so101_log")
     with np.load(public(name)) as data:
         np.testing.assert_array_equal(episode.outputs["actuator"]["goal"], data["cmd_rad"])
         np.testing.assert_array_equal(episode.outputs["sensor"]["position"], data["q_rad"])
@@ -148,7 +148,7 @@ def test_sages_so101(tmp_path):
     assert episode.outputs["sensor"]["position"].shape == (5200, 6)
 
 
-@pytest.mark.parametrize("pipeline", ["disk", "xl330", "so101"])
+@pytest.mark.parametrize("pipeline", ["disk", "xl330", "so101_log"])
 def test_the_pipelines_mappings_are_for_them(pipeline):
     from sim2real.log import load_mapping
 

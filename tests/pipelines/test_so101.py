@@ -1,126 +1,247 @@
-"""The arm's model against a loop of its own, and a real recording that it foretells better than its goals do."""
+"""The SO-101's geometry, limits, parameters, calibration, aims and score; its embedded robot has tests of its own."""
 
-from dataclasses import replace
+import itertools
+import json
 
+import jax
+import mujoco
 import numpy as np
 import pytest
-from recorded_robots import check_leaves, check_start, effects, episode, predictions, public, rmse
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real import cli, composer
+from sim2real.errors import UsageError
+from sim2real.hardware.config import GateLimits
+from sim2real.hardware.feetech import registers
+from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101")
-MAX_DELAY_S = PIPELINE.identify.max_delay_s
-JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
-PERIOD_S = 0.02006
-
-
-def nominal():
-    return {p.name: p.nominal for p in PIPELINE.load().identifiable(MAX_DELAY_S).parameters}
-
-
-TRUTH = {
-    **nominal(), "delay": 0.0087, "weight_upper": 0.03, "weight_forearm": 0.04, "weight_hand": 0.02,
-    **{f"{j}_bias": 0.004 * (i - 2) for i, j in enumerate(JOINTS)},
-}  # fmt: skip
-
-
-def simulated(v, goal, start, step_s=PERIOD_S / 100):
-    """Return positions at each sample, ``(N, 6)``: small steps of Euler, goals when they come, to the step."""
-    six = {k: np.array([v.get(f"{j}_{k}", np.inf) for j in JOINTS]) for k in
-           ("stiffness", "damping", "static", "stribeck", "bias", "saturation", "low")}  # fmt: skip
-    limit = np.where(np.isinf(six["saturation"]), 1.0, six["saturation"])  # joints that the table leaves at a radian
-    low = np.where(np.isinf(six["low"]), -3.0, six["low"])
-    q, w = np.array(start), np.zeros(6)
-    per_sample, late = round(PERIOD_S / step_s), round((v["delay"] + v["sensor_delay"]) / step_s)
-    rows = []
-    for i in range(per_sample * (len(goal) - 1) + 1):
-        if i % per_sample == 0:
-            rows.append(q.copy())
-        error = np.clip(goal[max(0, (i - late) // per_sample)] + six["bias"] - q, -limit, limit)
-        contact = v["table_stiffness"] * max(0.0, q[2] + v["table_ratio"] * q[1] - v["table_height"])
-        hand = v["weight_hand"] * np.cos(q[1] + q[2] + q[3])
-        fore = v["weight_forearm"] * np.cos(q[1] + q[2])
-        error[1] += v["weight_upper"] * np.sin(q[1]) + fore + hand - v["table_ratio"] * contact
-        error[2] += fore + hand - contact
-        error[3] += hand
-        w = w + step_s * (six["stiffness"] * error - six["damping"] * w)
-        dry = six["stiffness"] * six["static"] * np.exp(-np.abs(w) / six["stribeck"])
-        w = np.sign(w) * np.maximum(0.0, np.abs(w) - step_s * dry)
-        w = np.where(q + step_s * w < low, 0.0, w)
-        q = np.maximum(q + step_s * w, low)
-    return np.array(rows)
-
-
-def free_run(log):
-    """Return a problem whose one segment is the recording, from rest where it was measured."""
-    model, config = PIPELINE.load().identifiable(MAX_DELAY_S), replace(PIPELINE.identify, initial_state="rest")
-    return Problem(model, [log], [Span(0, 0.0)], log.duration_s, config)
+ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")
+MODULE = PIPELINE.load("robot")
+LOW, HIGH = np.array(ROBOT.servos.low), np.array(ROBOT.servos.high)
+STEP_S = 0.005
 
 
 @pytest.fixture(scope="module")
-def synthetic():
-    """8 s: every joint steps and swings; pitch and elbow press on the table, the wrist meets its stop."""
-    t = PERIOD_S * np.arange(400)
-    ramp = np.minimum(1.0, t / 0.3)[:, None]
-    turns = np.outer(t, [1.3, 0.9, 1.1, 1.7, 1.5, 2.1])
-    slow = np.sin(turns + np.array([0.0, 1.0, 0.5, 2.0, 3.0, 4.0]))
-    steps = np.sign(np.sin(np.outer(t, [2.9, 2.3, 3.1, 2.7, 2.5, 3.3])))
-    goal = ramp * (
-        np.array([0.7, 0.5, 0.6, 0.5, 0.9, 0.4]) * slow
-        + np.array([0.4, 0.15, 0.15, 0.15, 0.15, 0.15]) * steps
-        + [0.0, 0.4, 0.5, 0.0, -0.3, 0.0]
+def env():
+    """The task on C."""
+    env = composer.Environment(ROBOT.make_task())
+    env.reset()
+    return env
+
+
+@pytest.fixture(scope="module")
+def plant():
+    """The embedded robot's physics."""
+    return PLANT.SO101Plant()
+
+
+def test_the_tip_is_where_mujoco_has_it(env, plant):
+    task, physics = env.task, env.physics
+    rng = np.random.default_rng(0)
+    for angles in (np.zeros(6), *rng.uniform(-1.6, 1.6, (20, 6))):
+        physics.bind(task.joints).qpos = angles
+        physics.forward()
+        tip = TASK.tip_of(np, angles)
+        np.testing.assert_allclose(physics.bind(task.robot.tip).xpos, tip, atol=1e-12)
+        plant.data.qpos[:] = angles
+        np.testing.assert_allclose([plant.state()[f"tip[{i}]"] for i in range(3)], tip, atol=1e-12)
+    many = rng.uniform(-1, 1, (4, 5, 6))
+    np.testing.assert_allclose(TASK.tip_of(np, many)[2, 3], TASK.tip_of(np, many[2, 3]), rtol=1e-12)
+
+
+def test_the_arm_is_as_long_as_the_public_description_says():
+    """Stretched forward and level, and upright: sums of its lengths, written down by hand."""
+    np.testing.assert_allclose(TASK.tip_of(np, np.zeros(6)), [0.3914, 0, 0.2344], atol=2e-4)
+    up = TASK.tip_of(np, np.array([0, 0, -np.pi / 2, 0, 0, 0]))
+    np.testing.assert_allclose(up, [0.0388 + 0.0304 + 0.0280 - 0.0052, 0, 0.2292 + 0.2941], atol=2e-4)
+    turned = TASK.tip_of(np, np.array([np.pi / 2, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(turned, [0.0388, -0.3526, 0.2344], atol=2e-4)
+
+
+def test_model_and_embedded_robot_weigh_the_same(env, plant):
+    """The plant's geometry is written down a second time: gravity and inertia at random angles."""
+    physics = env.physics
+    rotors = physics.model.ptr.dof_armature[0] - plant.model.dof_armature[0]
+    for angles in np.random.default_rng(1).uniform(LOW, HIGH, (5, 6)):
+        bias, inertia = [], []
+        for m, d in ((physics.model.ptr, physics.data.ptr), (plant.model, plant.data)):
+            d.qpos[:], d.qvel[:] = angles, 0.0
+            mujoco.mj_forward(m, d)
+            bias.append(d.qfrc_bias.copy())
+            inertia.append(np.zeros((6, 6)))
+            for row, unit in zip(inertia[-1], np.eye(6), strict=True):
+                mujoco.mj_mulM(m, d, row, unit)
+        np.testing.assert_allclose(*bias, atol=1e-10)
+        np.testing.assert_allclose(inertia[0] - rotors * np.eye(6), inertia[1], atol=1e-10)
+
+
+def lowest(plant, angles):
+    """How far the arm's lowest ball is above the table [m]."""
+    model, data = plant.model, plant.data
+    data.qpos[:] = angles
+    mujoco.mj_kinematics(model, data)
+    half = (
+        np.abs(data.geom_xmat[1:, 8]) * model.geom_size[1:, 1] * (model.geom_type[1:] == mujoco.mjtGeom.mjGEOM_CAPSULE)
     )
-    angle = simulated(TRUTH, goal, np.zeros(6))
-    log = episode(t, actuator={"goal": goal}, sensor={"position": angle})
-    return log, free_run(log)
+    return float((data.geom_xpos[1:, 2] - half - model.geom_size[1:, 0]).min())
 
 
-def test_all_parameters_have_a_place():
-    check_leaves(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S)
+def test_no_goal_leads_into_the_table(plant):
+    """The gate lets no goal out of a box; everywhere in it the arm is above the table, by more than it droops."""
+    gate = ROBOT.gate(PIPELINE.deploy.gate)
+    np.testing.assert_array_equal(gate.range, [LOW, HIGH])
+    swing = [np.linspace(LOW[i], HIGH[i], 9) for i in (1, 2, 3)]
+    heights = [lowest(plant, [0, *angles, 0, 0]) for angles in itertools.product(*swing)]
+    assert min(heights) > 0.04
+    assert lowest(plant, [0, 0.3, 1.3, -1.0, 0, 0]) < 0, "outside of it there is the table"
 
 
-def test_the_sensor_reads_the_measured_start():
-    start = [0.1, -0.2, 0.3, -0.4, 0.5, -0.6, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    state, _ = check_start(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S, start)
-    np.testing.assert_allclose(np.concatenate([state.position, state.velocity]), start, rtol=1e-6)
+def test_excitations_aims_and_rest_are_within_the_limits(plant):
+    signal = ROBOT.around(excitation(PIPELINE.record, ROBOT.rate_hz, 6))
+    inside = (signal >= LOW - 1e-9) & (signal <= HIGH + 1e-9)
+    assert inside.mean(axis=0).min() > 0.85, "the gate cuts little"
+    assert np.ptp(np.clip(signal, LOW, HIGH), axis=0).min() > 0.5
+    assert np.all((ROBOT.servos.at_rest >= LOW) & (ROBOT.servos.at_rest <= HIGH))
+    targets = np.array([ROBOT.draw_aim(jax.random.key(i)) for i in range(60)])
+    assert targets[:, 2].min() > 0.1
+    assert np.ptp(targets, axis=0).min() > 0.2
+    assert np.all(np.array(MODULE.LOW) > LOW)
+    assert np.all(np.array(MODULE.HIGH) < HIGH)
 
 
-def test_every_channel_is_a_joint_of_its_own():
-    channels = PIPELINE.load().identifiable(MAX_DELAY_S).channels
-    assert [(c.position, c.index, c.name) for c in channels] == [("position", i, j) for i, j in enumerate(JOINTS)]
+def test_parameters_stand_where_c_keeps_them(env):
+    physics = env.physics
+    values = {**ROBOT.nominal(), "damping_elbow_flex": 0.3, "friction_gripper": 0.02, "saturation_gripper": 0.1}
+    aim = np.array([0.1, -0.05, 0.3, 0.4])
+    placed = ROBOT.place(values, aim)
+    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.fields(env.task).items()}
+    for name, (elements, attribute) in ROBOT.fields(env.task).items():
+        assert np.shape(placed[name]) == before[name].shape, name
+        setattr(physics.bind(elements), attribute, np.asarray(placed[name]))
+    model, gain = physics.model.ptr, values["gain"]
+    np.testing.assert_allclose(model.dof_damping, [0.6, 0.6, 0.3, 0.6, 0.6, 0.6], rtol=1e-6)
+    np.testing.assert_allclose(model.dof_armature[2], 0.005 - 0.5 * STEP_S * 0.3, rtol=1e-5)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.06] * 5 + [0.02], rtol=1e-6)
+    np.testing.assert_allclose(
+        model.actuator_forcerange[:, 1], [2.94] * 4 + [gain * values["saturation_wrist_roll"], gain * 0.1], rtol=1e-5
+    )
+    np.testing.assert_allclose(physics.bind(env.task.table.target).pos, aim[:3], rtol=1e-6)
+    assert physics.bind(env.task.table.opening).pos[0] == pytest.approx(0.4)
+    for name, (elements, attribute) in ROBOT.fields(env.task).items():
+        setattr(physics.bind(elements), attribute, before[name])
 
 
-def test_the_model_is_the_loop(synthetic):
-    log, problem = synthetic
-    true = log.outputs["sensor"]["position"]
-    assert true[:, 4].min() == pytest.approx(TRUTH["wrist_roll_low"], abs=1e-4)
-    assert np.sum(true[:, 2] + TRUTH["table_ratio"] * true[:, 1] > TRUTH["table_height"]) > 50
-    ((t, measured, model),) = predictions(problem, TRUTH)
-    assert len(t) > 390
-    assert rmse(model - measured).max() < 0.003
+def test_what_was_found_is_written_as_mjcf():
+    found = {**ROBOT.nominal(), "gain": 6.0, "damping_wrist_roll": 0.4, "saturation_gripper": 0.07}
+    model = mujoco.MjModel.from_xml_string(ROBOT.identified_mjcf(found))
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 6.0)
+    np.testing.assert_allclose(model.dof_damping, [0.6] * 4 + [0.4, 0.6])
+    np.testing.assert_allclose(model.actuator_forcerange[5], [-0.42, 0.42], rtol=1e-6)
 
 
-def test_a_joint_at_its_stop_stands_there_and_the_others_move_on():
-    model = PIPELINE.load("model")
-    low = np.array(model.nominal().low)
-    state = model.JointState(low + np.array([0.1, -0.1, 0.0, 0.1, -0.2, 0.1]), np.arange(-3.0, 3.0))
-    stopped = model.ArmWorld("world", 200.0).confine(model.nominal(), state)
-    np.testing.assert_allclose(stopped.position, low + np.array([0.1, 0.0, 0.0, 0.1, 0.0, 0.1]), rtol=1e-6)
-    np.testing.assert_array_equal(stopped.velocity, [-3.0, 0.0, -1.0, 0.0, 0.0, 2.0])
+def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
+    """P gain of 16, 0.166 duty per radian and count of P: 30 kg cm at 0.377 rad."""
+    sheet = ROBOT.servos.sheet
+    assert sheet.full_rad == pytest.approx(0.3765, abs=1e-4)
+    assert sheet.gain == pytest.approx(7.81, abs=0.01)
+    assert sheet.drive.p_gain == 16
+    assert sheet.drive.registers(0x0C)[registers.ACCELERATION] == 0, "as fast as it can"
 
 
-def test_every_parameter_acts(synthetic):
-    moved = effects(synthetic[1], TRUTH)
-    assert not {n: m for n, m in moved.items() if m < 1.0}
+def test_what_is_true_goes_by_the_same_names_and_lies_within_the_bounds():
+    truth = PLANT.SO101Plant().truth()
+    assert set(truth) == {p.name for p in ROBOT.dynamics()} == set(ROBOT.nominal())
+    for p in ROBOT.dynamics():
+        assert p.low < truth[p.name] < p.high, p.name
 
 
-def test_a_real_arm_is_where_the_model_says_rather_than_where_it_was_told_to_be():
-    (log,) = public("so101", "so101/step_response.npz").values()
-    ((t, measured, model),) = predictions(free_run(log), nominal())
-    assert t[-1] > 100.0
-    told = rmse(log.outputs["actuator"]["goal"] - log.outputs["sensor"]["position"])
-    own = rmse(model - measured)
-    assert np.all(own < 0.8 * told), dict(zip(JOINTS, own / told, strict=True))
-    assert np.mean(own / told) < 0.6
+def trajectory(angles, aim):
+    """Return times and states for joint angles ``(N, 6)`` at 100 Hz, as a deployment has them."""
+    states = {f"position[{i}]": angles[:, i] for i in range(6)}
+    return 0.01 * np.arange(len(angles)), {**states, **{f"aim[{i}]": np.full(40, aim[i]) for i in range(4)}}
+
+
+def test_the_score_of_an_arm_that_arrives_and_stays():
+    there = np.array([0.5, -0.8, 1.0, -1.2, 0.3, 0.2])
+    angles = np.tile(there, (401, 1))
+    angles[:150, 0] += 0.6
+    aim = [*TASK.tip_of(np, there), 0.25]
+    assert ROBOT.score(*trajectory(angles, aim)) == {
+        "success": 1.0,
+        "reached": 1.0,
+        "distance_m": pytest.approx(0.0, abs=1e-12),
+        "opening_off_rad": pytest.approx(0.05),
+        "first_reached_s": pytest.approx(1.5),
+    }
+
+
+def test_the_score_of_an_arm_whose_jaw_is_not_as_it_is_told():
+    there = np.array([0.5, -0.8, 1.0, -1.2, 0.3, 0.2])
+    score = ROBOT.score(*trajectory(np.tile(there, (401, 1)), [*TASK.tip_of(np, there), -0.2]))
+    assert (score["success"], score["reached"]) == (0.0, 0.0)
+    assert score["distance_m"] < 0.001
+    assert np.isnan(score["first_reached_s"])
+
+
+def test_tip_and_jaw_count_in_the_reward():
+    env = composer.Environment(TASK.Reach(), random_state=0)
+    env.reset()
+    physics, task = env.physics, env.task
+    reward = env.step(np.zeros(6)).reward
+    distance, ajar = physics.variables["distance"], physics.variables["ajar"]
+    assert distance == pytest.approx(np.linalg.norm(physics.bind(task.robot.tip).xpos - [0.2, 0, 0.2]), abs=1e-5)
+    assert ajar == pytest.approx(abs(physics.bind(task.joints).qpos[5]))
+    expected = np.exp(-((distance / 0.1) ** 2)) + np.exp(-((distance / 0.02) ** 2)) - 2 * distance
+    assert reward == pytest.approx(expected + 0.5 * np.exp(-((ajar / 0.1) ** 2)) - 0.3 * ajar)
+
+
+@pytest.fixture
+def lerobot(tmp_path, monkeypatch):
+    """LeRobot's folder of calibrations."""
+    monkeypatch.delenv(MODULE.CALIBRATION, raising=False)
+    monkeypatch.setenv("HF_LEROBOT_CALIBRATION", str(tmp_path))
+    folder = tmp_path / "robots" / "so101_follower"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_the_only_calibration_is_taken_and_of_several_the_one_that_is_named(lerobot, monkeypatch):
+    text = (PIPELINE.folder / "calibration.json").read_text()
+    for name in ("mine", "other"):
+        (lerobot / f"{name}.json").write_text(text)
+        if name == "mine":
+            assert MODULE.find() == lerobot / "mine.json"
+    with pytest.raises(UsageError, match=r"several calibrations: mine.json, other.json"):
+        MODULE.find()
+    monkeypatch.setenv(MODULE.CALIBRATION, str(lerobot / "other.json"))
+    assert MODULE.find() == lerobot / "other.json"
+    assert [j.servo_id for j in MODULE.read(MODULE.find())] == [1, 2, 3, 4, 5, 6]
+
+
+def test_an_arm_without_calibration_is_not_opened(lerobot, tmp_path):
+    with pytest.raises(UsageError, match="no calibration in") as told:
+        ROBOT.connect("/dev/ttyACM0", GateLimits(), tmp_path / "truth.bin", 0)
+    assert "SO101_CALIBRATION" in str(told.value.hint)
+
+
+def test_a_calibration_of_another_arm_is_refused(tmp_path):
+    motors = json.loads((PIPELINE.folder / "calibration.json").read_text())
+    motors["shoulder"] = motors.pop("elbow_flex")
+    (tmp_path / "x.json").write_text(json.dumps(motors))
+    with pytest.raises(UsageError, match=r"has no motor 'elbow_flex'. There are: shoulder_pan"):
+        MODULE.read(tmp_path / "x.json")
+
+
+def test_the_calibration_is_the_embedded_arms():
+    joints = MODULE.read(PIPELINE.folder / "calibration.json")
+    for joint, zero in zip(joints, PLANT.ZERO_COUNTS, strict=True):
+        assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=0.5)
+        low, high = joint.range_rad
+        i = ROBOT.servos.joints.index(joint.name)
+        assert low < LOW[i] < HIGH[i] < high
+
+
+def test_the_command_line_tells_about_it(capsys, tmp_path):
+    assert cli.main(["info", "so101", "--runs", str(tmp_path)]) == 0
+    assert "six Feetech servos" in capsys.readouterr().out

@@ -11,6 +11,7 @@ from small_robot import SHEET, VALUES, PairRobot
 
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.episode import named_leaves
+from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams
 from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.messages import Decision, JointReading
@@ -143,3 +144,29 @@ def test_a_recording_begins_where_the_joints_are(pair):
     assert np.abs(np.diff(off, axis=0)).max() <= 1.0 / pair.rate_hz + 1e-9
     np.testing.assert_array_equal(played[51:], signal[51:])
     np.testing.assert_array_equal(played[16:, 1], signal[16:, 1])
+
+
+def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
+    robot = type("Askew", (PairRobot,), {"servos": replace(PairRobot.servos, middle=(0.3, -0.2))})()
+    reading = SimpleNamespace(position_rad=np.array([0.3, -0.2]))
+    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
+    signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
+    agent = robot.recording_nodes(session, signal)["agent"]
+    played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
+    np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
+    np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
+    np.testing.assert_allclose(robot.around(signal), signal + np.array([0.3, -0.2]))
+
+
+def test_joints_may_have_any_of_the_servos_parameters_for_themselves():
+    joints = ("left", "right")
+    found = standard.parameters(SHEET, joints, own=("damping", "friction"))
+    own = ["damping_left", "damping_right", "friction_left", "friction_right"]
+    assert [p.name for p in found] == ["gain", *own[:2], "armature", *own[2:]]
+    values = {p.name: p.nominal for p in found} | {"damping_right": 0.5, "saturation_left": 0.1}
+    placed = standard.place(values, SHEET, joints, 0.002)
+    np.testing.assert_allclose(placed["damping"], [SHEET.damping, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(placed["most"][:, 1], SHEET.gain * np.array([0.1, SHEET.full_rad]), rtol=1e-6)
+    del values["damping_left"]
+    with pytest.raises(KeyError, match="damping_left"):
+        standard.place(values, SHEET, joints, 0.002)

@@ -138,7 +138,7 @@ def test_identify(run, disk):
         ("nothing.npz", [], "nothing.npz is no file *.npz and no folder with such files"),
         ("disk.npz", ["--fit", "other.npz@0:10"], "'other.npz@0:10' selects nothing of disk.npz"),
         ("disk.npz", ["--case", "xl330"], "is no file *.json and no folder with such files"),
-        ("disk.npz", ["--case", "so101", "--fit", "step_response"], "'step_response' selects nothing of disk.npz"),
+        ("disk.npz", ["--case", "so101_log", "--fit", "step_response"], "'step_response' selects nothing of disk.npz"),
     ],
 )
 def test_data_that_is_not_there_is_said_in_words(disk, capsys, data, flags, words):

@@ -1,0 +1,178 @@
+"""The embedded SO-101's physics: C MuJoCo, with parameters that no stage of the pipeline is told.
+
+Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
+geometry is therefore written down a second time (source: see parts.py).
+
+The parameters are those that were identified on recordings of a real SO-101, isaac-sim2real/sage @ 4ffd2627
+(Apache-2.0), by `python scripts/bench.py identify --case so101_log` (reports/identify_so101.json). There they are
+divided by a joint's inertia, or by its servo's stiffness. In units of torque:
+
+- Gain. Rotation's servo pushes no harder beyond 0.45 rad; taken for the 2.94 N m of its data sheet, the gain is 6.53
+  N m/rad. The driver's source for the gain (BAM's oscilloscope) says 7.8.
+- Rotors. The gain over the identified stiffness is a joint's inertia. What the public description has for the links in
+  the recordings' pose explains it for five joints, 11 % off (rms), with 0.00266 kg m^2 more on every joint. The jaw's
+  is not determined by samples 20 ms apart.
+- Damping, dry friction, saturation: what was identified times inertia, or gain.
+
+The same recordings have the hand on the table from elbow 0.934 rad on; by the public description it is 0.93.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+
+from sim2real.hardware.feetech.registers import RAD_PER_COUNT
+from sim2real.hardware.plant import OperatingMode
+
+ZERO_COUNTS: Final = (2133, 2118, 2154, 2127, 2133, 2098)
+"""Counts of the encoders while the joints are at 0, before the servos' homing offset."""
+NOMINAL_P_GAIN: Final = 16
+"""P gain for which the numbers below are."""
+
+_GAIN, _ARMATURE = 6.53, 0.00266
+_DAMPING = (0.560, 0.534, 0.616, 0.533, 0.500, 0.434)
+_FRICTION = (0.0644, 0.222, 0.302, 0.0706, 0.0654, 0.0167)
+_STRIBECK_RAD_S = (0.336, 0.451, 0.334, 0.320, 0.264, 0.0534)
+_SATURATION_RAD = (0.450, 0.450, 0.450, 0.450, 0.170, 0.0615)  # of those that were not identified, rotation's
+_BIAS_RAD = (-0.0008, 0.0098, 0.0061, 0.0070, -0.0011, -0.0002)
+_OFF_DAMPING: Final = 0.1  # assumed: what brakes an open winding [N m s/rad]
+
+_MODEL = """
+<mujoco model="so101">
+  <compiler angle="radian"/>
+  <option timestep="{step_s}" gravity="0 0 -9.81" integrator="implicitfast"/>
+  <default>
+    <joint type="hinge" limited="true" armature="{armature}" damping="{damping}"
+           solreffriction="{time_constant} 1" solimpfriction="0.999 0.999 0.001"/>
+    <geom type="sphere" contype="1" conaffinity="0" mass="0" friction="0.6"/>
+  </default>
+  <worldbody>
+    <geom name="table" type="plane" size="1 1 0.1" contype="0" conaffinity="1"/>
+    <body name="shoulder" pos="0.0388 0 0.0624">
+      <joint name="shoulder_pan" axis="0 0 -1" range="-1.92 1.92"/>
+      <inertial pos="0.0308 0 0.0253" mass="0.100" fullinertia="83.8e-6 81.0e-6 24.0e-6 -0.1e-6 -1.2e-6 -0.2e-6"/>
+      <body name="upper_arm" pos="0.0304 0 0.0542">
+        <joint name="shoulder_lift" axis="0 1 0" range="-1.745 1.745"/>
+        <inertial pos="0.0084 0.0001 0.0898" mass="0.103" fullinertia="147.3e-6 142.5e-6 40.8e-6 0 -19.8e-6 0"/>
+        <body name="lower_arm" pos="0.0280 0 0.1126">
+          <joint name="elbow_flex" axis="0 1 0" range="-1.69 1.69"/>
+          <inertial pos="0.0981 0 0.0032" mass="0.104" fullinertia="28.7e-6 145.3e-6 159.8e-6 -1.3e-6 -7.4e-6 0"/>
+          <geom name="elbow" size="0.025"/>
+          <body name="wrist" pos="0.1349 0 0.0052">
+            <joint name="wrist_flex" axis="0 1 0" range="-1.658 1.658"/>
+            <inertial pos="0.0386 0.0098 0.0001" mass="0.079" fullinertia="25.4e-6 21.0e-6 36.8e-6 -3.6e-6 0 0.1e-6"/>
+            <geom name="wrist" size="0.025"/>
+            <body name="hand" pos="0.0611 0 0">
+              <joint name="wrist_roll" axis="-1 0 0" range="-2.74 2.84"/>
+              <inertial pos="0.0252 0.0004 0.0002" mass="0.087"
+                        fullinertia="34.5e-6 43.4e-6 27.5e-6 -0.2e-6 5.7e-6 0.4e-6"/>
+              <geom name="hand" pos="0.03 0 0" size="0.025"/>
+              <geom name="finger" type="capsule" fromto="0.03 0 0 0.0981 0 0" size="0.008"/>
+              <site name="tip" pos="0.0981 0 0"/>
+              <body name="jaw" pos="0.0234 0.0178 0.0211">
+                <joint name="gripper" axis="0 -1 0" range="-0.96 0.96"/>
+                <inertial pos="0.0224 -0.0202 0.0191" mass="0.012" fullinertia="3.9e-6 5.3e-6 4.6e-6 0 -2.4e-6 0"/>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+class SO101Plant:
+    """An SO-101 on a table: six STS3215 in position mode; any other mode is torque off.
+
+    What the stages' model lacks: friction that wears off with speed, goals that are missed by a bias, errors in whole
+    counts, the stops, and the table.
+
+    Args:
+        start: Joint angles at the beginning [rad]; default: folded, as it was put away.
+        step_s: MuJoCo's time step [s].
+    """
+
+    servo_ids = (1, 2, 3, 4, 5, 6)
+
+    def __init__(self, start: tuple[float, ...] = (0.0, -1.74, 1.68, -1.4, 0.0, -0.8), step_s: float = 0.0005) -> None:
+        # Friction as stiff as the solver bears: at the default impedance a joint that it should hold creeps.
+        text = _MODEL.format(step_s=step_s, armature=_ARMATURE, damping=_OFF_DAMPING, time_constant=4 * step_s)
+        self.model = MjModel.from_xml_string(text)
+        self.data = MjData(self.model)
+        self.data.qpos[:] = start
+        n = len(self.servo_ids)
+        self._p_gain = [float(NOMINAL_P_GAIN)] * n
+        self._goals: list[float | None] = [None] * n
+        self._zero_rad = [count * RAD_PER_COUNT for count in ZERO_COUNTS]
+        # Kept, as looking an array up in MuJoCo's structures costs as much as reading it.
+        self._qpos, self._qvel, self._applied = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        self._friction, self._damping = self.model.dof_frictionloss, self.model.dof_damping
+        self._torques = [0.0] * n
+
+    def advance(self, t_s: float) -> None:
+        """Integrate up to ``t_s`` [s]."""
+        model, data = self.model, self.data
+        for _ in range(round((t_s - data.time) / model.opt.timestep)):
+            angles, speeds = self._qpos.tolist(), self._qvel.tolist()
+            self._applied[:] = self._torques = [self._torque(i, angle) for i, angle in enumerate(angles)]
+            self._friction[:] = [
+                level * math.exp(-abs(speed) / width)
+                for level, speed, width in zip(_FRICTION, speeds, _STRIBECK_RAD_S, strict=True)
+            ]
+            mj_step(model, data)
+
+    def command(self, servo_id: int, mode: int, goal: float) -> None:
+        """Set a servo's goal: rad from the encoder's count 0."""
+        joint = self.servo_ids.index(servo_id)
+        self._goals[joint] = goal - self._zero_rad[joint] if mode == OperatingMode.POSITION else None
+        # The back-EMF brakes as damping does; there MuJoCo integrates it implicitly.
+        self._damping[joint] = _OFF_DAMPING if self._goals[joint] is None else _DAMPING[joint]
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's P gain.
+
+        Args:
+            servo_id: The servo.
+            p_gain: P gain [counts].
+            d_gain: Not emulated; what the register's default does is part of the damping.
+            profile_velocity_rad_s: Not emulated here; the emulator moves the goals.
+        """
+        del d_gain, profile_velocity_rad_s
+        self._p_gain[self.servo_ids.index(servo_id)] = float(p_gain)
+
+    def measure(self, servo_id: int) -> tuple[float, float, float]:
+        """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
+        joint = self.servo_ids.index(servo_id)
+        load = self._torques[joint] / (_GAIN * _SATURATION_RAD[0])
+        return float(self._qpos[joint]) + self._zero_rad[joint], float(self._qvel[joint]), load
+
+    def state(self) -> dict[str, float]:
+        """Return the true joint angles [rad] and velocities [rad/s], and where the tip is [m]."""
+        mj_kinematics(self.model, self.data)  # a step leaves the site where the step began
+        rows = {"position": self._qpos, "velocity": self._qvel, "tip": self.data.site_xpos[0]}
+        return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
+
+    def truth(self) -> dict[str, Any]:
+        """Return what a log can tell, named as the stages do; friction at standstill."""
+        joints = [self.model.joint(i).name for i in range(self.model.njnt)]
+        return {
+            "gain": _GAIN,
+            "armature": _ARMATURE,
+            **{f"damping_{j}": d for j, d in zip(joints, _DAMPING, strict=True)},
+            **{f"friction_{j}": f for j, f in zip(joints, _FRICTION, strict=True)},
+            **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},
+        }
+
+    def _torque(self, joint: int, angle: float) -> float:
+        """Return what the motor's duty makes of the error, without back-EMF [N m]."""
+        goal = self._goals[joint]
+        if goal is None:
+            return 0.0
+        share, most = self._p_gain[joint] / NOMINAL_P_GAIN, _SATURATION_RAD[joint]
+        error = (round(goal / RAD_PER_COUNT) - round(angle / RAD_PER_COUNT)) * RAD_PER_COUNT + _BIAS_RAD[joint]
+        return _GAIN * min(max(share * error, -most), most)
