@@ -95,13 +95,14 @@ class ComposedWorld(BaseWorld):
         self.input_name, self.field = command, field
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
-        self._apart = False
+        self._apart, self._derived = False, frozenset[str]()
         found = self._view()
         self._set(found, self.init_params())  # refuses what cannot vary
         if self._derives:
             # Their names alone: computed one operation at a time, the constants of an arm took 6 to 50 s.
             derive = lambda: constants.derive(self.environment.model, found.mjx_model)  # noqa: E731
-            self.environment.carry(jax.eval_shape(derive))
+            self._derived = frozenset(jax.eval_shape(derive))
+            self.environment.carry(self._derived)
 
     def _view(self) -> MjxPhysics:
         return MjxPhysics(self.environment.model, self.environment.mjx_model, None, {})
@@ -130,8 +131,9 @@ class ComposedWorld(BaseWorld):
         model = self.environment.model
         qpos = model.qpos0 if params.qpos is None else params.qpos
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
-        reset = self.environment.reset_apart if self._apart else self.environment.reset
-        return reset(key, self._model(params, starts=True), (qpos, qvel))
+        if self._apart:
+            return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
+        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
 
     def output(self, state: State) -> Any:
         """Return the message that says what a state is; default: the task's observation."""
@@ -170,6 +172,11 @@ class ComposedWorld(BaseWorld):
         """Physics steps in a tick."""
         return self.environment.substeps
 
+    @property
+    def derives(self) -> bool:
+        """Whether constants of the model follow from fields that differ."""
+        return self._derives
+
     def open_loop(self) -> Any:
         """Take the physics out and return the ``MjModel``; UsageError where that would change what happens."""
         for name in ("step", "init_state", "init_output"):
@@ -188,9 +195,8 @@ class ComposedWorld(BaseWorld):
         """
         physics = self._view()
         self._set(physics, params)
-        if self._derives:
-            physics.recompute_constants()
-        return {name: physics.field(name) for name in physics.changed} | dict(state.leaves)
+        by_hooks = {name: value for name, value in state.leaves.items() if name not in self._derived}
+        return {name: physics.field(name) for name in physics.changed} | by_hooks
 
     def start(self, params: WorldParams, state: State) -> Start:
         """Return where the physics starts.

@@ -109,7 +109,7 @@ class CRollouts:
         fields = world.fields(params, state)
         names = tuple(sorted(fields))
         if names not in self._rollouts:
-            self._rollouts[names] = Rollouts(self._model, world.substeps, names)
+            self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives)
         controls = self._graph.drive(gs, world.controls)
         start = world.start(params, state)
         count, dtype = controls.shape[0], jnp.result_type(float)

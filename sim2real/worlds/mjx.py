@@ -83,6 +83,7 @@ class MjxWorld(BaseWorld):
         njmax: int | None = None,
     ) -> None:
         super().__init__(name, rate, color=color, order=order)
+        self.derives = False
         self.model = model
         self.input_name, self.field = command, field
         steps = 1.0 / (self.rate * model.opt.timestep)

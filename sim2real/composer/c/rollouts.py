@@ -22,7 +22,7 @@ _FRAMES = {
     "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
 }
 """Fields that say where something is in its body: where it is compiled to be the body's frame, C does not look at them."""
-_MASSES = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+_MASSES = ("body_mass", "body_inertia")
 
 
 class Start(NamedTuple):
@@ -45,10 +45,20 @@ class OpenLoop(Protocol):
     Attributes:
         name: Its name in the graph.
         substeps: Physics steps in a tick.
+        derives: Whether constants that MuJoCo derives from the model (``mj_setConst``) follow from ``fields``.
     """
 
     name: str
-    substeps: int
+
+    @property
+    def substeps(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def derives(self) -> bool:
+        """See above."""
+        ...
 
     def open_loop(self) -> Any:
         """Take the physics out and return the ``MjModel``: from now on ``init_state`` computes nothing with it.
@@ -99,19 +109,20 @@ class Rollouts:
         model: The ``MjModel``; it is copied.
         substeps: Physics steps in a tick.
         names: Fields that differ from copy to copy.
+        derives: Whether constants that follow from them are computed for each copy.
 
     Raises:
         UsageError: When C does not look at a field, or only MJX has it.
     """
 
-    def __init__(self, model: Any, substeps: int, names: tuple[str, ...]) -> None:
+    def __init__(self, model: Any, substeps: int, names: tuple[str, ...], derives: bool = False) -> None:
         from mujoco import batch  # 30 ms
 
         unknown = sorted(set(names) - batch.MODEL_FIELDS)
         if unknown:
             raise UsageError(f"C MuJoCo has no field {unknown[0]!r} that can differ from copy to copy")
-        self._make, self._substeps, self._names = batch.Batch, substeps, names
-        self._model = _general(model, names)
+        self._make, self._substeps, self._names, self._derives = batch.Batch, substeps, names, derives
+        self._model = _general(model, names, derives)
         self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._batch: Any = None
 
@@ -161,6 +172,7 @@ class Rollouts:
         for name, values in fields.items():
             own = batch.expand(name)
             own[:count] = values.reshape(count, *own.shape[1:])
+        failed = _failing(count, lambda: batch.set_const(ids)) if self._derives else np.zeros(count, bool)
         batch.warning[:] = 0
         batch.reset(ids, stage=mj.mjtStage.mjSTAGE_NONE)
         for name, values in zip(("qpos", "qvel", "qacc_warmstart"), start, strict=True):
@@ -168,7 +180,7 @@ class Rollouts:
         flags = batch.expand("opt.disableflags")
         compiled = flags.copy()
         flags |= int(mj.mjtDisableBit.mjDSBL_ACTUATION)
-        failed = _failing(count, lambda: batch.forward(ids))
+        failed |= _failing(count, lambda: batch.forward(ids))
         begun = {n: batch.bind(n)[:count].copy() for n in ("qpos", "qvel", "qacc")}
         flags[:] = compiled
         batch.bind("qacc_warmstart")[:count] = start.warmstart
@@ -207,17 +219,20 @@ def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
     return failed
 
 
-def _general(model: Any, names: tuple[str, ...]) -> Any:
-    """Return a copy of a model in which C takes no short cut past the fields that differ.
+def _general(model: Any, names: tuple[str, ...], derives: bool) -> Any:
+    """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end.
 
     Raises:
-        UsageError: When it has to: bodies whose inertia is aligned with their joints.
+        UsageError: When it has to take one: bodies whose inertia is aligned with their joints.
     """
     model = copy.copy(model)
+    # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
+    model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
     for kind, fields in _FRAMES.items():
         if set(fields) & set(names):
             getattr(model, f"{kind}_sameframe")[:] = 0
-    if set(_MASSES) & set(names) and (moved := np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))).size:
+    frames = {*_FRAMES["body"], *(() if derives else _MASSES)}
+    if frames & set(names) and (moved := np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))).size:
         body = mj.mj_id2name(model, mj.mjtObj.mjOBJ_BODY, int(moved[0]))
         raise UsageError(f"C MuJoCo takes the inertia of body {body!r} as compiled, and masses or inertias differ")
     return model
