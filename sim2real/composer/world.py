@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.c.rollouts import Start
+from sim2real.composer.c.rollouts import Start, check_steps
 from sim2real.composer.mjx import constants, open_loop
 from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.composer.mjx.physics import MjxPhysics
@@ -179,9 +179,7 @@ class ComposedWorld(BaseWorld):
 
     def open_loop(self) -> Any:
         """Take the physics out and return the ``MjModel``; UsageError where that would change what happens."""
-        for name in ("step", "init_state", "init_output"):
-            if getattr(type(self), name) is not getattr(ComposedWorld, name):
-                raise UsageError(f"world {self.name!r}: its class has a {name} of its own, which may depend on its state")
+        check_steps(self, ComposedWorld)
         open_loop.check(self.environment, self.entered, self.output, self.name)
         self._apart = True
         return self.environment.model

@@ -13,6 +13,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError
 from sim2real.identify.derivative import by_jacobian
 from sim2real.identify.problem import Problem
+from sim2real.identify.search import telling
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ def refine(
     steps: int = 25,
     rounds: int = 3,
     on_round: Callable[[float, np.ndarray], None] | None = None,
+    on_compile: Callable[[bool], None] | None = None,
 ) -> Refined:
     """Improve each start, and return the best result; a round that does not lower the loss is dropped.
 
@@ -54,11 +56,16 @@ def refine(
         steps: Most steps of a round.
         rounds: Most rounds from a start; the first that gains less than 0.01 % is the last.
         on_round: Called after each round with the best loss and point so far.
+        on_compile: Called with True before a program is compiled, and with False afterwards.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
-    improve = problem.programs.setdefault(("improve", steps), _program(problem, steps))
+    if ("improve", steps) not in problem.programs:
+        with telling(on_compile):
+            like = jnp.asarray(starts[0], jnp.float32)
+            problem.programs["improve", steps] = _program(problem, steps).lower(like).compile()
+    improve = problem.programs["improve", steps]
     full_loss = problem.programs.setdefault("alone", jax.jit(lambda z: problem.losses(z[None], z)[0]))
     first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
     if not np.isfinite(first).any():
@@ -86,11 +93,12 @@ def refine(
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
 
 
-def _program(problem: Problem, steps: int) -> Callable[[Any], tuple[Any, Any]]:
-    """Return one round of Levenberg-Marquardt, compiled on its first call: ``z -> (z, steps taken)``."""
+def _program(problem: Problem, steps: int) -> Any:
+    """Return one round of Levenberg-Marquardt, jitted: ``z -> (z, steps taken)``."""
     import optimistix  # 0.5 s
 
-    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
+    rtol, atol = problem.tolerance
+    solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=atol)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
     def improve(z: Any) -> tuple[Any, Any]:

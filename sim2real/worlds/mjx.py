@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from sim2real.composer.c.rollouts import Start
+from sim2real.composer.c.rollouts import Start, check_steps
 from sim2real.composer.mjx import gate, stepping, warp
 from sim2real.composer.mjx.import_mjx import mjx
 from sim2real.errors import UsageError
@@ -135,9 +135,7 @@ class MjxWorld(BaseWorld):
 
     def open_loop(self) -> Any:
         """Take the physics out and return the ``MjModel``; UsageError where a subclass steps in its own way."""
-        for name in ("step", "init_state", "init_output"):
-            if getattr(type(self), name) is not getattr(MjxWorld, name):
-                raise UsageError(f"world {self.name!r}: its class has a {name} of its own, which may depend on its state")
+        check_steps(self, MjxWorld)
         if self._warp:
             raise UsageError(f"world {self.name!r} is one of MuJoCo Warp's")
         self._apart = True
@@ -187,4 +185,5 @@ class MjxWorld(BaseWorld):
         return MjxState(qpos, qvel)
 
     def _control(self, step_state: StepState) -> Any:
+        """Return the controls ``(nu,)`` of a tick; they may depend on what it hears and on parameters."""
         return getattr(step_state.inputs[self.input_name].data, self.field)[-1]

@@ -21,7 +21,7 @@ _FRAMES = {
     "geom": ("geom_pos", "geom_quat", "body_ipos", "body_iquat"),
     "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
 }
-"""Fields that say where something is in its body: where it is compiled to be the body's frame, C does not look at them."""
+"""Fields that say where something is in its body; C does not look at them where that was compiled to be its frame."""
 _MASSES = ("body_mass", "body_inertia")
 
 
@@ -102,6 +102,18 @@ class OpenLoop(Protocol):
         ...
 
 
+def check_steps(world: Any, base: type) -> None:
+    """Refuse a world whose class steps or starts in its own way: nobody knows what that depends on.
+
+    Raises:
+        UsageError: With the method.
+    """
+    for name in ("step", "init_state", "init_output"):
+        if getattr(type(world), name) is not getattr(base, name):
+            own = type(world).__name__
+            raise UsageError(f"world {world.name!r}: {own}.{name} is its own, and may depend on the state")
+
+
 class Rollouts:
     """Steps copies of a model, each with fields of its own.
 
@@ -141,8 +153,8 @@ class Rollouts:
             after each tick. What diverged is NaN.
         """
         ticks = controls.shape[-3]
-        own = {n: (fields[n], np.ndim(_value(self._model, n))) for n in self._names}
-        arrays = [*((a, 1) for a in start), (controls, 3), *own.values()]
+        wide = {n: (fields[n], np.ndim(_value(self._model, n))) for n in self._names}
+        arrays = [*((a, 1) for a in start), (controls, 3), *wide.values()]
         axes = np.broadcast_shapes(*(np.shape(a)[: np.ndim(a) - width] for a, width in arrays))
         count = int(np.prod(axes))
 
@@ -151,7 +163,7 @@ class Rollouts:
             shape = a.shape[a.ndim - width :]
             return np.broadcast_to(a, (*axes, *shape)).reshape(count, *shape)
 
-        rows = {n: flat(*pair) for n, pair in own.items()}
+        rows = {n: flat(*pair) for n, pair in wide.items()}
         begin = Start(*(flat(a, 1) for a in start))
         control = flat(controls, 3).reshape(count, ticks * self._substeps, -1)
         found = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
@@ -159,7 +171,8 @@ class Rollouts:
         with _quiet():
             for first in range(0, count, lanes):
                 part = slice(first, min(first + lanes, count))
-                made = self._part({n: v[part] for n, v in rows.items()}, Start(*(a[part] for a in begin)), control[part])
+                own = {n: values[part] for n, values in rows.items()}
+                made = self._part(own, Start(*(a[part] for a in begin)), control[part])
                 for whole, some in zip(found, made, strict=True):
                     whole[part] = some
         qpos, qvel, qacc = (a.reshape(*axes, *a.shape[1:]) for a in found)
@@ -228,6 +241,8 @@ def _general(model: Any, names: tuple[str, ...], derives: bool) -> Any:
     model = copy.copy(model)
     # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
     model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
+    if model.ntree == 1:  # all constraints then belong together: an eighth of a step's time went into finding that out
+        model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_ISLAND)
     for kind, fields in _FRAMES.items():
         if set(fields) & set(names):
             getattr(model, f"{kind}_sameframe")[:] = 0

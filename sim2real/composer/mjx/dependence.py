@@ -39,7 +39,5 @@ def origins(function: Callable[..., Any], arguments: tuple[Any, ...], marked: An
         if any(v in tainted for v in equation.invars if not hasattr(v, "val")):
             tainted.update(equation.outvars)
     number = {v: i for i, v in enumerate(program.invars)}
-    found = [
-        Origin(False, None) if hasattr(v, "val") else Origin(v in tainted, number.get(v)) for v in program.outvars
-    ]
+    found = [Origin(False, None) if hasattr(v, "val") else Origin(v in tainted, number.get(v)) for v in program.outvars]
     return jax.tree_util.tree_unflatten(places, found)

@@ -219,9 +219,7 @@ class MjxEnvironment:
         outcome = (observation, reward, discount + 1, no, no, failed)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
-    def reset_apart(
-        self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None, data: Any = None
-    ) -> State:
+    def reset_apart(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None, data: Any = None) -> State:
         """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
 
         Args:

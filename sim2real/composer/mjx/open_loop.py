@@ -36,9 +36,8 @@ def check(
     if warp_fields.is_warp(environment.mjx_model):
         raise _closed(name, "it is one of MuJoCo Warp's")
     state = _check_start(environment, name)
-    action = jax.tree_util.tree_map(
-        lambda spec: jax.ShapeDtypeStruct(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype)), environment.action_spec()
-    )
+    plain = lambda spec: jax.ShapeDtypeStruct(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))  # noqa: E731
+    action = jax.tree_util.tree_map(plain, environment.action_spec())
 
     def tick(state: State, action: Any) -> tuple[State, Any]:
         return environment.step_apart(entered(state, action), action)
