@@ -311,7 +311,7 @@ class Problem:
     def tolerance(self) -> tuple[float, float]:
         """Relative and absolute change of point and loss at which a refinement ends.
 
-        Finer steps are lost in the noise of finite differences: on C MuJoCo an arm took twice the steps to the same point.
+        Finer steps are lost in the noise of finite differences: an arm on C took twice the steps to the same point.
         """
         return (1e-5, 1e-6) if self._outside is None else (1e-4, 1e-4)
 

@@ -193,8 +193,9 @@ class Rollouts:
         flags = batch.expand("opt.disableflags")
         compiled = flags.copy()
         flags |= int(mj.mjtDisableBit.mjDSBL_ACTUATION)
+        known = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # before: they are filled by the next call
         failed |= _failing(count, lambda: batch.forward(ids))
-        begun = {n: batch.bind(n)[:count].copy() for n in ("qpos", "qvel", "qacc")}
+        begun = {n: rows[:count].copy() for n, rows in known.items()}
         flags[:] = compiled
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
