@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -222,7 +223,8 @@ class ComposedWorld(BaseWorld):
             qvel: Velocities ``(nv,)`` [m/s or rad/s].
             qacc: Accelerations ``(nv,)`` of the last physics step [m/s^2 or rad/s^2].
         """
-        return self.output(state.replace(data=state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)))
+        data = state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)
+        return self.output(dataclasses.replace(state, data=data))
 
     def ends(self, state: State) -> tuple[Any, Any]:
         """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""

@@ -96,22 +96,22 @@ class CRollouts:
         self._world: OpenLoop = graph.nodes[graph.wiring.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
         self._rollouts: dict[tuple[str, ...], Rollouts] = {}
 
-    def rollout(self, gs: GraphState, params: Any, record: str) -> Rollout:
+    def rollout(self, gs: GraphState, params: Mapping[str, Any], record: str) -> Rollout:
         """Return what a node did in an episode; traceable, without derivatives.
 
         Args:
             gs: What the graph's ``init`` returned.
-            params: The world's parameters, as ``init`` got them.
+            params: The nodes' parameters, as ``init`` got them.
             record: The node.
         """
         world = self._world
-        state = gs.state[world.name]
-        fields = world.fields(params, state)
+        state, own = gs.state[world.name], params[world.name]
+        fields = world.fields(own, state)
         names = tuple(sorted(fields))
         if names not in self._rollouts:
             self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives)
         controls = self._graph.drive(gs, world.controls)
-        start = world.start(params, state)
+        start = world.start(own, state)
         count, dtype = controls.shape[0], jnp.result_type(float)
         widths = (self._model.nq, self._model.nv, self._model.nv)
 

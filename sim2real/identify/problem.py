@@ -102,7 +102,8 @@ class Problem:
         self.programs: dict[Any, Any] = {}
         """Programs that ``search`` and ``refine`` compiled, kept for their next call."""
         self._late = [p.name for p in self.table if p.side == "measurement"]
-        self.forward = config.jacobian == "forward" or (config.jacobian == "auto" and self._has_derivative())
+        sought = config.jacobian == "auto" and self._outside is None
+        self.forward = config.jacobian == "forward" or (sought and self._has_derivative())
 
     @property
     def fields(self) -> list[tuple[str, float, Callable[[Any], Any]]]:
@@ -153,7 +154,7 @@ class Problem:
         if self._outside is None:
             record = self.graph.rollout(gs, record=(sensor,))[1][sensor]
         else:
-            record = self._outside.rollout(gs, params[self.graph.wiring.world], sensor)
+            record = self._outside.rollout(gs, params, sensor)
         return record.output, record.seq
 
     def residuals(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> tuple[Any, Any]:

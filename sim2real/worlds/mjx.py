@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 
 from sim2real.composer.c.rollouts import Start, check_steps
 from sim2real.composer.mjx import gate, stepping, warp
@@ -152,7 +153,7 @@ class MjxWorld(BaseWorld):
         found = {}
         old, new = (jax.tree_util.tree_flatten_with_path(m)[0] for m in (self._mjx_model, params.model))
         for (path, before), (_, after) in zip(old, new, strict=True):
-            known = not isinstance(after, jax.core.Tracer)
+            known = not isinstance(after, Tracer)
             if after is not before and not (known and np.array_equal(before, after)):
                 found[jax.tree_util.keystr(path).lstrip(".")] = after
         return found

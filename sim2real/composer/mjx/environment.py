@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import weakref
 from collections.abc import Iterable
@@ -256,7 +257,7 @@ class MjxEnvironment:
         self._hooks.run("after_step", physics, random_state)
         data, leaves, variables, key, memory = physics.tree(random_state)
         kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
-        return state.replace(steps=state.steps + 1, **kept), jnp.stack(controls)
+        return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
 
     def step(self, state: State, action: Any, model: Any = None) -> State:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
