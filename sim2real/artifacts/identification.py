@@ -120,6 +120,7 @@ class Search:
         seconds: What all of it took [s].
         loss: Of an interrupted search: the best loss so far.
         done: Of an interrupted search: the shares of search and refinement that were done.
+        engine: What simulated, and why.
     """
 
     strategy: str | None = None
@@ -129,6 +130,7 @@ class Search:
     seconds: float | None = None
     loss: float | None = None
     done: Mapping[str, float] = field(default_factory=dict)
+    engine: str = ""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.mjx import constants
+from sim2real.composer.c.rollouts import Start, check_steps
+from sim2real.composer.mjx import constants, open_loop
 from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
@@ -94,10 +96,14 @@ class ComposedWorld(BaseWorld):
         self.input_name, self.field = command, field
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
+        self._apart, self._derived = False, frozenset[str]()
         found = self._view()
         self._set(found, self.init_params())  # refuses what cannot vary
         if self._derives:
-            self.environment.carry(constants.derive(self.environment.model, found.mjx_model))
+            # Their names alone: computed one operation at a time, the constants of an arm took 6 to 50 s.
+            derive = lambda: constants.derive(self.environment.model, found.mjx_model)  # noqa: E731
+            self._derived = frozenset(jax.eval_shape(derive))
+            self.environment.carry(self._derived)
 
     def _view(self) -> MjxPhysics:
         return MjxPhysics(self.environment.model, self.environment.mjx_model, None, {})
@@ -126,6 +132,8 @@ class ComposedWorld(BaseWorld):
         model = self.environment.model
         qpos = model.qpos0 if params.qpos is None else params.qpos
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
+        if self._apart:
+            return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
 
     def output(self, state: State) -> Any:
@@ -137,10 +145,20 @@ class ComposedWorld(BaseWorld):
         state = (graph_state or GraphState()).state.get(self.name)
         return self.output(self.init_state(rng, graph_state) if state is None else state)
 
+    def entered(self, state: State, action: Any) -> State:
+        """Return the state with which a control step under an action begins; default: as it is.
+
+        Args:
+            state: The state after the step before.
+            action: The action.
+        """
+        del action
+        return state
+
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Take a control step under the newest action."""
-        action = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
-        before = step_state.state
+        action = self._action(step_state)
+        before = self.entered(step_state.state, action)
         state: Any = self.environment.step(before, action, self._model(step_state.params))
         # What is over stays over: others look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
@@ -148,9 +166,72 @@ class ComposedWorld(BaseWorld):
         new = step_state.replace(state=state)
         return new, self.output(state)
 
+    # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in a tick."""
+        return self.environment.substeps
+
+    @property
+    def derives(self) -> bool:
+        """Whether constants of the model follow from fields that differ."""
+        return self._derives
+
+    def open_loop(self) -> Any:
+        """Take the physics out and return the ``MjModel``; UsageError where that would change what happens."""
+        check_steps(self, ComposedWorld)
+        open_loop.check(self.environment, self.entered, self.output, self.name)
+        self._apart = True
+        return self.environment.model
+
+    def fields(self, params: WorldParams, state: State) -> dict[str, Any]:
+        """Return the fields of the model that differ from the compiled one: parameters, and what hooks set at a start.
+
+        Args:
+            params: The node's parameters.
+            state: What ``init_state`` returned.
+        """
+        physics = self._view()
+        self._set(physics, params)
+        by_hooks = {name: value for name, value in state.leaves.items() if name not in self._derived}
+        return {name: physics.field(name) for name in physics.changed} | by_hooks
+
+    def start(self, params: WorldParams, state: State) -> Start:
+        """Return where the physics starts.
+
+        Args:
+            params: The node's parameters.
+            state: What ``init_state`` returned.
+        """
+        del params
+        return Start(state.data.qpos, state.data.qvel, state.data.qacc_warmstart)
+
+    def controls(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Run the hooks of a tick without its physics; return the controls of its physics steps ``(substeps, nu)``."""
+        action = self._action(step_state)
+        state = self.entered(step_state.state, action)
+        state, controls = self.environment.step_apart(state, action, self._model(step_state.params))
+        return step_state.replace(state=state), controls
+
+    def message(self, state: State, qpos: Any, qvel: Any, qacc: Any) -> Any:
+        """Return what the world sends.
+
+        Args:
+            state: What ``init_state`` returned.
+            qpos: Positions ``(nq,)`` [m or rad].
+            qvel: Velocities ``(nv,)`` [m/s or rad/s].
+            qacc: Accelerations ``(nv,)`` of the last physics step [m/s^2 or rad/s^2].
+        """
+        data = state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)
+        return self.output(dataclasses.replace(state, data=data))
+
     def ends(self, state: State) -> tuple[Any, Any]:
         """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""
         return state.done & ~state.truncated, state.truncated
+
+    def _action(self, step_state: StepState) -> Any:
+        return getattr(step_state.inputs[self.input_name].data, self.field)[-1]
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:
         found = (graph_state or GraphState()).params.get(self.name)

@@ -42,6 +42,8 @@ class FitConfig:
     """Most steps of Levenberg-Marquardt in a round, of which there are up to three."""
     long_s: float = 0.0
     """Length of the segments of a last refinement [s]; 0 leaves it out."""
+    engine: Literal["auto", "c", "compiled"] = "auto"
+    """What simulates: C MuJoCo, or the compiled graph; 'auto' takes C on a CPU where the world is one of MuJoCo's."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
     """Derivatives: forward mode or finite differences; 'auto' takes the latter where a node has no derivative."""
     difference: float = 3e-3

@@ -22,8 +22,8 @@ from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of the bounds."""
 Told = Callable[[str, float, float, np.ndarray], None]
-"""Called with the phase (``search`` or ``refine``), the share of it done since the last call, and the best loss and
-point so far."""
+"""Called with the phase (``search`` or ``refine``; ``compiling`` in between), the share of it done since the last call,
+and the best loss and point so far."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def fit(
     table: ParameterTable | None = None,
     long_spans: Sequence[Span] = (),
     told: Told | None = None,
+    begins: Callable[[Problem], None] | None = None,
 ) -> Fit:
     """Identify a model.
 
@@ -82,8 +83,11 @@ def fit(
         table: The parameters; default: the model's.
         long_spans: Segments of ``config.long_s`` for the last refinement.
         told: Progress.
+        begins: Called with the residuals before anything is compiled.
     """
     problem = windows = Problem(model, recordings, spans, length_s, config, table)
+    if begins:
+        begins(problem)
     starts, found = problem.table.start()[None], None
     if config.generations:
         found = run_search(problem, starts[0], told)
@@ -136,7 +140,8 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
         if told:
             told("search", generations / total, best, z)
 
-    return search(problem.losses, start, problem.config, problem.train, advance, problem.programs)
+    compiling = _compiling(told, "search", start)
+    return search(problem.losses, start, problem.config, problem.train, advance, problem.programs, compiling)
 
 
 def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
@@ -147,4 +152,9 @@ def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
         if told:
             told("refine", 1 / total, best, z)
 
-    return refine(problem, starts, problem.config.refine_steps, rounds, advance)
+    return refine(problem, starts, problem.config.refine_steps, rounds, advance, _compiling(told, "refine", starts[0]))
+
+
+def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:
+    """Return what tells of programs that are compiled, before the phase ``then`` goes on."""
+    return lambda on: told("compiling" if on else then, 0.0, float("inf"), z) if told else None

@@ -19,6 +19,7 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
 from sim2real.identify.config import FitConfig
 from sim2real.identify.derivative import finite_differences
+from sim2real.identify.engine import CRollouts, choose
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.robust import tamed
@@ -72,12 +73,14 @@ class Problem:
         self.table = (table or model.parameters).for_recordings(len(recordings))
         self.channels = model.channels
         nodes = model.nodes(config.max_delay_s)
+        self.engine = choose(config.engine, nodes, model.given, config.jacobian)
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s = cuts.spans, length_s
         timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
         make_room(nodes, timeline)  # after a hiccup commands leave in a burst
         self.graph = CompiledGraph(nodes, model.sensor, timeline, cuts.given)
+        self._outside = CRollouts(self.graph, self.engine.model) if self.engine.name == "c" else None
         self.segments = self.graph.episodes
         self.begins_s = np.array([s.begin_s for s in self.spans])
         self.recording = np.array([s.recording for s in self.spans])
@@ -103,7 +106,8 @@ class Problem:
         self.programs: dict[Any, Any] = {}
         """Programs that ``search`` and ``refine`` compiled, kept for their next call."""
         self._late = [p.name for p in self.table if p.side == "measurement"]
-        self.forward = config.jacobian == "forward" or (config.jacobian == "auto" and self._has_derivative())
+        sought = config.jacobian == "auto" and self._outside is None
+        self.forward = config.jacobian == "forward" or (sought and self._has_derivative())
 
     @property
     def fields(self) -> list[tuple[str, float, Callable[[Any], Any]]]:
@@ -143,14 +147,18 @@ class Problem:
 
     def _simulate(self, own: Mapping[str, Any], start: Any, eps: Any) -> tuple[Any, Any]:
         """Simulate a segment for one recording's parameters, from an initial state."""
-        gs = self.graph.init(jax.random.key(0), params=self.model.params(own, start), eps=eps)
+        params = self.model.params(own, start)
+        gs = self.graph.init(jax.random.key(0), params=params, eps=eps)
         # The first recorded command is taken to have held before, too: nothing else is known.
         first = jax.tree_util.tree_map(lambda rows: rows[eps], self._first)
         cast = lambda new, old: jnp.asarray(new, old.dtype)  # noqa: E731
         held = {n: jax.tree_util.tree_map(cast, first[n], gs.buffer[n]) for n in first}
         gs = gs.replace(buffer={**gs.buffer, **held})
-        _, records = self.graph.rollout(gs, record=(self.model.sensor,))
-        record = records[self.model.sensor]
+        sensor = self.model.sensor
+        if self._outside is None:
+            record = self.graph.rollout(gs, record=(sensor,))[1][sensor]
+        else:
+            record = self._outside.rollout(gs, params, sensor)
         return record.output, record.seq
 
     def residuals(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data | None = None) -> tuple[Any, Any]:
@@ -314,6 +322,14 @@ class Problem:
 
     def _tamed(self, residuals: Any) -> Any:
         return tamed(residuals, self.config.loss, self.config.reach)
+
+    @property
+    def tolerance(self) -> tuple[float, float]:
+        """Relative and absolute change of point and loss at which a refinement ends.
+
+        Finer steps are lost in the noise of finite differences: an arm on C took twice the steps to the same point.
+        """
+        return (1e-5, 1e-6) if self._outside is None else (1e-4, 1e-4)
 
     @property
     def measurements(self) -> int:

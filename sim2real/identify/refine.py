@@ -14,6 +14,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError
 from sim2real.identify.derivative import by_jacobian
 from sim2real.identify.problem import Data, Problem
+from sim2real.identify.search import telling
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ def refine(
     rounds: int = 3,
     on_round: Callable[[float, np.ndarray], None] | None = None,
     data: Data | None = None,
+    on_compile: Callable[[bool], None] | None = None,
 ) -> Refined:
     """Improve each start, and return the best result; a round that does not lower the loss is dropped.
 
@@ -57,12 +59,17 @@ def refine(
         rounds: Most rounds from a start; the first that gains less than 0.01 % is the last.
         on_round: Called after each round with the best loss and point so far.
         data: What is fitted; default: the problem's logs.
+        on_compile: Called with True before a program is compiled, and with False afterwards.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
-    improve = problem.programs.setdefault(("improve", steps), _program(problem, steps))
     data = data or problem.part()
+    if ("improve", steps) not in problem.programs:
+        with telling(on_compile):
+            like = jnp.asarray(starts[0], jnp.float32)
+            problem.programs["improve", steps] = _program(problem, steps).lower(like, data).compile()
+    improve = problem.programs["improve", steps]
     of_data = problem.programs.setdefault("loss", jax.jit(lambda z, d: problem.losses(z[None], z, data=d)[0]))
     full_loss = functools.partial(of_data, d=data)
     first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
@@ -91,11 +98,12 @@ def refine(
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
 
 
-def _program(problem: Problem, steps: int) -> Callable[[Any, Data], tuple[Any, Any]]:
-    """Return one round of Levenberg-Marquardt, compiled on its first call: ``z, data -> (z, steps taken)``."""
+def _program(problem: Problem, steps: int) -> Any:
+    """Return one round of Levenberg-Marquardt, jitted: ``z, data -> (z, steps taken)``."""
     import optimistix  # 0.5 s
 
-    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
+    rtol, atol = problem.tolerance
+    solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=atol)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
     def improve(z: Any, data: Data) -> tuple[Any, Any]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +55,7 @@ def search(
     segments: np.ndarray | None = None,
     on_generations: Callable[[int, float, np.ndarray], None] | None = None,
     programs: dict[Any, Any] | None = None,
+    on_compile: Callable[[bool], None] | None = None,
 ) -> SearchResult:
     """Minimise; every candidate of a generation sees the same data (common random numbers).
 
@@ -68,6 +70,7 @@ def search(
         on_generations: Called with the number of generations done since the last call, and the best loss and candidate
             of this run so far.
         programs: Compiled programs of earlier calls with the same losses; those of this one are added.
+        on_compile: Called with True before a program is compiled, and with False afterwards.
 
     Raises:
         UsageError: When there is no such strategy, or it cannot work with this population.
@@ -90,7 +93,7 @@ def search(
         kind = (config.strategy, population, config.batch, config.generations, config.std)
         if kind not in programs:
             programs[kind] = _Run(losses, config, population, len(start), batch, segments)
-        z, history, count = programs[kind](k_run, middle, std, config.generations, on_generations)
+        z, history, count = programs[kind](k_run, middle, std, config.generations, on_generations, on_compile)
         runs.append(z)
         histories.append(history)
         evaluations += count
@@ -125,7 +128,7 @@ class _Run:
             else (lambda key: None)
         )
         self.batched = batched
-        self.advance = jax.jit(self._advance)
+        self.advance: Any = None
 
     def __call__(
         self,
@@ -134,6 +137,7 @@ class _Run:
         std: float,
         generations: int,
         told: Callable[[int, float, np.ndarray], None] | None,
+        on_compile: Callable[[bool], None] | None,
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Run; return the best candidate ``(P,)``, the best loss up to each generation, and how many were simulated."""
         params = self.strategy.default_params
@@ -142,6 +146,9 @@ class _Run:
         params = strong(params)
         k_first, *keys = jax.random.split(key, 1 + -(-generations // self.count))
         state = strong(self._first(k_first, jnp.asarray(middle, jnp.float32), std, params))  # else it compiles twice
+        if self.advance is None:
+            with telling(on_compile):
+                self.advance = jax.jit(self._advance).lower(state, params, k_first).compile()
         history: list[np.ndarray] = []
         for k_generations in keys:
             state, best = self.advance(state, params, k_generations)
@@ -189,6 +196,15 @@ class _Run:
             return state, jnp.min(fitness)
 
         return jax.lax.scan(generation, state, jax.random.split(key, self.count))
+
+
+@contextmanager
+def telling(on_compile: Callable[[bool], None] | None) -> Iterator[None]:
+    """Tell that a program is compiled inside a ``with`` block: True before, False afterwards."""
+    tell = on_compile or (lambda on: None)
+    tell(True)
+    yield
+    tell(False)
 
 
 def _strategy(config: FitConfig, population: int, size: int) -> Any:

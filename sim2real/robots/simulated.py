@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from sim2real.composer.world import ComposedWorld
-from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.base import GraphState
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import JointReading
@@ -53,14 +53,17 @@ class ServoWorld(ComposedWorld):
         speed = state.data.qvel + self.lead_s * state.data.qacc
         return JointReading(state.data.qpos[self._qpos], speed[self._qvel])
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Make a control step with the newest goals."""
-        if self._resumed:
-            state, goal = step_state.state, step_state.inputs[self.input_name][-1].data.goal
-            reference = jnp.where(state.steps == 0, goal, state.variables[REFERENCE])
-            state = state.replace(variables={**state.variables, REFERENCE: reference})
-            step_state = step_state.replace(state=state)
-        return super().step(step_state)
+    def entered(self, state: Any, action: Any) -> Any:
+        """Return the state with which a control step begins; a resumed episode's setpoints start at the goals.
+
+        Args:
+            state: The state after the step before.
+            action: The newest goals ``(joints,)`` [rad].
+        """
+        if not self._resumed:
+            return state
+        reference = jnp.where(state.steps == 0, action, state.variables[REFERENCE])
+        return state.replace(variables={**state.variables, REFERENCE: reference})
 
     def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
         """Return the delay of the goals, if the actuator's parameters have one.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -34,10 +34,15 @@ class RowProgram:
         wiring: The tables.
         given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
         episodes: Number of episodes E.
+
+    Attributes:
+        replayed: The world's messages where its ticks were run elsewhere, leaves ``(1 + ticks, ...)``: the default
+            output, then those of its ticks; None where it runs here.
     """
 
     def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any], episodes: int) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
+        self.replayed: Any = None
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
@@ -104,6 +109,20 @@ class RowProgram:
         gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
+    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, Any]]) -> Any:
+        """Run the world's ticks of a whole episode by another function; see ``CompiledGraph.drive``."""
+        world: Any = self.wiring.world
+        flat = lambda t: t[:, gs.eps].reshape(-1, *t.shape[3:])  # noqa: E731 - (R, E, ticks, ...) -> (R * ticks, ...)
+        # What a tick hears does not depend on the ticks before it: looked up for all of them at once.
+        seen = jax.vmap(lambda now: self._step_state(gs, world, now))(jax.tree_util.tree_map(flat, self._world))
+
+        def tick(state: Any, now: Any) -> tuple[Any, Any]:
+            inputs, seq, ts = now
+            new, output = step(StepState(gs.rng[world], state, gs.params[world], inputs, gs.eps, seq, ts))
+            return matched(world, "the state that a driven tick returns", new.state, "the one it got", state), output
+
+        return jax.lax.scan(tick, gs.state[world], (seen.inputs, seen.seq, seen.ts))[1]
+
     def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
         """Call a node's step; an exception gets a note with the node's name."""
         try:
@@ -168,6 +187,8 @@ class RowProgram:
             sender = connection.output_node.name
             if sender in self._given:
                 data = self._look_up(gs, sender, t["seq"])
+            elif self.replayed is not None and sender == self.wiring.world:
+                data = jax.tree_util.tree_map(lambda leaf, seq=t["seq"]: leaf[jnp.maximum(seq, -1) + 1], self.replayed)
             else:
                 data = _window(gs.buffer[sender], age, width)
             dist = gs.delays.get(name, {}).get(input_name)

@@ -83,6 +83,7 @@ def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds
         evaluations=fit.search.evaluations if fit.search else 0,
         refined=tuple(Refinement(r.before, r.loss, r.steps) for r in fit.refined),
         seconds=seconds,
+        engine=str(fit.problem.engine),
     )
     return Identification(
         pipeline=pipeline,

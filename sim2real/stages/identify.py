@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from sim2real.robots.base import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages import advice, identified, left_out
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.console import progress
+from sim2real.stages.console import note, progress
 from sim2real.stages.cutting import reach, spans, split_of
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
@@ -78,7 +78,7 @@ def identify(
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
     with _told("identify", best) as told:
-        all_terms = found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told))
+        all_terms = found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told, _begins))
     terms = found.problem.table.terms or None
     if config.terms == "auto":
         terms = left_out.chosen(found, config, names)
@@ -197,9 +197,14 @@ def _fit(
     config: IdentifyConfig,
     table: ParameterTable,
     told: Told | None = None,
+    begins: Callable[[Problem], None] | None = None,
 ) -> Fit:
     longer = [s for s in spans(episodes, fitted, config, config.long_s) if s.fitted] if config.long_s else []
-    return fit(model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, told)
+    return fit(model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, told, begins)
+
+
+def _begins(problem: Problem) -> None:
+    note(f"engine: {problem.engine}")
 
 
 def _baselines(found: Fit) -> dict[str, Any]:
@@ -273,10 +278,11 @@ def _told(what: str, best: Best | None = None) -> Iterator[Told]:
     with progress(100, what) as bar:
 
         def advance(stage: str, share: float, loss: float, z: np.ndarray) -> None:
-            best.advance(stage, share, loss, z)
+            if stage in best.done:
+                best.advance(stage, share, loss, z)
             bar.set_description_str(f"{what}: {stage}")
             bar.update(round(70 * best.done["search"] + 30 * best.done["refine"]) - bar.n)
-            bar.set_postfix_str(f"loss {loss:.4f}")
+            bar.set_postfix_str(f"loss {loss:.4f}" if np.isfinite(loss) else "")
 
         yield advance
         bar.update(100 - bar.n)

@@ -336,4 +336,5 @@ def _tiles(found: Identification) -> Iterator[Tile]:
         yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the deviation assumed of a measurement")
     seconds, evaluations = found.search.seconds, found.search.evaluations
     if seconds is not None:
-        yield Tile("search", f"{float(seconds):.0f} s", f"{number(evaluations)} evaluations" if evaluations else "")
+        simulated = [found.search.engine, f"{number(evaluations)} evaluations" if evaluations else ""]
+        yield Tile("search", f"{float(seconds):.0f} s", "; ".join(filter(None, reversed(simulated))))

@@ -8,12 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
+from jax.core import Tracer
 
+from sim2real.composer.c.rollouts import Start, check_steps
 from sim2real.composer.mjx import gate, stepping, warp
 from sim2real.composer.mjx.import_mjx import mjx
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
 
 
@@ -81,6 +84,7 @@ class MjxWorld(BaseWorld):
         njmax: int | None = None,
     ) -> None:
         super().__init__(name, rate, color=color, order=order)
+        self.derives = False
         self.model = model
         self.input_name, self.field = command, field
         steps = 1.0 / (self.rate * model.opt.timestep)
@@ -97,6 +101,7 @@ class MjxWorld(BaseWorld):
             raise UsageError(f"world {name!r}: {error.args[0]}", hint=error.hint) from None
         self._engine: Any = self._warp or stepping
         self._mjx_model: Any = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
+        self._apart = False
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:
         """Return the model and its reference position at rest."""
@@ -105,6 +110,8 @@ class MjxWorld(BaseWorld):
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return MJX data at the parameters' start."""
+        if self._apart:
+            return Empty()
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         start: Any = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
         return self._engine.forward(params.model, start.replace(qpos=params.qpos, qvel=params.qvel))
@@ -117,11 +124,67 @@ class MjxWorld(BaseWorld):
     def step(self, step_state: StepState) -> tuple[StepState, MjxState]:
         """Integrate over one tick under the newest control."""
         model, advance = step_state.params.model, self._engine.advance
-        control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
-        data = step_state.state.replace(ctrl=jnp.asarray(control, jnp.float32))
+        data = step_state.state.replace(ctrl=jnp.asarray(self._control(step_state), jnp.float32))
         if self.substeps == 1:
             data = advance(model, data, legacy=False)
         else:
             data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
         new = step_state.replace(state=data)
         return new, MjxState(data.qpos, data.qvel)
+
+    # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
+
+    def open_loop(self) -> Any:
+        """Take the physics out and return the ``MjModel``; UsageError where a subclass steps in its own way."""
+        check_steps(self, MjxWorld)
+        if self._warp:
+            raise UsageError(f"world {self.name!r} is one of MuJoCo Warp's")
+        self._apart = True
+        return self.model
+
+    def fields(self, params: MjxParams, state: Any) -> dict[str, Any]:
+        """Return the fields of the model that differ from the compiled one.
+
+        Args:
+            params: The node's parameters.
+            state: Not used.
+        """
+        del state
+        found = {}
+        old, new = (jax.tree_util.tree_flatten_with_path(m)[0] for m in (self._mjx_model, params.model))
+        for (path, before), (_, after) in zip(old, new, strict=True):
+            known = not isinstance(after, Tracer)
+            if after is not before and not (known and np.array_equal(before, after)):
+                found[jax.tree_util.keystr(path).lstrip(".")] = after
+        return found
+
+    def start(self, params: MjxParams, state: Any) -> Start:
+        """Return where the physics starts.
+
+        Args:
+            params: The node's parameters.
+            state: Not used.
+        """
+        del state
+        return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
+
+    def controls(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Return the step state, and the newest control for each physics step ``(substeps, nu)``."""
+        control = jnp.asarray(self._control(step_state), jnp.float32)
+        return step_state, jnp.broadcast_to(control, (self.substeps, self.model.nu))
+
+    def message(self, state: Any, qpos: Any, qvel: Any, qacc: Any) -> MjxState:
+        """Return what the world sends.
+
+        Args:
+            state: Not used.
+            qpos: Positions ``(nq,)`` [m or rad].
+            qvel: Velocities ``(nv,)`` [m/s or rad/s].
+            qacc: Not used.
+        """
+        del state, qacc
+        return MjxState(qpos, qvel)
+
+    def _control(self, step_state: StepState) -> Any:
+        """Return the controls ``(nu,)`` of a tick; they may depend on what it hears and on parameters."""
+        return getattr(step_state.inputs[self.input_name].data, self.field)[-1]

@@ -185,6 +185,9 @@ def test_progress_adds_up_to_at_most_one(found):
         shares = [share for name, share, *_ in found.told if name == stage]
         assert shares
         assert sum(shares) <= 1.0 + 1e-6
+    phases = [name for name, *_ in found.told]
+    assert phases[:2] == ["compiling", "search"]
+    assert phases[phases.index("refine") - 1] == "compiling"
     *_, loss, z = found.told[-1]
     assert loss == pytest.approx(found.fit.loss)
     np.testing.assert_allclose(z, found.fit.z)  # what an interrupted search leaves behind

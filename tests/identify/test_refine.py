@@ -22,6 +22,7 @@ def stub(residuals, count=3):
     return SimpleNamespace(
         measurements=count,
         programs={},
+        tolerance=(1e-5, 1e-6),
         table=SimpleNamespace(prior_residuals=lambda z: jnp.zeros(0)),
         part=lambda: None,
         sensitivities=lambda z, data: None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import weakref
 from collections.abc import Iterable
@@ -91,6 +92,7 @@ class MjxEnvironment:
     Attributes:
         model: The compiled ``mujoco.MjModel``.
         mjx_model: The ``mjx.Model``.
+        initial: The ``mjx.Data`` that episodes start from.
     """
 
     def __init__(
@@ -130,7 +132,7 @@ class MjxEnvironment:
         strip = strip_singleton_obs_buffer_dim
         self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
-        self._start = _initial_data(self.model) if self._warp is None else self._warp.start
+        self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
         views.freeze(self.model)
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
@@ -148,11 +150,11 @@ class MjxEnvironment:
     def _physics(self, state: State | None = None, model: Any = None) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
         compiled = self.mjx_model if model is None else model
-        data = self._start if state is None else state.data
+        data = self.initial if state is None else state.data
         physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp or stepping)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()
-        physics.start = self._start
+        physics.start = self.initial
         physics.dry = self._dry
         if state is None:
             # On Warp nothing was computed yet; a model of the copy's own is not the one that was computed with.
@@ -217,6 +219,45 @@ class MjxEnvironment:
         no = jnp.zeros((), bool)
         outcome = (observation, reward, discount + 1, no, no, failed)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
+
+    def reset_apart(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None, data: Any = None) -> State:
+        """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
+
+        Args:
+            key: JAX key.
+            model: See ``reset``.
+            start: See ``reset``.
+            data: What episodes start from; default: ``initial``.
+        """
+        before = self._dry, self.initial
+        self._dry, self.initial = True, self.initial if data is None else data
+        try:
+            return self.reset(key, model, start)
+        finally:
+            self._dry, self.initial = before
+
+    def step_apart(self, state: State, action: Any, model: Any = None) -> tuple[State, Any]:
+        """Run the hooks of a control step without its physics.
+
+        Args:
+            state: The copy; only ``data.ctrl``, what hooks keep and ``steps`` are up to date afterwards.
+            action: See ``step``.
+            model: See ``step``.
+
+        Returns:
+            The copy, and the controls of each physics step ``(substeps, nu)``.
+        """
+        physics, random_state = self._physics(state, model)
+        physics.dry, controls = True, []
+        self._hooks.run("before_step", physics, action, random_state)
+        for _ in range(self.substeps):
+            self._hooks.run("before_substep", physics, action, random_state)
+            controls.append(physics.control())
+            self._hooks.run("after_substep", physics, random_state)
+        self._hooks.run("after_step", physics, random_state)
+        data, leaves, variables, key, memory = physics.tree(random_state)
+        kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
+        return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
 
     def step(self, state: State, action: Any, model: Any = None) -> State:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.

@@ -184,6 +184,10 @@ class MjxPhysics:
             self.replace("model", name, value)
         self.mark_as_dirty()
 
+    def field(self, name: str) -> Any:
+        """Return a field of this copy's model, such as ``dof_damping`` or ``opt.gravity``."""
+        return _get(self.mjx_model, name)
+
     def initial(self, elements: Any, name: str) -> Any:
         """Return an attribute of elements as it was compiled."""
         field, index = self.bind(elements).place(name)

@@ -1,0 +1,126 @@
+"""What rolls a segment out: the graph's own program, or C MuJoCo between two programs without physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.composer.c.rollouts import OpenLoop, Rollouts, Start
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState
+from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.program import Rollout
+
+_NEEDED = ("open_loop", "fields", "start", "controls", "message")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which engine was taken.
+
+    Attributes:
+        name: ``c`` or ``compiled``.
+        why: In words.
+        model: The ``MjModel``, on C.
+    """
+
+    name: Literal["c", "compiled"]
+    why: str
+    model: Any = None
+
+    def __str__(self) -> str:
+        """Return both in one line."""
+        return f"{'C MuJoCo' if self.name == 'c' else 'compiled'}: {self.why}"
+
+
+def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any], jacobian: str = "auto") -> Choice:
+    """Choose an engine, and take the physics out of the world where it is C.
+
+    Args:
+        wanted: ``auto``, ``c`` or ``compiled``.
+        nodes: The nodes.
+        given: Nodes whose outputs are recorded.
+        jacobian: How derivatives are taken; only programs differentiate forward.
+
+    Raises:
+        UsageError: When C is asked for and cannot be had.
+    """
+    if wanted == "compiled":
+        return Choice("compiled", "asked for")
+    backend = jax.default_backend()
+    try:
+        if wanted == "auto" and backend != "cpu":
+            raise UsageError(f"there is an accelerator ({backend})")
+        if jacobian == "forward":
+            raise UsageError("derivatives are taken in forward mode, which C MuJoCo does not have")
+        world = _world(nodes, given)
+        model = world.open_loop()
+    except UsageError as error:
+        if wanted == "c":
+            hint = error.hint or "take --engine compiled, or auto"
+            raise UsageError(f"engine c: {error.args[0]}", hint=hint) from None
+        return Choice("compiled", error.args[0])
+    return Choice("c", "asked for" if wanted == "c" else "the world is MuJoCo's, and there is no accelerator", model)
+
+
+def _world(nodes: Mapping[str, BaseNode], given: Mapping[str, Any]) -> Any:
+    worlds = [n for n in nodes.values() if isinstance(n, BaseWorld)]
+    if len(worlds) != 1 or not all(hasattr(worlds[0], n) for n in _NEEDED):
+        names = ", ".join(f"{n.name!r} ({type(n).__name__})" for n in worlds) or "there is none"
+        raise UsageError(f"the world is not one of MuJoCo's: {names}")
+    live = [c.output_node.name for c in worlds[0].inputs.values() if c.output_node.name not in given]
+    if live:
+        raise UsageError(f"the world {worlds[0].name!r} hears {live[0]!r}, which is not recorded")
+    return worlds[0]
+
+
+class CRollouts:
+    """Rolls a graph's recorded commands out on C MuJoCo.
+
+    The graph's programs say what the world hears in each tick, with its delays and averages, and what the sensor makes
+    of the world's messages; in between C steps all copies at once, with the parameters that each has.
+
+    Args:
+        graph: The graph, whose world's physics was taken out.
+        model: The ``MjModel``.
+    """
+
+    def __init__(self, graph: CompiledGraph, model: Any) -> None:
+        self._graph, self._model = graph, model
+        self._world: OpenLoop = graph.nodes[graph.wiring.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
+        self._rollouts: dict[tuple[str, ...], Rollouts] = {}
+
+    def rollout(self, gs: GraphState, params: Mapping[str, Any], record: str) -> Rollout:
+        """Return what a node did in an episode; traceable, without derivatives.
+
+        Args:
+            gs: What the graph's ``init`` returned.
+            params: The nodes' parameters, as ``init`` got them.
+            record: The node.
+        """
+        world = self._world
+        state, own = gs.state[world.name], params[world.name]
+        fields = world.fields(own, state)
+        names = tuple(sorted(fields))
+        if names not in self._rollouts:
+            self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives)
+        controls = self._graph.drive(gs, world.controls)
+        start = world.start(own, state)
+        count, dtype = controls.shape[0], jnp.result_type(float)
+        widths = (self._model.nq, self._model.nv, self._model.nv)
+
+        def outside(fields: Any, start: Any, controls: Any) -> tuple[np.ndarray, ...]:
+            fields, start, controls = jax.tree_util.tree_map(np.asarray, (fields, start, controls))
+            made = self._rollouts[names](fields, Start(*start), controls)
+            return tuple(a.astype(dtype) for a in made)
+
+        shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
+        moved = jax.pure_callback(outside, shapes, fields, start, controls, vmap_method="expand_dims")
+        messages = jax.vmap(lambda *moved: world.message(state, *moved))(*moved)
+        return self._graph.replay(gs, messages, (record,))[record]

@@ -1,0 +1,95 @@
+"""Segments on C MuJoCo and in the compiled graph: the same numbers, whatever the delays."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_robot import VALUES, PairRobot, PairTask
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+
+MAX_DELAY_S, SEGMENT_S = 0.03, 0.4
+LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03), "friction_left": (0.01, 0.1)}
+
+
+class ConvergedRobot(PairRobot):
+    """Its solver ends where the solution is, on either engine."""
+
+    def make_task(self):
+        task = PairTask()
+        option = task.root_entity.mjcf_model.option
+        option.iterations, option.ls_iterations, option.tolerance = 100, 50, 0
+        return task
+
+
+def steps(start, stamp, end):
+    none = np.zeros_like(start)
+    return Steps(scheduled=start, start=start, woken=start, ts_overwrite=stamp, end=end, drift=none)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """Goals and samples off every grid, some goals in a burst; what was measured does not matter here."""
+    rng, count = np.random.default_rng(1), 60
+    slots = np.arange(count) * 20_000
+    stamp = slots + rng.integers(0, 8000, count)
+    sent = slots + rng.integers(0, 15_000, count)
+    sent[20] = sent[21] - 300
+    goals = np.cumsum(rng.uniform(-0.1, 0.1, (count, 2)), axis=0)
+    still = np.zeros((count, 2))
+    return Episode(
+        steps={"sensor": steps(stamp, stamp, stamp + 10), "actuator": steps(sent, np.full(count, -1), sent)},
+        messages={},
+        outputs={"sensor": {"position": still, "velocity": still}, "actuator": {"goal": goals}},
+    )
+
+
+@pytest.fixture(scope="module")
+def engines(episode):
+    """Programs that return the residuals of two segments in radians, of both engines, in double precision."""
+    programs = {}
+    jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
+    try:
+        for engine in ("c", "compiled"):
+            config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state="measured", engine=engine)
+            model = ConvergedRobot().identifiable(MAX_DELAY_S)
+            problem = Problem(model, [episode], [Span(0, 0.2), Span(0, 0.55)], SEGMENT_S, config)
+            assert problem.engine.name == engine
+            sigmas = jnp.array([s for _, s, _ in problem.fields])
+
+            def run(values, shift, problem=problem, sigmas=sigmas):
+                errors = jax.vmap(lambda e: problem.residuals(values, e, shift)[0])(jnp.arange(2))
+                return sigmas * errors
+
+            programs[engine] = jax.jit(run)
+        yield SimpleNamespace(**programs)
+    finally:
+        jax.config.update("jax_enable_x64", False)
+
+
+def played(program, values, shift=(0.2, -0.1, 1.0, -2.0)):
+    return np.asarray(program({k: jnp.asarray(v) for k, v in values.items()}, jnp.asarray(shift)))
+
+
+delays = st.floats(0.0, MAX_DELAY_S)
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(delays, delays, st.fixed_dictionaries({k: st.floats(*ends) for k, ends in LIMITS.items()}))
+def test_both_engines_say_the_same(engines, sensor, actuator, own):
+    values = {**VALUES, **own, "sensor_delay": sensor, "actuator_delay": actuator}
+    np.testing.assert_allclose(played(engines.c, values), played(engines.compiled, values), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["sensor_delay", "actuator_delay"])
+def test_that_would_fail_if_a_tick_were_wrong(engines, name):
+    values = {**VALUES, "sensor_delay": 0.006, "actuator_delay": 0.011}
+    there = played(engines.c, {**values, name: values[name] + 0.01})
+    assert np.abs(there - played(engines.compiled, values)).max() > 1e-2
