@@ -152,7 +152,8 @@ def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
         if told:
             told("refine", 1 / total, best, z)
 
-    return refine(problem, starts, problem.config.refine_steps, rounds, advance, _compiling(told, "refine", starts[0]))
+    compiling = _compiling(told, "refine", starts[0])
+    return refine(problem, starts, problem.config.refine_steps, rounds, advance, on_compile=compiling)
 
 
 def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:
