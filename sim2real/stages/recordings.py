@@ -7,7 +7,7 @@ from pathlib import Path
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.identify.segments import require_moved
-from sim2real.log.importer import import_file, load_mapping
+from sim2real.log.importer import import_file
 from sim2real.stages.console import note
 from sim2real.stages.pipeline import Pipeline
 
@@ -24,8 +24,8 @@ def open_recording(path: Path, pipeline: Pipeline) -> Recording:
     Raises:
         Sim2RealError: When it is no log, of another pipeline, or of a dry run, or has holes.
     """
-    if path.suffix != ".mcap" and path.is_file() and (mapping := pipeline.folder / "import.toml").is_file():
-        return Recording(path, import_file(path, load_mapping(mapping)))
+    if (mapping := pipeline.mapping_of(path)) is not None:
+        return Recording(path, import_file(path, mapping))
     recording = Recording.load(path)
     for warning in recording.warnings:
         note(f"warning: {warning}; what is there is used")

@@ -117,11 +117,13 @@ class MjxWorld(BaseWorld):
     def step(self, step_state: StepState) -> tuple[StepState, MjxState]:
         """Integrate over one tick under the newest control."""
         model, advance = step_state.params.model, self._engine.advance
-        control = getattr(step_state.inputs[self.input_name].data, self.field)[-1]
-        data = step_state.state.replace(ctrl=jnp.asarray(control, jnp.float32))
+        data = step_state.state.replace(ctrl=jnp.asarray(self._control(step_state), jnp.float32))
         if self.substeps == 1:
             data = advance(model, data, legacy=False)
         else:
             data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
         new = step_state.replace(state=data)
         return new, MjxState(data.qpos, data.qvel)
+
+    def _control(self, step_state: StepState) -> Any:
+        return getattr(step_state.inputs[self.input_name].data, self.field)[-1]
