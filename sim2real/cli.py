@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sim2real.stages.pipeline import Pipeline
 
 DEMO_PIPELINE = "pendulum"
+_WORSE = " Ends with code 1 where a baseline predicts as well."
 
 EXIT_CODES = """\
 exit codes
@@ -43,7 +44,9 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   report    write a run's report as one HTML page
   info      about the installation, a pipeline, a log or a run
   check     judge what a recording, or a planned one, can tell about the parameters
-  import    turn files of other recorders into logs
+  validate  score what was identified on a later log
+  import    turn files of other recorders into logs, and say what is what in them
+  new       write the files of a pipeline for a robot of which there is a model
   log       recover what is readable of a damaged log into a new one
 
 examples
@@ -119,6 +122,12 @@ def _stage(stage: str, arguments: list[str]) -> None:
     """``sim2real STAGE PIPELINE [flags]``."""
     from sim2real.stages import flags, targets
 
+    if stage == "identify" and flags.by_model(arguments):
+        from sim2real.stages import described as of_model  # imports JAX
+
+        parsed, described = of_model.parsed(stage, arguments, EXIT_CODES)
+        _call_stage(stage, described, parsed.config, parsed.runs, parsed.run)
+        return
     pipeline, rest = _pipeline_first(stage, arguments)
     config = getattr(pipeline, stage)
     parsed = flags.parse(
@@ -232,15 +241,19 @@ def _info(command: str, arguments: list[str]) -> None:
         print(info.run(targets.find_run(parsed.runs, target)))
 
 
-def _import(command: str, arguments: list[str]) -> None:
-    """``sim2real import FILE... [flags]``."""
+def _files(command: str, arguments: list[str]) -> None:
+    """``sim2real import FILE...``, ``validate PARAMETERS --log NEW`` and ``new NAME ROBOT.xml``."""
     from sim2real.stages import config, flags
 
-    own, epilog = config.ImportConfig(), _epilog("sim2real import data.npz --pipeline NAME", "sim2real info LOG")
-    asked = flags.parse(own, arguments, f"sim2real {command}", _summary(own), epilog)
-    from sim2real.stages import importing  # imports JAX
-
-    importing.run(asked)
+    kind, stage, text, *examples = {
+        "import": ("Import", "importing", "", "import data.npz --mjcf robot.xml", "info LOG"),
+        "validate": ("Validate", "validate", _WORSE, "validate runs/NAME/TIME/identify/parameters.json --log new.mcap"),
+        "new": ("New", "new", "", "new go2 go2.xml --log run.csv", "identify go2"),
+    }[command]
+    own, epilog = getattr(config, f"{kind}Config")(), _epilog(*(f"sim2real {example}" for example in examples))
+    asked = flags.parse(own, arguments, f"sim2real {command}", _summary(own) + text, epilog)
+    if importlib.import_module(f"sim2real.stages.{stage}").run(asked) is False:  # imports JAX
+        sys.exit(ERROR)
 
 
 def _log(command: str, arguments: list[str]) -> None:
@@ -265,6 +278,13 @@ def _check(command: str, arguments: list[str]) -> None:
     """``sim2real check PIPELINE [flags]``."""
     from sim2real.stages import config, flags
 
+    if flags.by_model(arguments):
+        from sim2real.stages import check, described
+
+        parsed, pipeline = described.parsed(command, arguments, EXIT_CODES)
+        if not check.run(pipeline, parsed.config):
+            sys.exit(ERROR)
+        return
     pipeline, rest = _pipeline_first(command, arguments)
     prog = f"sim2real {command} {pipeline.name}"
     own = config.CheckConfig(record=pipeline.record)
@@ -287,8 +307,10 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "view": _view,
     "report": _view,
     "info": _info,
-    "import": _import,
+    "import": _files,
     "check": _check,
+    "validate": _files,
+    "new": _files,
     "log": _log,
 }
 

@@ -1,4 +1,4 @@
-"""Reads the files of other recorders: npz, JSON, CSV, and episodes of LeRobot data sets (Parquet)."""
+"""Reads the files of other recorders: npz, JSON, CSV, episodes of LeRobot data sets (Parquet), MCAP and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import json
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.log.bags import read_bag
 
-SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"}
+SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot", ".mcap": "mcap"}
 """File suffix -> format, used unless a format is given."""
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
 # What the libraries raise for damaged content.
@@ -34,12 +35,16 @@ class ForeignFile:
         format: One of the values of ``SUFFIXES``.
         keys: Names of its signals.
         load: Returns a signal by name; raises KeyError if there is none.
+        columns: Names of a signal's columns, where the file has some.
+        beside: Further files of the same recording.
     """
 
     path: Path
     format: str
     keys: Sequence[str]
     load: Callable[[str], Any]
+    columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    beside: tuple[Path, ...] = ()
 
     def signal(self, source: str, column: int | None = None) -> np.ndarray:
         """Return a signal.
@@ -95,24 +100,36 @@ def open_foreign(path: Path, format: str | None = None) -> ForeignFile:
         UsageError: When the file does not exist, is empty, or does not have this format.
     """
     formats = ", ".join(_READERS)
-    if format is None:
+    if format is None and not path.is_dir():
         format = SUFFIXES.get(path.suffix.lower())
         if format is None:
             raise UsageError(
                 f"the format of {path} is unknown: no suffix {path.suffix!r}. Available: {', '.join(SUFFIXES)}",
                 hint=f"name it with --format: {formats}",
             )
-    if format not in _READERS:
+    if format not in (*_READERS, None):
         raise UsageError(f"unknown format {format!r}. Available: {formats}", hint="save the file as one of these")
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        path, format = _bag_file(path), "mcap"
     if path.is_dir():
         hint = "name the files in it; of a LeRobot data set: DIR/data/chunk-*/episode_*.parquet"
         raise UsageError(f"{path} is a folder, not a file", hint=hint)
     try:
         if path.stat().st_size == 0:
             raise UsageError(f"{path} is empty", hint=_WHOLE)
-        return _READERS[format](path)
+        return _READERS[str(format)](path)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}", hint="check its name") from None
+
+
+def _bag_file(folder: Path) -> Path:
+    """Return the only MCAP file of a ROS 2 bag's folder."""
+    found = sorted(folder.glob("*.mcap"))
+    if len(found) != 1:
+        other = sorted(folder.glob("*.db3"))
+        hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
+        raise UsageError(f"{folder} holds {len(found)} MCAP files, and {len(other)} of SQLite", hint=hint)
+    return found[0]
 
 
 def _read_npz(path: Path) -> ForeignFile:
@@ -181,6 +198,8 @@ def _read_csv(path: Path) -> ForeignFile:
         if name not in header:
             raise KeyError(name)
         index = header.index(name)
+        if rows and rows[0][1][index].startswith("["):
+            return [_list(row[index], f"line {n} of {path}, column {name!r}") for n, row in rows]
         try:
             return np.array([int(row[index]) for _, row in rows], np.int64)
         except (ValueError, OverflowError):
@@ -213,7 +232,8 @@ def _read_lerobot(path: Path) -> ForeignFile:
             return facts[0].load(name)
         return file.read(columns=[name]).column(0).to_pylist()
 
-    found = ForeignFile(path, "lerobot", [*columns, *(["fps"] if facts else [])], load)
+    named = _feature_names(infos[0]) if facts else {}
+    found = ForeignFile(path, "lerobot", [*columns, *(["fps"] if facts else [])], load, named)
     if "episode_index" in columns and len(np.unique(found.signal("episode_index"))) > 1:
         raise UsageError(
             f"{path} holds more than one episode", hint="import data sets of LeRobot v2, where a file is an episode"
@@ -221,11 +241,53 @@ def _read_lerobot(path: Path) -> ForeignFile:
     return found
 
 
+def _feature_names(info: Path) -> dict[str, list[str]]:
+    """Return the names of the entries of a LeRobot data set's columns, as ``meta/info.json`` has them."""
+    found = {}
+    for key, feature in json.loads(info.read_text(encoding="utf-8")).get("features", {}).items():
+        names = feature.get("names") if isinstance(feature, dict) else None
+        names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
+        if isinstance(names, list) and all(isinstance(n, str) for n in names):
+            found[key] = names
+    return found
+
+
+def _read_mcap(path: Path) -> ForeignFile:
+    keys, load, columns = read_bag(path)
+    return ForeignFile(path, "mcap", keys, load, columns)
+
+
+def joined(files: Sequence[ForeignFile]) -> ForeignFile:
+    """Return several files of one recording as one, whose signals are named ``STEM/NAME``.
+
+    Raises:
+        UsageError: When two files have the same name.
+    """
+    own = {f.path.stem: f for f in files}
+    if len(own) < len(files):
+        raise UsageError("files of one log need different names: their signals go by them", hint="rename one")
+
+    def split(name: str) -> tuple[ForeignFile, str]:
+        stem, _, rest = name.partition("/")
+        if stem not in own:
+            raise KeyError(name)
+        return own[stem], rest
+
+    def load(name: str) -> Any:
+        file, rest = split(name)
+        return file.load(rest)
+
+    keys = [f"{stem}/{key}" for stem, file in own.items() for key in file.keys]
+    columns = {f"{stem}/{key}": names for stem, file in own.items() for key, names in file.columns.items()}
+    return ForeignFile(files[0].path, files[0].format, keys, load, columns, tuple(f.path for f in files[1:]))
+
+
 _READERS: dict[str, Callable[[Path], ForeignFile]] = {
     "npz": _read_npz,
     "json": _read_json,
     "csv": _read_csv,
     "lerobot": _read_lerobot,
+    "mcap": _read_mcap,
 }
 
 
@@ -287,6 +349,14 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _list(text: str, where: str) -> Any:
+    """Return the list in a CSV cell, as ``[0.1, 0.2]`` or ``[0.1 0.2]``."""
+    try:
+        return json.loads(text) if "," in text else [float(x) for x in text.strip("[] ").split()]
+    except ValueError:
+        raise UsageError(f"{where} holds {text!r}, no list of numbers", hint=_WHOLE) from None
 
 
 def _cell(text: str, where: str) -> float:

@@ -57,26 +57,37 @@ def import_file(
         path: The file.
         mapping: The mapping from signals to fields, or the mapping file.
         samples: The samples to take, for every node; None: all.
-        format: ``npz``, ``json``, ``csv`` or ``lerobot``; None: chosen by the file's suffix.
+        format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; None: chosen by the file's suffix.
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
             differ in length, a sample is not finite, or stamps do not increase.
     """
-    if not isinstance(mapping, ImportMapping):
-        mapping = load_mapping(mapping)
-    file = open_foreign(Path(path), format)
+    found = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
+    return import_opened(open_foreign(Path(path), format), found, samples)
+
+
+def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | None = None) -> Episode:
+    """Read an open file as an episode; see ``import_file``.
+
+    Args:
+        file: The file, or several that were joined.
+        mapping: The mapping.
+        samples: The samples to take; None: all.
+    """
     signals = {name: _signals(file, name, node) for name, node in mapping.nodes.items()}
     first, stop = _range(file, {name: s.count for name, s in signals.items()}, samples)
-    ticks, outputs, stamps = {}, {}, {}
+    ticks, outputs, stamps, dropped = {}, {}, {}, {}
     for name, node in mapping.nodes.items():
         found, last = signals[name], signals[name].count if stop is None else stop
+        kept = _kept(node, found, first, last)
         outputs[name] = {
-            field: _samples(file, f"{name}.{field}", found.fields[field], how, first, last)
+            field: _samples(file, f"{name}.{field}", found.fields[field], how, kept)
             for field, how in node.fields.items()
         }
-        ticks[name] = _ticks(file, name, node, found, first, last)
+        ticks[name] = _ticks(file, name, node, found, kept)
         stamps[name] = GENERATED if found.stamps is None else RECORDED
+        dropped[name] = last - first - len(kept)
     zero = _time_zero([ticks[name] for name, kind in stamps.items() if kind == RECORDED], first)
     for name, kind in stamps.items():
         ticks[name] -= zero if kind == RECORDED else 0
@@ -84,8 +95,12 @@ def import_file(
         "file": file.path.name,
         "format": file.format,
         "sha256": hashlib.sha256(file.path.read_bytes()).hexdigest(),
+        **(
+            {"beside": {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in file.beside}} if file.beside else {}
+        ),
         "first_sample": first,
         "time_zero_us": zero,
+        "dropped": dropped,
     }
     return Episode(
         steps={name: _steps(t) for name, t in ticks.items()},
@@ -149,6 +164,11 @@ def facts(episode: Episode) -> dict[str, Any]:
         "samples": {name: len(steps) for name, steps in episode.steps.items()},
         "rate [Hz]": {name: node["rate_hz"] for name, node in episode.metadata["graph"].items()},
         "stamps": kinds,
+        **(
+            {"left out": lost}
+            if (lost := {n: k for n, k in episode.metadata["source"]["dropped"].items() if k})
+            else {}
+        ),
     }
 
 
@@ -224,12 +244,31 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
     return first, stop
 
 
-def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, first: int, stop: int) -> np.ndarray:
-    """Return a field's samples ``first`` to ``stop``, scaled, shape ``(N, ...)``; a constant is repeated."""
-    values = values[first:stop] if values.ndim else np.broadcast_to(values, (stop - first,))
-    _check_finite(file, f"field {where}", values, first)
+def _kept(node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
+    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep."""
+    kept = np.arange(first, stop)
+    series = [v for v in (*signals.fields.values(), signals.stamps) if v is not None and v.ndim]
+    if node.missing == "drop":
+        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
+        kept = kept[good]
+    if node.repeated == "first" and signals.stamps is not None and len(kept):
+        stamps = signals.stamps[kept]
+        kept = kept[np.concatenate([[True], stamps[1:] != stamps[:-1]])]
+    return kept
+
+
+def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, kept: np.ndarray) -> np.ndarray:
+    """Return a field's samples, scaled, shape ``(N, ...)``; a constant is repeated."""
+    values = values[kept] if values.ndim else np.broadcast_to(values, kept.shape)
+    _check_finite(file, f"field {where}", values, kept)
     dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
-    scaled = (how.scale * values.astype(np.float64) + how.offset).astype(dtype)
+    scale = np.asarray(how.scale)
+    if scale.ndim and scale.shape != values.shape[1:]:
+        raise UsageError(
+            f"field {where} has {scale.size} scales for samples of shape {values.shape[1:]}",
+            hint="give one number, or one for each column",
+        )
+    scaled = (scale * values.astype(np.float64) + how.offset).astype(dtype)
     shape = scaled.shape[1:] if how.shape is None else how.shape
     if np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
         raise UsageError(
@@ -239,15 +278,15 @@ def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMappin
     return np.ascontiguousarray(scaled.reshape(len(scaled), *shape))
 
 
-def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the stamps of samples ``first`` to ``stop``, shape ``(N,)``, int64 [us]."""
+def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+    """Return the stamps of samples, shape ``(N,)``, int64 [us]."""
     if signals.stamps is None:
         # The slots that the timing rules give to a node of this rate.
-        return np.floor(np.arange(stop - first) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
-    stamps = signals.stamps[first:stop]
+        return np.floor((kept - kept[:1]) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
+    stamps = signals.stamps[kept]
     what = f"stamps {node.stamps!r} of node {name!r}"
     hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
-    _check_finite(file, what, stamps, first)
+    _check_finite(file, what, stamps, kept)
     nanoseconds = STAMP_UNITS[node.stamp_unit]
     if np.abs(stamps * (nanoseconds / 1000)).max() >= _MAX_TICKS:
         raise UsageError(f"{what} in {file.path} are centuries away: {stamps[0]} {node.stamp_unit}", hint=hint)
@@ -258,20 +297,20 @@ def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, f
     if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
         k = int(wrong[0])
         raise UsageError(
-            f"{what} in {file.path} do not increase: sample {first + k} at {stamps[k]} {node.stamp_unit}, "
-            f"sample {first + k + 1} at {stamps[k + 1]} {node.stamp_unit}",
+            f"{what} in {file.path} do not increase: sample {kept[k]} at {stamps[k]} {node.stamp_unit}, "
+            f"sample {kept[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
             hint=f"samples must be a microsecond apart at least; {hint}",
         )
-    return ticks
+    return ticks + round(1e6 * node.stamp_offset)
 
 
-def _check_finite(file: ForeignFile, what: str, values: np.ndarray, first: int) -> None:
+def _check_finite(file: ForeignFile, what: str, values: np.ndarray, kept: np.ndarray) -> None:
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         k = int(np.argmin(finite))
         raise UsageError(
-            f"{what} is no finite number in sample {first + k} of {file.path}: {values[k]}",
-            hint="cut it off with --samples A:B, or repair the file",
+            f"{what} is no finite number in sample {kept[k]} of {file.path}: {values[k]}",
+            hint='cut it off with --samples A:B, or leave such samples out: missing = "drop" in the mapping',
         )
 
 

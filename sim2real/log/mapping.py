@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ class FieldMapping:
     Attributes:
         source: Name of a signal in the file, as ``ForeignFile.signal`` takes it; several signals are stacked.
         unit: Unit of the field, after scaling.
-        scale: The field is ``scale * signal + offset``.
+        scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit].
         shape: Shape of one sample; None: as in the file.
         column: Column of a two-dimensional signal; None: all columns.
@@ -36,7 +37,7 @@ class FieldMapping:
 
     source: tuple[str, ...]
     unit: str = ""
-    scale: float = 1.0
+    scale: float | tuple[float, ...] = 1.0
     offset: float = 0.0
     shape: tuple[int, ...] | None = None
     column: int | None = None
@@ -53,6 +54,9 @@ class NodeMapping:
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
         stamp_unit: Unit of the recorded stamps, one of ``STAMP_UNITS``.
         order: Of messages with equal stamps, those of nodes with a lower number were sent first.
+        missing: What happens to samples that lack a number: ``refuse``, or ``drop`` to leave them out.
+        repeated: What happens to samples with the stamp of the one before: ``refuse``, or ``first`` to keep the first.
+        stamp_offset: Added to the recorded stamps, where a stream has a clock of its own [s].
     """
 
     fields: Mapping[str, FieldMapping]
@@ -60,6 +64,9 @@ class NodeMapping:
     stamps: str | None = None
     stamp_unit: str = "s"
     order: int = 0
+    missing: str = "refuse"
+    repeated: str = "refuse"
+    stamp_offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,8 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
 
 def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     where = f"{document}: nodes.{name}"
-    _known(table, ("fields", "rate_hz", "stamps", "stamp_unit", "order"), where)
+    keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", "missing", "repeated", "stamp_offset")
+    _known(table, keys, where)
     fields = _value(table, "fields", dict, where) or {}
     if not fields:
         raise UsageError(f"{where} has no fields", hint=f'add fields.NAME = {{ source = "..." }}; {_HINT}')
@@ -160,6 +168,14 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     unit = _value(table, "stamp_unit", str, where) or "s"
     if unit not in STAMP_UNITS:
         raise UsageError(f"{where}: unknown stamp_unit {unit!r}. Available: {', '.join(STAMP_UNITS)}", hint=_HINT)
+    policies = {}
+    for key, available in (("missing", ("refuse", "drop")), ("repeated", ("refuse", "first"))):
+        policies[key] = _value(table, key, str, where) or "refuse"
+        if policies[key] not in available:
+            raise UsageError(f"{where}: unknown {key} {policies[key]!r}. Available: {', '.join(available)}", hint=_HINT)
+    late_s = float(_value(table, "stamp_offset", (int, float), where) or 0.0)
+    if not math.isfinite(late_s) or (late_s and stamps is None):
+        raise UsageError(f"{where}: stamp_offset is a finite number [s], added to recorded stamps", hint=_HINT)
     # Commands come after samples with the same stamp, as they were computed from them.
     order = _value(table, "order", int, where)
     return NodeMapping(
@@ -168,6 +184,8 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
         stamps=stamps,
         stamp_unit=unit,
         order=int(name == _COMMANDING) if order is None else order,
+        stamp_offset=late_s,
+        **policies,
     )
 
 
@@ -188,10 +206,13 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
     sources = [source] if isinstance(source, str) else source or []
     if not sources or not all(isinstance(s, str) and s for s in sources):
         raise UsageError(f"{where} needs a source: the name of a signal, or a list of names", hint=_HINT)
-    numbers = {key: _value(table, key, (int, float), where) for key in ("scale", "offset")}
-    for key, number in numbers.items():
-        if number is not None and not math.isfinite(number):
-            raise UsageError(f"{where}: {key} must be a finite number, got {number}", hint=_HINT)
+    scale, offset = _value(table, "scale", (int, float, list), where), _value(table, "offset", (int, float), where)
+    scales = scale if isinstance(scale, list) else [1.0 if scale is None else scale]
+    for key, numbers in (("scale", scales), ("offset", [offset or 0.0])):
+        if not numbers or not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
+            raise UsageError(
+                f"{where}: {key} must be a finite number, got {scale if key == 'scale' else offset}", hint=_HINT
+            )
     shape = _value(table, "shape", list, where)
     if shape is not None and not all(type(n) is int and n > 0 for n in shape):
         raise UsageError(f"{where}: shape must be a list of whole numbers above 0, got {shape}", hint=_HINT)
@@ -201,8 +222,8 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
     return FieldMapping(
         source=tuple(sources),
         unit=unit,
-        scale=1.0 if numbers["scale"] is None else float(numbers["scale"]),
-        offset=float(numbers["offset"] or 0.0),
+        scale=tuple(map(float, scales)) if isinstance(scale, list) else float(scales[0]),
+        offset=float(offset or 0.0),
         shape=None if shape is None else tuple(shape),
         column=_value(table, "column", int, where),
     )
@@ -231,3 +252,37 @@ def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
                 f"{where} has an unknown key {key!r}. Available: {', '.join(keys)}",
                 hint=f"did you mean {close[0]}?" if close else _HINT,
             )
+
+
+def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
+    """Return a mapping as the text of a mapping file.
+
+    Args:
+        mapping: The mapping.
+        comments: Lines that stand above it.
+    """
+    lines = [*(f"# {line}" for line in comments), f"pipeline = {_quoted(mapping.pipeline)}"]
+    for name, node in mapping.nodes.items():
+        keys: dict[str, Any] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
+        keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}
+        keys |= {"order": node.order} if node.order != int(name == _COMMANDING) else {}
+        keys |= {k: v for k in ("missing", "repeated") if (v := getattr(node, k)) != "refuse"}
+        keys |= {"stamp_offset": node.stamp_offset} if node.stamp_offset else {}
+        lines += ["", f"[nodes.{name}]", *(f"{key} = {_quoted(value)}" for key, value in keys.items())]
+        for field, how in node.fields.items():
+            parts: dict[str, Any] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
+            parts |= {"unit": how.unit} if how.unit else {}
+            parts |= {k: v for k, plain in (("scale", 1.0), ("offset", 0.0)) if (v := getattr(how, k)) != plain}
+            parts |= {k: v for k in ("shape", "column") if (v := getattr(how, k)) is not None}
+            inside = ", ".join(f"{key} = {_quoted(value)}" for key, value in parts.items())
+            lines.append(f"fields.{field} = {{ {inside} }}")
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(value: Any) -> str:
+    """Return a value as TOML writes it."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_quoted, value))}]"
+    return repr(value)

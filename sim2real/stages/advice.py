@@ -53,7 +53,7 @@ def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) ->
         return ""
     new = flags.split()
     named = {name for flag, name in pairwise(new) if flag in ("--bounds", "--fix")}
-    words = ["sim2real", "identify", pipeline.name]
+    words = ["sim2real", "identify", *pipeline.words]
     for f in fields(config):
         flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)
         if isinstance(value, Mapping):

@@ -193,12 +193,22 @@ class ImportConfig:
     """Turn files of other recorders into logs, one for each file."""
 
     files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
-    """Files of other recorders: npz, JSON, CSV, or episodes of a LeRobot data set."""
+    """Files of other recorders: npz, JSON, CSV, MCAP or a ROS 2 bag, or episodes of a LeRobot data set."""
     mapping: Path | None = None
-    """TOML file that says which signal is which field; default: import.toml in the pipeline's folder."""
+    """TOML file that says which signal is which field; default: the pipeline's import.toml, or one is proposed."""
+    mjcf: Path | None = None
+    """Model of the robot (MJCF or URDF), for the names and ranges of its joints."""
+    joints: tuple[str, ...] = ()
+    """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
+    rate_hz: float | None = None
+    """Samples per second, where a file has no time stamps [Hz]."""
+    together: bool = False
+    """All files are of one recording: a log of all of them instead of one for each."""
+    as_told: bool = False
+    """Import as the mapping says even where the data contradicts it."""
     pipeline: str | None = None
-    """Pipeline that the logs are for; default: the one that the mapping names."""
-    format: Literal["npz", "json", "csv", "lerobot"] | None = None
+    """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
+    format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None
     """Format of the files; default: by their suffixes."""
     samples: Annotated[str | None, arg(metavar="A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
@@ -213,7 +223,7 @@ class ImportConfig:
             raise UsageError(
                 f"samples must be a range A:B of whole numbers, got {self.samples!r}", hint="such as 0:20000 or 500:"
             )
-        if self.out is not None and len(self.files) > 1:
+        if self.out is not None and len(self.files) > 1 and not self.together:
             raise UsageError(f"out names one log, but there are {len(self.files)} files", hint="import them one by one")
 
     @property
@@ -233,6 +243,82 @@ class ImportConfig:
         if self.samples is None:
             return None
         return slice(*(int(end) if end else None for end in self.samples.split(":")))
+
+
+@dataclass(frozen=True)
+class RobotFlags:
+    """A robot that no pipeline describes: its model, and what else there is to say of it."""
+
+    mjcf: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Model of the robot: MJCF or URDF."""
+    joints: tuple[str, ...] = ()
+    """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
+    parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """What is identified: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
+    kp@.*_calf_joint; with =VALUE it is held. WHAT is kp, kd, gain, torque, speed, released, damping, armature,
+    frictionloss, zero or payload."""
+    mapping: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Mapping of the log, if it is of another recorder; default: one is proposed."""
+    rate_hz: float | None = None
+    """Samples per second, where the log has no time stamps [Hz]."""
+    velocity: bool = False
+    """Compare measured velocities, too."""
+    step_s: float = 0.0
+    """Time step of the simulation [s]; 0: the model's own, between 0.5 and 5 ms."""
+    fix_base: bool = False
+    """Hold a floating base where the model has it, as on a stand."""
+    contacts: bool = False
+    """Simulate contacts."""
+    as_told: bool = False
+    """Take the mapping as it is, even where the data contradicts it."""
+
+
+MODEL_IDENTIFY = IdentifyConfig(
+    initial_state="measured",
+    settle_s=0.0,
+    horizon_s=1.0,
+    generations=0,
+    refine=1,
+    jacobian="finite",
+    max_delay_s=0.05,
+)
+"""How a robot of a model is identified: rough values are known, so there is no search; short segments, whose starts are
+read off the log."""
+
+
+@dataclass(frozen=True)
+class ValidateConfig:
+    """Score what was identified on later logs."""
+
+    parameters: Annotated[Positional[Path | None], arg(metavar="PARAMETERS")] = None
+    """parameters.json, or the folder of an identification."""
+    log: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """Log that was not identified from, one flag a log."""
+    horizon_s: float = 0.0
+    """How far ahead is predicted [s]; 0: as far as the identification was judged."""
+    free_run_s: float = 10.0
+    """Longest simulation from a single initial state [s]."""
+    mapping: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Mapping of logs of another recorder; default: the pipeline's, or one is proposed."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+
+@dataclass(frozen=True)
+class NewConfig:
+    """Write the files of a pipeline for a robot that was recorded."""
+
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """Name of the pipeline."""
+    model: Annotated[Positional[Path | None], arg(metavar="ROBOT.xml")] = None
+    """Model of the robot: MJCF or URDF."""
+    log: Annotated[str | None, arg(metavar="FILE")] = None
+    """A log of it, which says what was commanded and measured, and how fast."""
+    drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
+    """What drives are told, where no log says so."""
+    robot: Annotated[RobotFlags, arg(name="")] = field(default_factory=RobotFlags)
+    folder: Path = Path("pipelines")
+    """Folder of pipelines."""
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
 from sim2real.artifacts import run_folder
 from sim2real.artifacts.timing import Timing
-from sim2real.log import importer
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.log import evidence, importer
+from sim2real.log.foreign import ForeignFile, joined, open_foreign
+from sim2real.log.mapping import ImportMapping, load_mapping, to_toml
+from sim2real.log.names import meaning
+from sim2real.log.proposal import pipeline_name, propose
+from sim2real.log.quantities import Asked
+from sim2real.robots.mjcf import joints_of, read_model
+from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.roles import ROLES
 from sim2real.stages import console, pipeline
 from sim2real.stages.config import ImportConfig
 
@@ -13,20 +28,146 @@ def run(config: ImportConfig) -> None:
     """Write a log for each file, into a run folder of its own or where the configuration says.
 
     Raises:
-        UsageError: When a file or the mapping cannot be read, or they do not fit each other.
+        UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
+            proposed and something is ambiguous.
     """
-    home = pipeline.load_pipeline(config.pipeline).package if config.pipeline and not config.mapping else None
-    files, mapping = config.sources, importer.load_mapping(config.mapping, config.pipeline, home)
+    files = [open_foreign(path, config.format) for path in config.sources]
+    files = [joined(files)] if config.together and len(files) > 1 else files
+    mapping = told_mapping(config)
+    text = "" if mapping else None
     for file in files:
-        episode = importer.import_file(file, mapping, config.selection, config.format)
-        facts, log = importer.facts(episode), config.out
+        if mapping is None:
+            mapping, text = proposed(file, asked(config))
+        episode = importer.import_opened(file, mapping, config.selection)
+        refuse_contradictions(file.path, episode, config.as_told)
+        facts, log, written = importer.facts(episode), config.out, None
         if log is None:
-            with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, mapping.inputs(file)) as stage:
+            inputs = mapping.inputs(file.path) | {f"source_{i}": p for i, p in enumerate(file.beside, 1)}
+            with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 importer.write_log(log := stage.output("log", "session.mcap"), episode, mapping)
+                if text:
+                    (written := stage.output("mapping", "import.toml")).write_text(text)
                 for name, path in Timing.of(episode).save(stage.folder).items():
                     stage.output(name, path)
                 stage.summary(facts)
         else:
             importer.write_log(log, episode, mapping)
+            if text:
+                (written := log.with_suffix(".import.toml")).write_text(text)
         print(console.pairs(facts))
         console.wrote(log)
+        if written is not None:
+            console.wrote(written)
+            console.note(f"the next file of this recorder: sim2real import FILE --mapping {console.shown(written)}")
+            text = ""
+
+
+def told_mapping(config: ImportConfig) -> ImportMapping | None:
+    """Return the mapping that is named, or that the pipeline has; None: one is to be proposed."""
+    if config.mapping is None and config.pipeline is None:
+        return None
+    home = pipeline.load_pipeline(config.pipeline) if config.pipeline and not config.mapping else None
+    if home is not None and not (home.folder / "import.toml").is_file() and described(home):
+        return None
+    return load_mapping(config.mapping, config.pipeline, home.package if home else None)
+
+
+def described(home: pipeline.Pipeline) -> bool:
+    """Return whether a pipeline's robot takes what a proposed mapping calls its fields."""
+    return isinstance(home.load(), MjcfRobot)
+
+
+def asked(config: ImportConfig) -> Asked:
+    """Return what the user says of files without a mapping."""
+    if config.mjcf is not None:
+        return asked_of_model(config.mjcf, config.pipeline or pipeline_name(config.mjcf), config.joints, config.rate_hz)
+    home = pipeline.load_pipeline(config.pipeline) if config.pipeline else None
+    if home is not None:
+        own: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - `described` said so
+        return asked_of_model(own.model, home.name, own.joints, config.rate_hz)
+    return Asked("robot", config.rate_hz, config.joints)
+
+
+def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> Asked:
+    """Return what a model says of files without a mapping.
+
+    Args:
+        mjcf: The model.
+        name: Name of the pipeline.
+        joints: The joints that were recorded; empty: all of the model's.
+        rate_hz: Samples per second, where a file has no stamps [Hz].
+
+    Raises:
+        UsageError: When the model has no such joint.
+    """
+    model = read_model(mjcf)
+    own = joints_of(model)
+    if unknown := [j for j in joints if j not in own]:
+        raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    ranges = np.array([model.joint(j).range for j in joints or own])
+    return Asked(name, rate_hz, joints or own, ranges)
+
+
+def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
+    """Return the mapping that a file's names and data speak for, and its text; the evidence is printed.
+
+    Raises:
+        UsageError: When something is ambiguous.
+    """
+    found = propose(file, told)
+    console.note(f"proposed from {file.path.name}, as nobody said what is what:")
+    for line in found.evidence:
+        console.note(f"  {line}")
+    names = f"Joints: {', '.join(found.joints)}"
+    return found.mapping, to_toml(
+        found.mapping, [f"Proposed by `sim2real import {file.path.name}`:", *found.evidence, names]
+    )
+
+
+def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:
+    """Refuse a mapping that the data contradicts.
+
+    Args:
+        path: The file.
+        episode: What was imported from it.
+        as_told: Only warn.
+
+    Raises:
+        UsageError: When joints follow other commands than their own, or move against them.
+    """
+    said = contradictions(episode)
+    if said and not as_told:
+        raise UsageError(
+            f"the mapping and the data of {path} contradict each other: {'; '.join(said)}",
+            hint="correct order, signs or units in the mapping; --as-told imports it all the same",
+        )
+    for line in said:
+        console.note(f"warning: {line}")
+
+
+def contradictions(episode: Episode) -> list[str]:
+    """Return what a log's data says against the goals and positions in it: sentences."""
+    sensor, actuator = ROLES.sensor, ROLES.actuator
+    if not {sensor, actuator} <= set(episode.outputs):
+        return []
+    commands, units = episode.outputs[actuator], episode.metadata["units"]
+    said: list[str] = []
+    for field, values in episode.outputs[sensor].items():
+        if meaning(field).quantity != "position" or not units.get(field):
+            continue
+        for goal, told in commands.items():
+            if (
+                units.get(goal) == units[field]
+                and told.shape[1:] == values.shape[1:]
+                and meaning(goal).side == "command"
+            ):
+                t = episode.steps[actuator].begun_s, episode.steps[sensor].begun_s
+                flat = told.reshape(len(told), -1), values.reshape(len(values), -1)
+                said += evidence.contradictions(t, *flat, acting=_acting(list(commands.items())))
+    return said
+
+
+def _acting(commands: Sequence[tuple[str, np.ndarray]]) -> np.ndarray | None:
+    """Return whether torque was on at each command; None where it is not known."""
+    found = [values for name, values in commands if meaning(name).quantity == "enabled"]
+    return (found[0].reshape(len(found[0]), -1) > 0).min(axis=1) if len(found) == 1 else None

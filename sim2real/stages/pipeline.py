@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 
 if TYPE_CHECKING:
+    from sim2real.log.mapping import ImportMapping
     from sim2real.robots.base import RecordedRobot
 
 ENTRY_POINT_GROUP = "sim2real.pipelines"
@@ -54,6 +56,24 @@ class Pipeline:
     def folder(self) -> Path:
         """The folder of the pipeline's files."""
         return Path(str(importlib.import_module(self.package).__file__)).parent
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """How a command names the robot."""
+        return (self.name,)
+
+    def mapping_of(self, path: Path) -> ImportMapping | None:
+        """Return the mapping with which a file of another recorder is read; None: it is a log, or there is none."""
+        from sim2real.log.mapping import load_mapping
+
+        if path.suffix == ".mcap" or not path.is_file():
+            return None
+        own = self.folder / "import.toml"
+        return load_mapping(own) if own.is_file() else None
+
+    def texts(self) -> Mapping[str, str]:
+        """Return files that an identification keeps beside its parameters: name -> text; none for a pipeline."""
+        return {}
 
     @overload
     def load(self) -> RecordedRobot: ...

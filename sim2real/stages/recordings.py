@@ -7,7 +7,7 @@ from pathlib import Path
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.identify.segments import require_moved
-from sim2real.log.importer import import_file, load_mapping
+from sim2real.log.importer import import_file
 from sim2real.log.schema import unit_of
 from sim2real.robots.base import RecordedRobot
 from sim2real.stages.console import note
@@ -27,8 +27,8 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
     Raises:
         Sim2RealError: When it is no log, of another pipeline, or of a dry run, in other units, or has holes.
     """
-    if path.suffix != ".mcap" and path.is_file() and (mapping := pipeline.folder / "import.toml").is_file():
-        recording = Recording(path, import_file(path, load_mapping(mapping)))
+    if (mapping := pipeline.mapping_of(path)) is not None:
+        recording = Recording(path, import_file(path, mapping))
         if robot is not None:
             require_units(recording, robot)
         return recording

@@ -1,0 +1,103 @@
+"""What the name of a signal in a file of another recorder says: who sent it, which quantity it is, of which joint."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+_SIDES = {
+    "command": (
+        "cmd command commanded commands goal goals target targets told des desired ref reference setpoint sp action "
+        "actions ctrl control controls u ff feedforward"
+    ),
+    "measured": "meas measured measurement state states actual present obs observation fb feedback sensor encoder",
+}
+_QUANTITIES = {
+    "stamp": "t time times stamp stamps timestamp timestamps sec secs",
+    "position": "q qs qpos pos position positions angle angles th theta",
+    "velocity": "dq qd qvel vel velocity velocities speed speeds omega thdot qdot rate_of_angle",
+    "torque": "tau torque torques effort efforts load loads current currents force forces",
+    "duty": "pwm duty",
+    "voltage": "volt volts voltage vin",
+    "kp": "kp stiffness",
+    "kd": "kd",
+    "enabled": "enable enabled",
+    "rate": "fps rate hz freq frequency",
+    "period": "dt period",
+}
+_UNITS = {
+    "rad": "rad rads radian radians",
+    "deg": "deg degs degree degrees",
+    "s": "s sec secs second seconds",
+    "ms": "ms msec millis milliseconds",
+    "us": "us usec micros microseconds",
+    "ns": "ns nsec nanos nanoseconds nanosec",
+    "raw": "raw counts ticks",
+}
+_SIDE = {word: side for side, words in _SIDES.items() for word in words.split()}
+_QUANTITY = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
+_UNIT = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+# What says nothing: parts of messages, and what lists of records are called.
+_FILLERS = {
+    "data",
+    "entries",
+    "msg",
+    "log",
+    "values",
+    "value",
+    "points",
+    "motor",
+    "motors",
+    "per",
+    "joint",
+    "joints",
+    "header",
+}
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a name says; empty where it says nothing.
+
+    Attributes:
+        side: ``command`` or ``measured``.
+        quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
+            ``enabled``, ``rate`` or ``period``.
+        unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns`` or ``raw``.
+        label: The rest: the joint.
+    """
+
+    side: str = ""
+    quantity: str = ""
+    unit: str = ""
+    label: str = ""
+
+
+def meaning(name: str) -> Meaning:
+    """Return what a name says, such as ``cmd_deg/FL_hip`` (a command in degrees, of joint ``fl_hip``)."""
+    words = [word.lower() for word in _WORDS.findall(name)]
+    side = quantity = unit = ""
+    rest = []
+    for place, word in enumerate(words):
+        # A letter is a unit only behind something, as in `t_s`; `s` alone is a name.
+        known_unit = _UNIT.get(word, "") if place else ""
+        if word in _SIDE:
+            side = side or _SIDE[word]
+        elif word in _QUANTITY and not (quantity == "stamp" and known_unit):
+            # `torque_enable` enables, `goal_time` is a time: what stands last counts.
+            quantity = _QUANTITY[word]
+        elif known_unit:
+            unit = known_unit
+        elif word not in _FILLERS:
+            rest.append(word)
+    # `dq_rad_s`: an angle over a time is a velocity, in the angle's unit.
+    if quantity == "velocity" and unit == "s":
+        unit = next((u for w in words if (u := _UNIT.get(w, "")) in ("rad", "deg")), "")
+    return Meaning(side, quantity, unit, "_".join(rest))
+
+
+def same_joint(label: str, joint: str) -> bool:
+    """Return whether a column's label names a joint of a model, as ``fl_hip`` names ``FL_hip_joint``."""
+    words = [w.lower() for w in _WORDS.findall(joint)]
+    return bool(label) and label in ("_".join(words), "_".join(w for w in words if w not in _FILLERS))

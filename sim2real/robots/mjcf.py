@@ -1,0 +1,125 @@
+"""A robot's MJCF or URDF, made ready for identification: its joints, and a drive on each that was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer.models.translate import mj
+from sim2real.errors import UsageError
+
+_NO_LIMIT = 1e6
+
+
+def read_spec(path: Path) -> Any:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file.
+
+    Raises:
+        UsageError: When the file is missing, or MuJoCo cannot read or compile it.
+    """
+    if not path.is_file():
+        raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
+    try:
+        spec = mj.MjSpec.from_file(str(path))
+        spec.copy().compile()
+    except (ValueError, RuntimeError, OSError) as error:
+        raise UsageError(
+            f"MuJoCo cannot read {path}: {str(error).strip().splitlines()[0]}",
+            hint="correct the file; meshes that it names must lie where it says, or be taken out",
+        ) from None
+    return spec
+
+
+def read_model(path: Path) -> Any:
+    """Return the compiled model of an MJCF or URDF file; see ``read_spec``."""
+    return read_spec(path).compile()
+
+
+def joints_of(model: Any) -> tuple[str, ...]:
+    """Return the names of a model's hinges and slides, in its order."""
+    kinds = {int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE)}
+    return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
+
+
+def driven(path: Path, joints: Sequence[str], step_s: float, fix_base: bool, contacts: bool) -> Any:
+    """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
+
+    First stand those of force, in the order of the joints, then those of stiffness, whose force is ``-ctrl * angle``,
+    then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the file's own actuators.
+    Joints that were not recorded are held where the model has them.
+
+    Args:
+        path: MJCF or URDF.
+        joints: The joints that were recorded.
+        step_s: Time step [s].
+        fix_base: Whether a floating base is held where the model has it.
+        contacts: Whether bodies touch.
+
+    Raises:
+        UsageError: When a joint is missing or is no hinge or slide, or the base floats.
+    """
+    spec = read_spec(path)
+    model = spec.copy().compile()
+    own = joints_of(model)
+    if unknown := [j for j in joints if j not in own]:
+        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    free = [j for j in spec.joints if j.type not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE)]
+    if free and not fix_base:
+        raise UsageError(
+            f"the base of {path} floats: joint {free[0].name or 'without a name'!r} was not recorded",
+            hint="--fix-base holds it where the model has it, as on a stand",
+        )
+    limits = {j: limit_of(model, j) for j in joints}
+    held = [j for j in spec.joints if j.name not in joints]  # a floating base's among them
+    for element in (*spec.sensors, *spec.actuators, *spec.keys, *held):
+        spec.delete(element)
+    for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
+        for joint in joints:
+            part: Any = spec.add_actuator(name=f"{joint}_{what}", target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+            part.gaintype = mj.mjtGain.mjGAIN_AFFINE
+            part.gainprm[:3] = gain
+    for joint in joints:
+        most = limits[joint] or _NO_LIMIT
+        spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
+    option = spec.option
+    option.timestep, option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0
+    if not contacts:
+        option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise UsageError(
+            f"{path} does not compile with joints held: {error}", hint="take what needs them out of the model"
+        ) from None
+
+
+def limit_of(model: Any, joint: str) -> float | None:
+    """Return the largest torque that the file's own actuator or joint allows [N m or N]; None: no limit."""
+    number = model.joint(joint).id
+    ranges = [model.actuator_forcerange[i] for i in _actuators(model, number) if model.actuator_forcelimited[i]]
+    # A motor's torque is its control, so a limit of that is one, too.
+    ranges += [
+        model.actuator_ctrlrange[i] * model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
+        for i in _actuators(model, number)
+        if model.actuator_ctrllimited[i] and model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_NONE)
+    ]
+    ranges += [model.jnt_actfrcrange[number]] if model.jnt_actfrclimited[number] else []
+    limits = [float(np.abs(r).max()) for r in ranges if np.abs(r).max() > 0]
+    return min(limits, default=None)
+
+
+def gains_of(model: Any, joint: str) -> tuple[float, float] | None:
+    """Return stiffness and damping of the file's own position or velocity servo; None: the joint has none."""
+    for i in _actuators(model, model.joint(joint).id):
+        if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_AFFINE):
+            return float(-model.actuator_biasprm[i, 1]), float(-model.actuator_biasprm[i, 2])
+    return None
+
+
+def _actuators(model: Any, joint: int) -> list[int]:
+    of_joint = model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)
+    return [int(i) for i in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == joint))]

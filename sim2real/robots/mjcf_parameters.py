@@ -1,0 +1,212 @@
+"""Parameters of a robot's model by pattern: for all joints, for a group, or for each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import Parameter, Transform
+from sim2real.robots.mjcf import gains_of, limit_of
+
+What = Literal[
+    "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload"
+]
+ALL = ".*"
+_WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
+         "armature": (30, 30), "frictionloss": (50, 20)}  # fmt: skip
+"""By which factors bounds lie below and above the nominal value."""
+_FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
+             "frictionloss": 0.1}  # fmt: skip
+"""Nominal values where the model has none."""
+_ABOUT = {
+    "kp": ("N m/rad", "stiffness of the drive"),
+    "kd": ("N m s/rad", "damping of the drive"),
+    "gain": ("N m", "torque for each unit of the command"),
+    "torque": ("N m", "largest torque of the drive"),
+    "speed": ("rad/s", "speed without load under the largest torque: the damping is that torque over it"),
+    "released": ("1", "share of the drive's damping with torque off"),
+    "damping": ("N m s/rad", "viscous friction"),
+    "armature": ("kg m^2", "rotor behind the gears"),
+    "frictionloss": ("N m", "dry friction"),
+    "zero": ("rad", "encoder at the model's zero"),
+    "payload": ("kg", "mass added at the body's centre of mass"),
+}
+_FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0)}
+_ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
+_ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
+
+
+@dataclass(frozen=True)
+class Term:
+    """One quantity of some joints, identified as one value or as one for each.
+
+    Attributes:
+        what: The quantity; of a body, where it is ``payload``.
+        joints: Regular expression that a whole name must match.
+        each: Whether each joint has a value of its own.
+        nominal: The value to start from; None: the model's own, or a usual one.
+        low: Lower bound; None: a factor below the nominal value.
+        high: Upper bound; None: a factor above.
+        name: Name of the parameter; default: the quantity, with the pattern's letters where it is for a group.
+        free: Whether it is identified; else it is held at ``nominal``.
+    """
+
+    what: What
+    joints: str = ALL
+    each: bool = False
+    nominal: float | None = None
+    low: float | None = None
+    high: float | None = None
+    name: str = ""
+    free: bool = True
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a model."""
+        if self.what not in _ABOUT:
+            raise UsageError(f"unknown parameter {self.what!r} of a joint. Available: {', '.join(_ABOUT)}")
+        try:
+            re.compile(self.joints)
+        except re.error as error:
+            raise UsageError(
+                f"{self.joints!r} is no pattern for joints: {error}", hint="such as .*_hip_joint"
+            ) from None
+
+    @staticmethod
+    def parse(text: str) -> Term:
+        """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, such as ``frictionloss:each`` or ``kp@.*_calf_joint``.
+
+        Raises:
+            UsageError: When it is none.
+        """
+        found = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
+        if not found:
+            raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
+        what: Any = found[1]
+        value = float(found[4]) if found[4] else None
+        return Term(what, found[3] or ALL, bool(found[2]), value, free=value is None)
+
+    def label(self) -> str:
+        """Return the name of a value that several joints share."""
+        return self.name or (self.what if self.joints == ALL else f"{self.what}_{_letters(self.joints)}")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A parameter, and where its value belongs.
+
+    Attributes:
+        parameter: The parameter.
+        what: The quantity.
+        at: Numbers of the joints in the robot's order; of ``payload``, of the model's bodies.
+    """
+
+    parameter: Parameter
+    what: str
+    at: tuple[int, ...]
+
+
+def expand(terms: Sequence[Term], joints: Sequence[str], model: Any, own: Any) -> list[Placed]:
+    """Return the parameters of a model.
+
+    Args:
+        terms: By pattern.
+        joints: The joints that were recorded.
+        model: The model with drives.
+        own: The model as it is in the file, for nominal values.
+
+    Raises:
+        UsageError: When a pattern matches nothing, or two parameters have one name.
+    """
+    found: list[Placed] = []
+    for term in terms:
+        names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
+        offset = 1 if term.what == "payload" else 0
+        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name)]
+        if not at:
+            raise UsageError(
+                f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",
+                hint="a pattern matches whole names: .*_hip_joint",
+            )
+        groups = (
+            [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at] if term.each else [(at, term.label())]
+        )
+        for group, name in groups:
+            nominal = _nominal(term, [names[i] for i in group], own)
+            p = _parameter(term, name, nominal)
+            found.append(Placed(p, term.what, tuple(i + offset for i in group)))
+    return found
+
+
+def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints: np.ndarray, dofs: np.ndarray) -> Any:
+    """Return the world's parameters with values in their places.
+
+    Args:
+        placed: What ``expand`` returned.
+        values: Parameters by name.
+        base: ``DriveParams`` with nominal values.
+        joints: Shape ``(joints,)``: their numbers in the model.
+        dofs: Shape ``(joints,)``: where the model's arrays have each joint.
+    """
+    drive: dict[str, Any] = {}
+    model: dict[str, Any] = {}
+    # A speed without load makes a damping of the torque limit, so that comes first.
+    for p in sorted(placed, key=lambda p: p.what == "speed"):
+        value, at = jnp.asarray(values[p.parameter.name], jnp.float32), np.array(p.at)
+        if p.what in _ON_DRIVE:
+            drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
+        elif p.what in ("torque", "speed"):
+            limits = model.get("jnt_actfrcrange", jnp.asarray(base.model.jnt_actfrcrange))
+            if p.what == "torque":
+                model["jnt_actfrcrange"] = limits.at[joints[at]].set(value * jnp.array([-1.0, 1.0]))
+            else:
+                damping = model.get("dof_damping", base.model.dof_damping)
+                model["dof_damping"] = damping.at[dofs[at]].set(limits[joints[at], 1] / value)
+        elif p.what == "payload":
+            model["body_mass"] = model.get("body_mass", base.model.body_mass).at[at].add(value)
+        else:
+            field = _ON_DOF[p.what]
+            model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
+    return base.replace(model=base.model.tree_replace(model), **drive)
+
+
+def _parameter(term: Term, name: str, nominal: float) -> Parameter:
+    unit, about = _ABOUT[term.what]
+    transform: Transform = "log"
+    kind: Any = "measurement" if term.what == "zero" else "dynamics"
+    if term.what in _FIXED:
+        _, low, high = _FIXED[term.what]
+        transform = "linear"
+    else:
+        below, above = _WIDE[term.what]
+        low, high = nominal / below, nominal * above
+    low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free)
+
+
+def _nominal(term: Term, names: Sequence[str], own: Any) -> float:
+    """Return the value that joints start from: the median of the model's own."""
+    if term.nominal is not None:
+        return term.nominal
+    if term.what in _FIXED:
+        return _FIXED[term.what][0]
+    values: list[float] = []
+    for name in names:
+        if term.what in _ON_DOF:
+            values.append(float(getattr(own, _ON_DOF[term.what])[own.joint(name).dofadr[0]]))
+        elif term.what in ("kp", "kd") and (gains := gains_of(own, name)):
+            values.append(gains[term.what == "kd"])
+        elif term.what == "torque" and (limit := limit_of(own, name)):
+            values.append(limit)
+    known = [v for v in values if v > 0]
+    return float(np.median(known)) if known else _FALLBACK[term.what]
+
+
+def _letters(pattern: str) -> str:
+    """Return the letters and digits of a name or a pattern, words apart."""
+    return re.sub(r"\W+", "_", pattern.replace(".*", "")).strip("_") or "all"

@@ -1,0 +1,283 @@
+"""A robot of which there is a model and a recording: no Python of its own."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.robots.mjcf import driven, joints_of, read_model, read_spec
+from sim2real.robots.mjcf_parameters import Placed, Term, expand, place
+from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
+from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
+from sim2real.worlds.recorded import RecordedActuator
+
+ROBOT_FILE = "robot.toml"
+COMMANDS = tuple(f.name for f in fields(DriveCommand))
+DRIVING = ("goal", "goal_velocity", "torque", "duty")
+"""Commands of which there must be one."""
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """What there is to know about a robot that was recorded.
+
+    Attributes:
+        model: MJCF or URDF.
+        joints: The joints that were recorded, in the order of the log.
+        commands: Fields of the log that drive: some of ``COMMANDS``.
+        shared: Those of them that are one number for all joints.
+        velocity: Whether velocities were measured, and count.
+        rate_hz: Samples per second of the log, at most [Hz].
+        step_s: Time step of the simulation [s].
+        sigma_rad: Deviation of a measured position [rad].
+        sigma_rad_s: Deviation of a measured velocity [rad/s].
+        kp_unit: What 1 stands for in the log's own stiffness.
+        kd_unit: What 1 stands for in the log's own damping.
+        fix_base: Whether a floating base is held.
+        contacts: Whether bodies touch.
+        terms: What is identified.
+    """
+
+    model: Path
+    joints: tuple[str, ...]
+    commands: tuple[str, ...]
+    shared: tuple[str, ...] = ()
+    velocity: bool = False
+    rate_hz: float = 200.0
+    step_s: float = 0.0025
+    sigma_rad: float = 0.002
+    sigma_rad_s: float = 0.1
+    kp_unit: float = 1.0
+    kd_unit: float = 1.0
+    fix_base: bool = False
+    contacts: bool = False
+    terms: tuple[Term, ...] = ()
+
+    def to_toml(self, model: str) -> str:
+        """Return the text of a ``robot.toml`` that names the model's file."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "terms"}
+        plain = {f.name: f.default for f in fields(self)}
+        lines = ["# A robot that was recorded: sim2real.robots.mjcf_robot.RobotConfig says what each key is."]
+        own["model"] = model
+        lines += [f"{k} = {json.dumps(v)}" for k, v in own.items() if v != plain[k]]
+        for term in self.terms:
+            usual = asdict(Term(term.what))
+            said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
+            lines += ["", "[[terms]]", *(f"{k} = {json.dumps(v)}" for k, v in said.items())]
+        return "\n".join(lines) + "\n"
+
+    @staticmethod
+    def load(path: Path) -> RobotConfig:
+        """Read a ``robot.toml``; its model lies where that says, seen from it.
+
+        Raises:
+            UsageError: When a key is unknown, missing or of the wrong kind.
+        """
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+            terms = tuple(Term(**row) for row in table.pop("terms", []))
+            rest: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+            found = RobotConfig(**rest, terms=terms)
+            return replace(found, model=path.parent / found.model)
+        except (tomllib.TOMLDecodeError, TypeError, OSError) as error:
+            known = ", ".join(f.name for f in fields(RobotConfig))
+            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {known}") from None
+
+
+@struct.dataclass
+class Measured(Base):
+    """What the encoders say, each of shape ``(joints,)`` [rad, rad/s]; no velocity where there is none."""
+
+    position: Any
+    velocity: Any = None
+
+
+class Encoders(BaseNode):
+    """Reads the joints of a ``DrivenWorld``.
+
+    Args:
+        name: Unique in the graph.
+        rate: Samples per second [Hz].
+        world: The world.
+        velocity: Whether velocities are measured.
+    """
+
+    def __init__(self, name: str, rate: float, world: DrivenWorld, velocity: bool) -> None:
+        super().__init__(name, rate)
+        self._world, self._velocity = world, velocity
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> EncoderParams:
+        """Return encoders that read 0 at the model's zero."""
+        del rng, graph_state
+        return EncoderParams(jnp.zeros(len(self._world.qpos_at)))
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measured:
+        """Return zeros."""
+        del rng, graph_state
+        still = jnp.zeros(len(self._world.qpos_at))
+        return Measured(still, still if self._velocity else None)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measured]:
+        """Read."""
+        seen = step_state.inputs[self._world.name][-1].data
+        speed = seen.qvel[self._world.qvel_at] if self._velocity else None
+        return step_state, Measured(seen.qpos[self._world.qpos_at] + step_state.params.zero, speed)
+
+
+@struct.dataclass
+class EncoderParams(Base):
+    """What the encoders read at the model's zero, ``(joints,)`` [rad]."""
+
+    zero: Any
+
+
+class MjcfRobot(LoggedRobot):
+    """A robot that is known from its model and from recordings.
+
+    Args:
+        config: What there is to know about it.
+
+    Raises:
+        UsageError: When the model does not fit.
+    """
+
+    delayed = "command to angle"
+    burst = 2
+
+    def __init__(self, config: RobotConfig) -> None:
+        if not set(config.commands) <= set(COMMANDS) or not set(config.commands) & set(DRIVING):
+            raise UsageError(
+                f"a log that drives a robot has one of {', '.join(DRIVING)}, got {', '.join(config.commands) or 'no'}",
+                hint=f"fields of the actuator may be {', '.join(COMMANDS)}",
+            )
+        self.config, self.tick_s = config, config.step_s
+        own = read_model(config.model)
+        self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts)
+        self.placed = tuple(expand(config.terms, config.joints, self.model, own))
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What was measured of each joint."""
+        c = self.config
+        velocity, goal = ("velocity" if c.velocity else None), ("goal" if "goal" in c.commands else None)
+        rows = enumerate(c.joints)
+        return tuple(Channel("position", velocity, c.sigma_rad, c.sigma_rad_s, i, joint, goal) for i, joint in rows)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Field -> unit."""
+        known = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
+        there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
+        return {field: unit for field, unit in known.items() if field in there}
+
+    def dynamics(self) -> list[Parameter]:
+        """Return what may be identified."""
+        return [p.parameter for p in self.placed]
+
+    def make_nodes(self) -> tuple[BaseNode, RecordedActuator, DrivenWorld]:
+        """Return sensor, actuator and world."""
+        config = self.config
+        still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
+        world = DrivenWorld("world", 1 / config.step_s, self.model, (config.kp_unit, config.kd_unit))
+        sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
+        return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
+
+    def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
+        """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
+        return IdentifiableMjcf(self, max_delay_s)
+
+    def base(self, params: DriveParams) -> DriveParams:
+        """Return the world's parameters before any is identified: the model's, and drives as the terms have them."""
+        n, driving = len(self.config.joints), set(self.config.commands)
+        zero, one = jnp.zeros(n), jnp.ones(n)
+        return params.replace(
+            kp=20.0 * one if "goal" in driving else zero,
+            kd=zero,
+            gain=one,
+            released=zero,
+            zero=zero,
+        )
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+        """Return the file's model with identified friction and inertia; drives are in ``parameters.json``."""
+        spec = read_spec(self.config.model)
+        fields_of = {"damping": "damping", "armature": "armature", "frictionloss": "frictionloss"}
+        for p in self.placed:
+            for i in p.at if p.what in fields_of else ():
+                joint, value = spec.joint(self.config.joints[i]), float(values[p.parameter.name])
+                vector = isinstance(getattr(joint, p.what), np.ndarray)
+                setattr(joint, p.what, [value, *joint.damping[1:]] if vector else value)
+        return spec.to_xml()
+
+
+class IdentifiableMjcf(IdentifiableRecording):
+    """Simulates what the encoders measured; an ``identify.model.IdentifiableModel``.
+
+    Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
+
+    Args:
+        robot: The robot.
+        max_delay_s: Upper bound of the delay [s].
+    """
+
+    def __init__(self, robot: MjcfRobot, max_delay_s: float) -> None:
+        super().__init__(robot, max_delay_s)
+        self.parameters = ParameterTable(p for p in self.parameters if p.name != "sensor_delay")
+        self.ahead_s = robot.tick_s
+        world = robot.make_nodes()[2]
+        self._placed: Sequence[Placed] = robot.placed
+        self._joints, self._dofs, self._qpos = world.joints, world.qvel_at, world.qpos_at
+        self._params = {**self._params, world.name: robot.base(self._params[world.name])}
+
+    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+        """Return node parameters.
+
+        Args:
+            values: Parameters by name.
+            start: Shape ``(2 * joints,)``: positions as measured, then velocities.
+        """
+        tree = self.parameters.placed(self._params, values)
+        world = place(self._placed, values, tree["world"], self._joints, self._dofs)
+        n = len(self._dofs)
+        qpos = world.qpos.at[self._qpos].set(start[:n] - world.zero)
+        qvel = world.qvel.at[self._dofs].set(start[n:])
+        return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero)}
+
+
+def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Term, ...]:
+    """Return what is identified unless somebody says otherwise.
+
+    Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
+    damping and the joint's can be told apart only where torque is switched off or the log has gains of its own: else
+    there is one.
+
+    Args:
+        commands: Fields of the log that drive.
+        physical: Whether the log's own gains are in N m/rad and N m s/rad: then factors of them are identified.
+    """
+    if "goal" in commands:
+        factor: dict[str, Any] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
+        first: tuple[Term, ...] = (Term("kp", **factor), *([Term("kd", **factor)] if physical else []))
+        first += (Term("kd"),) if "enabled" in commands and not physical else ()
+    else:
+        first = (Term("kd"),) if "goal_velocity" in commands else (Term("gain"),)
+    rest = () if "goal_velocity" in commands and "goal" not in commands else (Term("damping"),)
+    return (*first, *rest, Term("armature"), Term("frictionloss", each=True))
+
+
+def all_joints(model: Path) -> tuple[str, ...]:
+    """Return the joints of a model file."""
+    return joints_of(read_model(model))

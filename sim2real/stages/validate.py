@@ -1,0 +1,174 @@
+"""Score what was identified on later logs: held-out figures, in the terms of the verdict."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.manifest import plain
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.identify import prediction
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span, check_log
+from sim2real.identify.verdict import Score, scores
+from sim2real.log.mapping import load_mapping
+from sim2real.robots.mjcf_robot import ROBOT_FILE
+from sim2real.stages import described, identified
+from sim2real.stages.config import IdentifyConfig, ValidateConfig
+from sim2real.stages.console import note, progress, shown, table
+from sim2real.stages.cutting import reach
+from sim2real.stages.pipeline import Pipeline, load_pipeline
+from sim2real.stages.recordings import open_recording
+
+_PARAMETERS = "parameters.json"
+_KEPT = 1.25
+"""Up to this many times the error that the identification promised, the promise is kept."""
+_FREE = "free run"
+
+
+def run(config: ValidateConfig) -> bool:
+    """Score and print.
+
+    Args:
+        config: What to score.
+
+    Returns:
+        Whether every position is predicted better than by every baseline.
+
+    Raises:
+        UsageError: When there are no parameters, no log, or a log was identified from.
+    """
+    if config.parameters is None or not config.log:
+        raise UsageError(
+            "validate needs parameters and a log", hint="sim2real validate RUN/identify/parameters.json --log new.mcap"
+        )
+    found = Identification.load(config.parameters)
+    pipeline = pipeline_of(config.parameters, found, config)
+    logs = [open_recording(Path(path), pipeline) for path in config.log]
+    result = score(found, pipeline, [log.episode for log in logs], config)
+    result = {"parameters": shown(config.parameters), "logs": list(config.log), **result}
+    print(json.dumps(plain(result), indent=1)) if config.json else show(result)
+    return bool(result["better"])
+
+
+def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pipeline:
+    """Return the robot that parameters are of: described beside them, or a pipeline.
+
+    Args:
+        path: The parameters.
+        found: What they say.
+        config: May name a mapping.
+    """
+    beside = (path if path.is_dir() else path.parent) / ROBOT_FILE
+    if not beside.is_file():
+        return load_pipeline(found.pipeline)
+    own = described.from_file(beside, found.pipeline)
+    return own.reading(config.log, load_mapping(config.mapping, own.name) if config.mapping else None)
+
+
+def score(
+    found: Identification, pipeline: Pipeline, episodes: Sequence[Episode], config: ValidateConfig
+) -> dict[str, Any]:
+    """Return errors on logs that nothing was fitted to, as JSON takes them.
+
+    Args:
+        found: What was identified.
+        pipeline: The robot.
+        episodes: The logs.
+        config: How far ahead.
+
+    Raises:
+        UsageError: When each recording has parameters of its own: of a new one they are not known.
+    """
+    robot = pipeline.load()
+    fitting = replace(pipeline.identify, settle_s=found.settle_s)
+    model = robot.identifiable(fitting.max_delay_s)
+    if own := [p.name for p in model.parameters if p.free and p.per_recording]:
+        raise UsageError(f"{', '.join(own)} differ from recording to recording: of a new log they are not known")
+    for episode in episodes:
+        check_log(episode, model)
+    known = {p.name: p.estimate for p in found.parameters}
+    if lacking := [p.name for p in model.parameters if p.name not in known]:
+        raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
+    values = {p.name: known[p.name] for p in model.parameters}
+    models = {"identified": values, "nominal": {p.name: p.nominal for p in model.parameters}}
+    promised = {row.column: row for row in found.held_out}
+    horizon_s = config.horizon_s or next((row.horizon_s for row in found.held_out), fitting.horizon_s)
+    shortest_s = min(end - begin for begin, end in (reach(e, fitting) for e in episodes))
+    rows = {}
+    with progress(None, "validate: simulate"):
+        windows = _problem(model, episodes, fitting, min(horizon_s, shortest_s - fitting.settle_s))
+        columns = prediction.samples(windows, models, fitting.settle_s)
+        errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
+        judged = scores(errors, identified.positions(windows, robot.units))
+        whole = _problem(model, episodes, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
+        columns = prediction.samples(whole, models, fitting.settle_s)
+        free = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
+    for s in judged:
+        told = promised.get(s.position.column)
+        at = [r.rmse or np.inf for r in free if r.field == s.position.column and r.model == "identified"]
+        rows[s.position.name] = _row(s, None if told is None else told.rmse.get("identified"), float(np.mean(at)))
+    kept = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
+    return {
+        "pipeline": pipeline.name,
+        "horizon_s": horizon_s,
+        "positions": rows,
+        "better": not any(s.beaten_by for s in judged),
+        "promise_kept": all(k <= _KEPT for k in kept) if kept else None,
+        "rmse": float(np.sqrt(np.mean([s.own**2 for s in judged]))),
+        "free_run_rmse": float(np.sqrt(np.mean([r[_FREE] ** 2 for r in rows.values()]))),
+    }
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print a score, for people."""
+    models = list(dict.fromkeys(m for row in result["positions"].values() for m in row["rmse"]))
+    cells = [
+        [name, *(row["rmse"].get(m) for m in models), row["promised"], row[_FREE], row["unit"]]
+        for name, row in result["positions"].items()
+    ]
+    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "promised", _FREE, "unit"]))
+    print(
+        f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
+        f"{result['free_run_rmse']:.4g} in free runs"
+    )
+    if not result["better"]:
+        beaten = {n: row["beaten_by"] for n, row in result["positions"].items() if row["beaten_by"]}
+        listed = "; ".join(f"{n} by {', '.join(by)}" for n, by in list(beaten.items())[:3])
+        note(f"verdict: no improvement on this log: beaten are {listed}")
+    elif result["promise_kept"] is False:
+        note(f"verdict: better than the baselines, but more than {_KEPT:g} times as far off as was promised")
+    else:
+        note("verdict: holds on this log")
+
+
+def _row(s: Score, promised: float | None, free_run: float) -> dict[str, Any]:
+    return {
+        "unit": s.position.unit,
+        "rmse": {"identified": s.own, **s.others},
+        "beaten_by": s.beaten_by,
+        "promised": promised,
+        "over_promised": s.own / promised if promised else None,
+        _FREE: free_run,
+    }
+
+
+def _problem(
+    model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, horizon_s: float, once: bool = False
+) -> Problem:
+    """Return logs in segments of which none is fitted; ``once``: one segment a log."""
+    length_s = config.settle_s + horizon_s
+    spans = []
+    for r, episode in enumerate(episodes):
+        begin, end = reach(episode, config)
+        begins = np.arange(begin, end - length_s + 1e-6, length_s)
+        spans += [Span(r, float(b), False) for b in (begins[:1] if once else begins)]
+    return Problem(model, list(episodes), spans, length_s, config)

@@ -1,0 +1,114 @@
+"""A MuJoCo model whose joints have drives: what a recorder's commands do to them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.worlds.mjx import MjxParams, MjxWorld
+from sim2real.worlds.recorded import command_delay
+
+
+@struct.dataclass
+class DriveCommand(Base):
+    """What the drives are told; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
+
+    Attributes:
+        goal: Where to be, by the encoder [rad].
+        goal_velocity: How fast to turn [rad/s].
+        torque: Feed-forward, or all that there is [N m].
+        duty: Share of the voltage, or the voltage, or what else is proportional to it.
+        kp: Stiffness, in the log's unit.
+        kd: Damping, in the log's unit.
+        enabled: 1 with torque on, 0 with torque off.
+    """
+
+    goal: Any = None
+    goal_velocity: Any = None
+    torque: Any = None
+    duty: Any = None
+    kp: Any = None
+    kd: Any = None
+    enabled: Any = None
+
+
+@struct.dataclass
+class DriveParams(MjxParams):
+    """Parameters of drives, each of shape ``(joints,)``, beside those of the model.
+
+    The force is ``kp * (goal - angle) + kd * (goal_velocity - velocity) + gain * (torque or duty)``, within the limits
+    that the model has for its joints (``jnt_actfrcrange``).
+
+    Attributes:
+        kp: Stiffness [N m/rad], times the log's own where it has one.
+        kd: Damping of the drive [N m s/rad], times the log's own where it has one.
+        gain: Torque for each unit of torque or duty.
+        released: Share of the drive's damping that is left with torque off: windings that are short-circuited.
+        zero: What the encoders read at the model's zero [rad].
+    """
+
+    kp: Any = 0.0
+    kd: Any = 0.0
+    gain: Any = 1.0
+    released: Any = 0.0
+    zero: Any = 0.0
+
+
+class DrivenWorld(MjxWorld):
+    """A model with a drive on each joint that was recorded.
+
+    A drive is three actuators, as ``sim2real.robots.mjcf.driven`` makes them: a force, a stiffness and a damping, which
+    are its controls. So gains may differ from tick to tick, act at every time step, and damping implicitly.
+
+    Args:
+        name: Unique in the graph.
+        rate: Ticks per second [Hz].
+        model: The model.
+        units: What 1 stands for in the log's own gains ``kp`` and ``kd``, where it has them.
+        **options: Options of ``MjxWorld``.
+    """
+
+    def __init__(
+        self, name: str, rate: float, model: Any, units: tuple[float, float] = (1.0, 1.0), **options: Any
+    ) -> None:
+        super().__init__(name, rate, model, **options)
+        self.units = units
+        self.joints = np.array(model.actuator_trnid[: model.nu // 3, 0])
+        self.qpos_at, self.qvel_at = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
+        self.lead_s = 0.5 * float(model.opt.timestep)
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DriveParams:
+        """Return the model at its reference, with drives that do nothing."""
+        own = super().init_params(rng, graph_state)
+        return DriveParams(own.model, own.qpos, own.qvel)
+
+    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+        """Return the delay of the commands, where the actuator's parameters set one.
+
+        MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: that is added.
+        """
+        del rng
+        return {name: delay + self.lead_s for name, delay in command_delay(graph_state, self.input_name).items()}
+
+    def _control(self, step_state: StepState) -> Any:
+        """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command."""
+        p: DriveParams = step_state.params
+        told: DriveCommand = step_state.inputs[self.input_name][-1].data
+        still = jnp.zeros(len(self.joints))
+        on = still + 1.0 if told.enabled is None else jnp.asarray(told.enabled) + still
+        kp = still if told.goal is None else on * p.kp * _of_log(told.kp, self.units[0])
+        kd = p.kd * _of_log(told.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
+        force = still if told.goal is None else kp * (told.goal - p.zero)
+        force += still if told.goal_velocity is None else on * kd * told.goal_velocity
+        for pushed in (told.torque, told.duty):
+            force += still if pushed is None else on * p.gain * pushed
+        return jnp.concatenate([force, kp, kd])
+
+
+def _of_log(gain: Any, unit: float) -> Any:
+    """Return the log's own gain in its unit; 1 where it has none."""
+    return 1.0 if gain is None else gain / unit

@@ -1,0 +1,240 @@
+"""Robots of a model and a recording: drives, parameters by pattern, the description as a file."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.robots.mjcf import driven, gains_of, joints_of, limit_of, read_model
+from sim2real.robots.mjcf_parameters import Term, expand, place
+from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
+from sim2real.worlds.driven import DriveCommand
+
+XML = """<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper"><joint name="left_hip" axis="0 1 0" damping="0.1" armature="0.01" frictionloss="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.4" contype="0" conaffinity="0"/>
+      <body name="lower" pos="0 0 -0.2"><joint name="left_knee" axis="0 1 0" damping="0.2" armature="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.2" contype="0" conaffinity="0"/></body></body>
+    <body name="other" pos="0 1 0"><joint name="right_hip" axis="0 1 0"/>
+      <geom type="sphere" size="0.05" mass="0.3" contype="0" conaffinity="0"/></body>
+    {free}
+  </worldbody>
+  <actuator>
+    <position joint="left_hip" kp="12" kv="0.7" forcerange="-3 3"/>
+    <position joint="left_knee" kp="8" forcerange="-2 2"/>
+  </actuator>
+</mujoco>"""
+FREE = '<body name="base" pos="0 0 1"><freejoint name="root"/><geom size="0.1" mass="1"/></body>'
+URDF = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
+JOINTS = ("left_knee", "left_hip")
+
+
+@pytest.fixture
+def model_file(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(XML.format(free=""))
+    return path
+
+
+def config(path, **options):
+    return RobotConfig(**{"model": path, "joints": JOINTS, "commands": ("goal",), "step_s": 0.002, **options})
+
+
+def test_what_a_file_says_of_its_joints(model_file):
+    own = read_model(model_file)
+    assert joints_of(own) == ("left_hip", "left_knee", "right_hip")
+    assert (limit_of(own, "left_hip"), limit_of(own, "right_hip")) == (3.0, None)
+    assert gains_of(own, "left_hip") == (12.0, 0.7)
+    assert gains_of(own, "right_hip") is None
+
+
+@pytest.mark.parametrize(("kv", "goal", "most"), [(0.7, (0.1, -0.15), 2.9), (0.0, (0.5, -1.4), np.inf)])
+def test_drives_push_as_mujocos_own_position_servos(model_file, kv, goal, most):
+    """Three actuators a joint, whose controls are force, stiffness and damping, are one servo with these gains.
+
+    Also where torque is limited, but for the damping of a drive at its limit, which C MuJoCo then takes as explicit.
+    """
+    model_file.write_text(model_file.read_text().replace('kv="0.7"', f'kv="{kv}"'))
+    own = mujoco.MjModel.from_xml_path(str(model_file))
+    made = driven(model_file, JOINTS, 0.002, False, False)
+    assert [made.joint(i).name for i in range(made.njnt)] == ["left_hip", "left_knee"]  # the other one is held
+    told, kp, kd = np.array(goal), np.array([8.0, 12.0]), np.array([0.0, kv])
+    a, b = mujoco.MjData(own), mujoco.MjData(made)
+    pushed = []
+    for _ in range(400):
+        a.ctrl[:] = told[::-1]
+        b.ctrl[:] = np.concatenate([kp * told, kp, kd])
+        mujoco.mj_step(own, a)
+        mujoco.mj_step(made, b)
+        np.testing.assert_allclose(b.qpos, a.qpos[:2], atol=1e-9)
+        pushed.append(np.abs(a.actuator_force).max())
+    assert max(pushed) < most
+    assert most < np.inf or max(pushed) == 3.0
+    assert np.abs(a.qpos[:2]).max() > 0.05
+
+
+def control(robot, values=None, **told):
+    """Return forces, stiffnesses and dampings for a command."""
+    model = robot.identifiable(0.02)
+    world = robot.make_nodes()[2]
+    values = {p.name: p.nominal for p in model.parameters} | (values or {})
+    params = model.params(values, jnp.zeros(4))["world"]
+    newest = SimpleNamespace(data=DriveCommand(**{k: jnp.asarray(v) for k, v in told.items()}))
+    state: Any = SimpleNamespace(params=params, inputs={"actuator": [newest]})
+    return np.asarray(world._control(state)).reshape(3, 2)
+
+
+KP = Term("kp", nominal=10.0)
+
+
+def test_positions_are_pulled_to_goals_by_the_encoder(model_file):
+    robot = MjcfRobot(config(model_file, terms=(KP, Term("zero", each=True))))
+    force, kp, kd = control(robot, {"zero_left_knee": 0.1}, goal=[0.5, 0.2])
+    np.testing.assert_allclose(force, [4.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(kp, 10.0)
+    assert not kd.any()
+
+
+def test_torque_that_is_off_leaves_what_short_circuited_windings_brake(model_file):
+    terms = (KP, Term("kd", nominal=0.4), Term("released", nominal=0.25))
+    robot = MjcfRobot(config(model_file, commands=("goal", "enabled"), terms=terms))
+    force, kp, kd = control(robot, goal=[0.5, 0.2], enabled=[0.0])
+    assert not force.any()
+    assert not kp.any()
+    np.testing.assert_allclose(kd, 0.1, rtol=1e-6)
+
+
+def test_mit_mode_takes_everything_from_the_log(model_file):
+    commands = ("goal", "goal_velocity", "torque", "kp", "kd")
+    robot = MjcfRobot(config(model_file, commands=commands, terms=(Term("kp", nominal=1.0), Term("kd", nominal=1.0))))
+    told = {"goal": [0.1, 0.2], "goal_velocity": [1.0, 2.0], "torque": [0.5, 0.0], "kp": [20.0, 10.0], "kd": [1.0, 2.0]}
+    force, kp, kd = control(robot, **told)
+    np.testing.assert_allclose(force, [20 * 0.1 + 1.0 * 1.0 + 0.5, 10 * 0.2 + 2.0 * 2.0], rtol=1e-6)
+    np.testing.assert_allclose((kp, kd), ([20, 10], [1, 2]))
+
+
+def test_a_firmwares_gain_counts_in_its_own_unit(model_file):
+    robot = MjcfRobot(config(model_file, commands=("goal", "kp"), kp_unit=200.0, terms=(KP,)))
+    np.testing.assert_allclose(control(robot, goal=[0.1, 0.1], kp=[400.0])[1], 20.0)
+
+
+@pytest.mark.parametrize(("commands", "told", "pushed"), [(("torque",), {"torque": [0.3, 0.1]}, [0.6, 0.2]),
+                                                          (("duty",), {"duty": [0.5, 1.0]}, [1.0, 2.0])])  # fmt: skip
+def test_torques_and_duties_push_in_proportion(model_file, commands, told, pushed):
+    robot = MjcfRobot(config(model_file, commands=commands, terms=(Term("gain", nominal=2.0),)))
+    force, kp, _ = control(robot, **told)
+    np.testing.assert_allclose(force, pushed, rtol=1e-6)
+    assert not kp.any()
+
+
+def test_parameters_by_pattern_stand_where_they_belong(model_file):
+    terms = (
+        Term("damping"), Term("armature", ".*_hip"), Term("frictionloss", each=True), Term("torque", "left_knee"),
+        Term("speed", ".*_hip"), Term("payload", "lower"),
+    )  # fmt: skip
+    robot = MjcfRobot(config(model_file, terms=terms))
+    names = [p.name for p in robot.dynamics()]
+    assert names == ["damping", "armature_hip", "frictionloss_left_knee", "frictionloss_left_hip",
+                     "torque_left_knee", "speed_hip", "payload_lower"]  # fmt: skip
+    values = dict(zip(names, (0.3, 0.05, 0.11, 0.22, 1.5, 6.0, 0.7), strict=True))
+    model = robot.identifiable(0.02)
+    world = model.params({**values, "delay": 0.0}, jnp.zeros(4))["world"].model
+    # In the model's order: hip, knee.
+    np.testing.assert_allclose(world.dof_damping, [3.0 / 6.0, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(world.dof_armature, [0.05, 0.02], rtol=1e-6)
+    np.testing.assert_allclose(world.dof_frictionloss, [0.22, 0.11], rtol=1e-6)
+    np.testing.assert_allclose(world.jnt_actfrcrange, [[-3, 3], [-1.5, 1.5]])
+    body = robot.model.body("lower").id
+    np.testing.assert_allclose(world.body_mass[body], robot.model.body_mass[body] + 0.7, rtol=1e-6)
+
+
+def test_nominal_values_are_the_models_own(model_file):
+    own, made = read_model(model_file), driven(model_file, JOINTS, 0.002, False, False)
+    placed = expand([Term("kp", each=True), Term("damping"), Term("kd", "left_knee")], JOINTS, made, own)
+    assert [p.parameter.nominal for p in placed] == pytest.approx([8.0, 12.0, 0.15, 0.5])
+
+
+def test_the_start_is_where_the_encoders_say(model_file):
+    robot = MjcfRobot(config(model_file, terms=(Term("zero", nominal=0.1, free=False),)))
+    params = robot.identifiable(0.02).params({"zero": 0.1, "delay": 0.0}, jnp.array([0.5, -0.3, 1.0, 2.0]))
+    np.testing.assert_allclose(params["world"].qpos, [-0.4, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(params["world"].qvel, [2.0, 1.0])
+    np.testing.assert_allclose(params["sensor"].zero, 0.1)
+
+
+def test_a_description_survives_its_file(tmp_path, model_file):
+    wanted = config(model_file, velocity=True, rate_hz=123.0, terms=(*usual_terms(("goal", "enabled")),
+                    Term("frictionloss", "left_.*", True, 0.1, 0.01, 1.0, "dry", False)))  # fmt: skip
+    (tmp_path / "robot.toml").write_text(wanted.to_toml("robot.xml"))
+    assert RobotConfig.load(tmp_path / "robot.toml") == wanted
+
+
+def test_identified_friction_leaves_as_mjcf(model_file):
+    robot = MjcfRobot(config(model_file, terms=(Term("damping"), Term("armature", each=True))))
+    text = robot.identified_mjcf({"damping": 0.33, "armature_left_hip": 0.07, "armature_left_knee": 0.08})
+    model = mujoco.MjModel.from_xml_string(text)
+    np.testing.assert_allclose(model.dof_damping, [0.33, 0.33, 0.0])
+    np.testing.assert_allclose(model.dof_armature, [0.07, 0.08, 0.0])
+
+
+def test_urdf_is_read(tmp_path):
+    (tmp_path / "robot.urdf").write_text(URDF)
+    own = read_model(tmp_path / "robot.urdf")
+    assert joints_of(own) == ("j",)
+    assert limit_of(own, "j") == 5.0
+
+
+def test_a_floating_base_is_held_only_where_that_is_said(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(XML.format(free=FREE))
+    with pytest.raises(UsageError, match="--fix-base"):
+        driven(path, JOINTS, 0.002, False, False)
+    assert driven(path, JOINTS, 0.002, True, False).nv == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"joints": ("left_toe",)}, "left_toe"),
+        ({"commands": ("kp",)}, "goal, goal_velocity, torque, duty"),
+        ({"terms": (Term("kp", "right_.*"),)}, "matches none"),
+    ],
+)
+def test_what_does_not_fit_is_named(model_file, change, named):
+    with pytest.raises(UsageError, match=named):
+        MjcfRobot(config(model_file, **change))
+
+
+@pytest.mark.parametrize(
+    ("text", "term"),
+    [
+        ("kp", Term("kp")),
+        ("frictionloss:each", Term("frictionloss", each=True)),
+        ("kp@.*_hip", Term("kp", ".*_hip")),
+        ("armature:each@left_.*=0.01", Term("armature", "left_.*", True, 0.01, free=False)),
+    ],
+)
+def test_terms_as_flags(text, term):
+    assert Term.parse(text) == term
+
+
+@pytest.mark.parametrize("text", ["kq", "kp@(", "kp every"])
+def test_wrong_terms_are_refused(text):
+    with pytest.raises(UsageError):
+        Term.parse(text)
+
+
+def test_placing_nothing_changes_nothing(model_file):
+    robot = MjcfRobot(config(model_file))
+    world = robot.make_nodes()[2]
+    base = robot.base(world.init_params())
+    assert place((), {}, base, world.joints, world.qvel_at).model.dof_damping is base.model.dof_damping

@@ -1,0 +1,143 @@
+"""Robots that are described on the command line: by a model and a log, and as a pipeline that is written for them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real import cli
+from sim2real.errors import UsageError
+from sim2real.log import read_log
+from sim2real.robots.mjcf_parameters import Term
+from sim2real.robots.mjcf_robot import RobotConfig
+from sim2real.stages import described
+from sim2real.stages.config import RobotFlags
+from sim2real.stages.pipeline import load_pipeline
+
+XML = """<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="upper"><joint name="pan_joint" axis="0 1 0" range="-60 60"/><geom size="0.05" mass="0.3"/>
+      <body name="lower" pos="0 0 -0.2"><joint name="lift_joint" axis="0 1 0"/><geom size="0.05" mass="0.2"/></body>
+    </body>
+  </worldbody>
+</mujoco>"""
+RATE_HZ = 100.0
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    t = np.arange(1000) / RATE_HZ
+    goal = np.stack([0.4 * np.sin(3.1 * t), 0.3 * np.sin(5.7 * t + 1.0)], axis=1)
+    q = np.stack([0.4 * np.sin(3.1 * (t - 0.04)), 0.3 * np.sin(5.7 * (t - 0.04) + 1.0)], axis=1)
+    return t, goal, q
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch, recorded):
+    """A working directory with a model and a log."""
+    monkeypatch.chdir(tmp_path)
+    t, goal, q = recorded
+    Path("robot.xml").write_text(XML)
+    np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal)
+    return tmp_path
+
+
+def test_a_model_and_a_log_describe_a_robot(workplace):
+    found = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
+    assert found.name == "robot"
+    own = found.description
+    assert (own.joints, own.commands, own.step_s) == (("pan_joint", "lift_joint"), ("goal",), 0.002)
+    assert own.rate_hz == pytest.approx(RATE_HZ, rel=1e-3)
+    names = [p.name for p in found.load().dynamics()]
+    assert names == ["kp", "damping", "armature", "frictionloss_pan_joint", "frictionloss_lift_joint"]
+    assert found.words == ("--mjcf", "robot.xml")
+
+
+def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
+    t, goal, q = recorded
+    np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal, kp=np.float64(32.0), torque_enable=np.ones(len(t)))
+    own = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description
+    assert (set(own.commands), set(own.shared)) == ({"goal", "kp", "enabled"}, {"kp", "enabled"})
+    assert own.kp_unit == 32.0
+    assert Term("kd") in own.terms
+
+
+def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
+    assert cli.main(["import", "run.npz", "--mjcf", "robot.xml", "--out", "run.mcap"]) == 0
+    out, err = capsys.readouterr()
+    assert "'q_rad' follows 'goal_rad'" in err
+    assert "wrote run.import.toml" in out
+    assert read_log("run.mcap").metadata["pipeline"] == "robot"
+    found = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
+    assert found.mapping is None
+    assert found.description.commands == ("goal",)
+    assert cli.main(["import", "run.npz", "--mapping", "run.import.toml", "--out", "again.mcap"]) == 0
+
+
+@pytest.mark.parametrize("flags", [(), ("--joints", "lift_joint", "pan_joint")])
+def test_new_writes_a_pipeline_that_loads(workplace, flags):
+    assert cli.main(["new", "rig", "robot.xml", "--log", "run.npz", *flags]) == 0
+    assert {p.name for p in Path("pipelines/rig").iterdir()} == {
+        "__init__.py", "robot.py", "robot.toml", "robot.xml", "import.toml"
+    }  # fmt: skip
+    pipeline = load_pipeline("rig")
+    robot = pipeline.load()
+    assert [c.label for c in robot.channels] == (list(flags[1:]) or ["pan_joint", "lift_joint"])
+    assert pipeline.identify.initial_state == "measured"
+    assert pipeline.mapping_of(Path("run.npz")) is not None
+
+
+def test_new_without_a_log_goes_by_its_flags(workplace, capsys):
+    arguments = ["new", "rig", "robot.xml", "--drive", "mit", "--parameter", "damping:each", "--joints", "pan_joint"]
+    assert cli.main(arguments) == 0
+    own = RobotConfig.load(Path("pipelines/rig/robot.toml"))
+    assert own.commands == ("goal", "goal_velocity", "torque", "kp", "kd")
+    assert own.terms == (Term("damping", each=True),)
+    assert cli.main(arguments) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
+    Path("meshes").mkdir()
+    asset = '<asset><mesh name="m" file="meshes/m.obj"/></asset><worldbody>'
+    Path("robot.xml").write_text(XML.replace("<worldbody>", asset))
+    Path("meshes/m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    texts = described.files_of(RobotConfig(Path("robot.xml"), ("pan_joint",), ("goal",)))
+    assert list(texts) == ["robot.toml"]
+    assert str(workplace / "robot.xml") in texts["robot.toml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["identify", "--mjcf", "robot.xml"], "--log"),
+        (["identify", "--mjcf", "none.xml", "--log", "run.npz"], "none.xml"),
+        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--joints", "toe"], "toe"),
+        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--joints", "pan_joint"], "not the robot's 1 joints"),
+        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--parameter", "kq"], "unknown parameter 'kq'"),
+        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--velocity"], "no velocity"),
+        (["new", "Rig", "robot.xml"], "small letters"),
+        (["new", "rig"], "no model"),
+        (["validate"], "validate needs parameters"),
+    ],
+)
+def test_wrong_commands_are_refused_before_anything_is_compiled(workplace, capsys, arguments, named):
+    assert cli.main(arguments) == 2
+    assert named in capsys.readouterr().err
+    assert not Path("runs").exists()
+
+
+def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recorded):
+    assert cli.main(["import", "run.npz", "--mjcf", "robot.xml", "--out", "run.mcap"]) == 0
+    text = Path("run.import.toml").read_text()
+    swapped = text.replace('source = "goal_rad"', 'source = ["goal_rad[:,1]", "goal_rad[:,0]"]')
+    assert swapped != text
+    Path("wrong.toml").write_text(swapped)
+    capsys.readouterr()
+    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap"]) == 2
+    assert "joint 0 follows the command of joint 1" in capsys.readouterr().err
+    assert not Path("wrong.mcap").exists()
+    assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
+    with pytest.raises(UsageError, match="contradict"):
+        described.from_flags(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
