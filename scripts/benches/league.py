@@ -116,7 +116,7 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
     if name == "go2":
         rig = league_mujoco.legs(fold.fitted[0])
         return _mujoco(entrant, rig, fold.fitted, budget_s, seed)
-    rig = league_mujoco.one_joint("xl330" if name == "sts3250" else name)
+    rig = league_mujoco.one_joint(name)
     return _joint_by_joint(fold, lambda rs, s: _mujoco(entrant, rig, rs, s, seed), budget_s)
 
 

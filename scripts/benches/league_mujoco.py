@@ -28,7 +28,10 @@ from benches.sysid import Recording
 Row = tuple[float, float, float, rigs.Put]
 ITERATIONS = 40
 GO2_KP, GO2_KD = 20.0, 0.5
-_ARMATURE = {"disk": (1e-4, 1e-6, 1e-3), "xl330": (0.003, 0.0002, 0.03), "so101": (0.01, 1e-3, 0.1)}
+_SERVO = (0.003, 0.0002, 0.03)
+_ARMATURE = {"disk": (1e-4, 1e-6, 1e-3), "xl330": _SERVO, "sts3250": (0.01, 0.0002, 0.1), "so101": (0.01, 1e-3, 0.1)}
+_TORQUE = {"xl330": (0.5, 0.1, 2.0), "sts3250": (4.0, 0.5, 15.0)}
+"""Around what the makers say of the torque at standstill [N m]."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,8 @@ class _Residual:
             models_sequences=[run.sequences(f"run{i}") for i, run in enumerate(runs)],
             modify_residual=transform.apply, resample_true=False,
         )  # fmt: skip
-        self.deadline, self.evaluations, self.lowest, self.best = deadline, 0, np.inf, None
+        self.deadline, self.evaluations, self.lowest = deadline, 0, np.inf
+        self.best = self.losses = np.zeros(0)
 
     def __call__(self, x: np.ndarray, parameters: sysid.ParameterDict, **options: Any) -> Any:
         if self.evaluations and time.process_time() > self.deadline:
@@ -70,7 +74,8 @@ class _Residual:
         found = self._function(x, parameters, **options)
         columns = x.reshape(len(x), -1)
         self.evaluations += columns.shape[1]
-        losses = sum(np.sum(np.nan_to_num(r, nan=1e3).reshape(-1, columns.shape[1]) ** 2, axis=0) for r in found[0])
+        stacked = np.nan_to_num(np.concatenate(found[0]), nan=1e3).reshape(-1, columns.shape[1])
+        losses = np.sum(stacked**2, axis=0)
         if np.min(losses) < self.lowest:
             self.lowest, self.best = float(np.min(losses)), columns[:, int(np.argmin(losses))].copy()
         self.losses = losses
@@ -187,7 +192,7 @@ def _feed_back(spec: mujoco.MjSpec, joint: int, value: float) -> None:
 
 
 def one_joint(kind: str) -> Rig:
-    """Return a rig of one hinge: ``disk``, ``xl330`` (any servo that lifts a mass) or ``so101`` (one of its joints)."""
+    """Return a rig of one hinge: the disk, a servo that lifts a mass, or ``so101``, one joint of the arm."""
     armature = {"armature": (*_ARMATURE[kind], rigs._armature)}
     if kind == "disk":
         spec = rigs._spec(rigs.PHYSICS_S["disk"], 0.1, 0.041, 1e-4)
@@ -197,9 +202,9 @@ def one_joint(kind: str) -> Rig:
         known = {"gain": drive["gain"]}  # its load is known
         runs = lambda r: [rigs._Run(r, spec)]  # noqa: E731
         return Rig(runs, {**drive, **joint}, bias, {**known, **joint, **armature}, None)
-    if kind == "xl330":
+    if kind in _TORQUE:
         joint = {"damping": (0.01, 0.0, 0.5, rigs._damping), "frictionloss": (0.03, 0.0, 0.3, rigs._friction)}
-        drive = {"torque": (0.5, 0.1, 20.0, rigs._torque)}
+        drive = {"torque": (*_TORQUE[kind], rigs._torque)}
         more = {"back_emf": (0.03, 0.0, 1.0, rigs._back_emf)}
         plain = {**drive, **joint, **armature}
         return Rig(_servo_runs, plain, more, plain, _feed_back)

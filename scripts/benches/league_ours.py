@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Callable[[Sequenc
     Returns:
         What predicts the fold's test recordings, and what was done in words.
     """
-    case = identify.make_case(SimpleNamespace(case=name, **dict.fromkeys(identify.BUDGET)))
+    case = identify.make_case(argparse.Namespace(case=name, **dict.fromkeys(identify.BUDGET)))
     case = replace(case, config=replace(case.config, seed=seed))
     fit_spec, test_spec = fold.spec or ("", "")
     specs = [fit_spec]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import cmaes, league_bam, league_sets  # noqa: E402
-from benches.sysid import Recording  # noqa: E402
+from benches import cmaes, league_bam, league_sets
+from benches.sysid import Recording
 
 
 def test_cma_es_finds_a_bent_valley_in_a_box():
