@@ -163,7 +163,9 @@ def rows(measured: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             own = [r for r in measured if r["set"] == name and r["entrant"] == entrant]
             values, unit = [r["value"] for r in own if r["value"] is not None], SETS[name].unit
             lost = f", {len(own) - len(values)} without a figure" if len(values) < len(own) else ""
-            about = f"{len(own)} folds, {own[0]['budget_s']:g} s a fit{lost}" if values else own[0]["told"]
+            took = [r["seconds"] for r in own if r["seconds"] is not None]
+            spent = f"{len(own)} folds, {np.median(took):.0f} s of processor time a fit{lost}" if took else ""
+            about = spent if values else own[0]["told"]
             for what, of in (("mean", np.mean), ("worst", np.max)):
                 value = float(f"{of(values):.4g}") if values else None
                 table.append(figures.row(f"league/{name}/{entrant}/{what}", value, unit, about))

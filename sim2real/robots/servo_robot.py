@@ -226,7 +226,8 @@ class ServoRobot(LoopRobot):
         """What C MuJoCo adds to the actuator's delay [s].
 
         Half a step for the leapfrog, as in the graph, and half a step as MuJoCo's setpoints are those of a step's end.
-        Less a quarter of a tick: the graph has goals act as their mean over a tick, so a profile starts at its begin.
+        Less a quarter of a tick: the graph has goals act as their mean over a tick, so a profile starts early, with the
+        tick. By how much depends on when in the tick a goal comes; docs/guides/export.md has what is left of it.
         """
         return 2 * self.lead_s - 0.25 * self.tick_s
 
