@@ -186,9 +186,9 @@ def _bias(rig: Rig, joint: int) -> rigs.Put:
 
 
 def _feed_back(spec: mujoco.MjSpec, joint: int, value: float) -> None:
-    """Have a position drive see the encoder's bias; its gain is set before."""
+    """Have a position drive see the encoder's bias, set and not added: the toolbox keeps one spec. Its gain comes first."""
     drive = spec.actuators[joint]
-    drive.biasprm[0] += drive.biasprm[1] * value
+    drive.biasprm[0] = drive.biasprm[1] * value
 
 
 def one_joint(kind: str) -> Rig:

@@ -81,6 +81,19 @@ def test_blocks_are_held_out_with_states_from_the_past_alone():
     np.testing.assert_allclose(same.start, test.start)
 
 
+def test_what_pace_predicts_does_not_depend_on_what_it_tried_before():
+    """The toolbox sets parameters in one and the same model."""
+    pytest.importorskip("mujoco.sysid")
+    from benches import league_mujoco
+
+    t = 0.01 * np.arange(60)
+    known = {"duty_per_rad": 1.0, "mass": 0.49, "length": 0.1, "torque_enable": np.ones(60, bool)}
+    own = Recording(t, 0.5 * np.sin(5 * t)[:, None], 0.4 * np.sin(5 * t)[:, None], np.zeros((1, 2)), known)
+    predict, _ = league_mujoco.fit_pace(league_mujoco.one_joint("xl330"), [own], 0.1, 0)
+    first, second = predict([own])[0], predict([own])[0]
+    np.testing.assert_array_equal(first, second)
+
+
 def test_scores():
     own = Recording(np.arange(3.0), np.array([[0, 0], [1, 0], [0, 0.0]]), np.zeros((3, 2)), np.zeros((2, 2)))
     predicted = np.array([[0.003, 9.0], [0.0, 9.0], [0.003, 9.0]])
