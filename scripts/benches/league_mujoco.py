@@ -186,7 +186,7 @@ def _bias(rig: Rig, joint: int) -> rigs.Put:
 
 
 def _feed_back(spec: mujoco.MjSpec, joint: int, value: float) -> None:
-    """Have a position drive see the encoder's bias, set and not added: the toolbox keeps one spec. Its gain comes first."""
+    """Have a position drive, whose gain is set, see the encoder's bias; not added, as the toolbox keeps one spec."""
     drive = spec.actuators[joint]
     drive.biasprm[0] = drive.biasprm[1] * value
 
