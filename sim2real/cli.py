@@ -47,6 +47,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   validate  score what was identified on a later log
   import    turn files of other recorders into logs, and say what is what in them
   new       write the files of a pipeline for a robot of which there is a model
+  export    write what was identified for MuJoCo, mjlab, Isaac Lab, or as JSON
   log       recover what is readable of a damaged log into a new one
 
 examples
@@ -260,18 +261,44 @@ def _log(command: str, arguments: list[str]) -> None:
     """``sim2real log recover FILE [--out FILE]``."""
     from sim2real.stages import config, flags
 
-    action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if action in ("-h", "--help"):
-        action, rest = "recover", ["--help"]
-    if action != "recover":
-        said = f"there is no `{command} {action}`" if action else f"{command} needs to be told what to do"
-        raise UsageError(f"{said}. Available: recover", hint=f"sim2real {command} recover FILE")
-    own, prog = config.RecoverConfig(), f"sim2real {command} recover"
+    prog, rest = _action(command, "recover", arguments, "FILE")
+    own = config.RecoverConfig()
     epilog = _epilog(f"{prog} session.mcap", f"{prog} session.mcap --out saved.mcap")
     asked = flags.parse(own, rest, prog, _summary(own), epilog)
     from sim2real.stages import recovering  # imports JAX
 
     recovering.run(asked)
+
+
+def _export(command: str, arguments: list[str]) -> None:
+    """``sim2real export identified RUN|PIPELINE|FILE --to FORMAT``."""
+    from sim2real.stages import config, flags
+
+    prog, rest = _action(command, "identified", arguments, "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json")
+    own = config.ExportConfig()
+    epilog = _epilog(f"{prog} {DEMO_PIPELINE} --to json", f"{prog} runs/arm/TIME --to mjcf --out arm.xml")
+    asked = flags.parse(own, rest, prog, _summary(own), epilog)
+    from sim2real.stages import exporting  # imports JAX
+
+    exporting.run(asked)
+
+
+def _action(command: str, only: str, arguments: list[str], usage: str) -> tuple[str, list[str]]:
+    """Return the command with the one thing that it can do, and the arguments behind that.
+
+    Args:
+        command: The command.
+        only: What it can do.
+        arguments: What the user typed behind the command.
+        usage: What comes behind, for the hint.
+    """
+    action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
+    if action in ("-h", "--help"):
+        action, rest = only, ["--help"]
+    if action != only:
+        said = f"there is no `{command} {action}`" if action else f"{command} needs to be told what to do"
+        raise UsageError(f"{said}. Available: {only}", hint=f"sim2real {command} {only} {usage}")
+    return f"sim2real {command} {only}", rest
 
 
 def _check(command: str, arguments: list[str]) -> None:
@@ -308,6 +335,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "report": _view,
     "info": _info,
     "import": _files,
+    "export": _export,
     "check": _check,
     "validate": _files,
     "new": _files,

@@ -55,6 +55,16 @@ BENCHES = {
             *("scripts/benches/recordings.py", "scripts/benches/sysid.py", "scripts/benches/sysid_rows.py"),
         ),
     ),
+    "league": Bench(
+        "league",
+        "every recording, held out in parts, against mujoco.sysid, PACE and BAM",
+        (
+            *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
+            *("sim2real/artifacts", "sim2real/log", "pipelines/disk", "pipelines/xl330", "pipelines/so101"),
+            *(f"scripts/benches/league_{part}.py" for part in ("bam", "mujoco", "ours", "sets")),
+            *(f"scripts/benches/{part}.py" for part in ("cmaes", "identify", "recordings", "sysid", "sysid_rows")),
+        ),
+    ),
     "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),

@@ -63,10 +63,15 @@ class RecordedRobot(ABC):
     Attributes:
         units: Field of a message -> its unit.
         roles: Which node does what.
+        profile_rad_s: How fast the actuators' setpoints move to their goals [rad/s]; infinite: at once.
+        export_lead_s: What a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s], to do
+            what the identified graph does.
     """
 
     units: Mapping[str, str]
     roles: Roles = ROLES
+    profile_rad_s: float = math.inf
+    export_lead_s: float = 0.0
 
     _DATA: ClassVar[Mapping[str, Datum]] = {
         "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),

@@ -203,6 +203,21 @@ class ServoRobot(LoopRobot):
         """Half a step of the physics, which the world adds to the actuator's delay [s]."""
         return 0.5 * float(self.task.physics_timestep)
 
+    @property
+    def profile_rad_s(self) -> float:
+        """How fast setpoints move to goals."""
+        return self.servos.sheet.profile_rad_s
+
+    @property
+    def export_lead_s(self) -> float:
+        """What C MuJoCo adds to the actuator's delay [s].
+
+        Half a step for the leapfrog, as in the graph, and half a step as MuJoCo's setpoints are those of a step's end.
+        Less a quarter of a tick: the graph has goals act as their mean over a tick, so a profile starts early, with the
+        tick. By how much depends on when in the tick a goal comes; docs/guides/export.md has what is left of it.
+        """
+        return 2 * self.lead_s - 0.25 * self.tick_s
+
     def make_world(self, resumed: bool = False) -> ServoWorld:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
         return ServoWorld(self.roles.world, self.task, self.fields(self.task), resumed, self.roles.actuator)

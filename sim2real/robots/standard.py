@@ -86,9 +86,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
         for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad))
     )
-    # MuJoCo's implicit integration of damping acts like an additional inertia of half a step times the damping, which
-    # is subtracted here. At 2.5 ms it is 6 % of the rotors' inertia of pipelines/arm.
-    armature = jnp.maximum(inertia - 0.5 * step_s * damping, 0.0)
+    armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
         "bias": jnp.zeros((n, 10)).at[:, 1].set(-gain * gear**2),
@@ -103,7 +101,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
 def identified_mjcf(
     mjcf: str, robot: ServoDriven, values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | str]
 ) -> str:
-    """Return a model's MJCF with given parameters, for use in other tools.
+    """Return a model's MJCF with given parameters, for use in other tools at its own time step.
 
     Args:
         mjcf: The composed model.
@@ -121,9 +119,19 @@ def identified_mjcf(
         gain, damping, armature, friction, full = (float(n) for n in numbers)
         joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
         joint.damping = [damping * gear**2, *joint.damping[1:]]
-        joint.armature, joint.frictionloss = armature * gear**2, friction * gear
+        joint.armature = max(_beside_damping(armature, damping, spec.option.timestep), 0.0) * gear**2
+        joint.frictionloss = friction * gear
         stiffness, most = gain * gear**2, gain * full * gear
         motor.gainprm, motor.biasprm = [stiffness, *motor.gainprm[1:]], [0.0, -stiffness, *motor.biasprm[2:]]
         motor.forcerange = [-most, most]
     spec.compile()
     return spec.to_xml()
+
+
+def _beside_damping(armature: Any, damping: Any, step_s: float) -> Any:
+    """Return the inertia that is left to set; what the integrator adds is none of the rotor's.
+
+    MuJoCo's implicit integration of damping acts like an additional inertia of half a step times the damping. At 2.5 ms
+    that is 6 % of the rotors' inertia of pipelines/arm.
+    """
+    return armature - 0.5 * step_s * damping

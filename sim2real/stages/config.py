@@ -343,6 +343,20 @@ class RecoverConfig:
 
 
 @dataclass(frozen=True)
+class ExportConfig:
+    """Write what was identified in the terms of another simulator."""
+
+    source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|FILE")] = None
+    """A run folder, a pipeline, whose newest identification is taken, or a parameters.json."""
+    to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf"
+    """What to write: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The file to write; default: one in the working directory that is called after the pipeline."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+
+@dataclass(frozen=True)
 class CheckConfig:
     """Judge what a recording, or a planned one, can tell about the parameters, before anything is searched."""
 

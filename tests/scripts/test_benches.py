@@ -132,6 +132,43 @@ def test_identify(run, disk):
     assert report["values"][0]["delay"] >= 0
 
 
+@pytest.fixture(scope="module")
+def servo(tmp_path_factory):
+    """Recordings in the form of the STS3250's: a lag and a dead time behind the goal, three motions."""
+    folder = tmp_path_factory.mktemp("league") / "bam_sts3250"
+    folder.mkdir()
+    t = 0.02 * np.arange(150)
+    for i, name in enumerate(("sin_sin", "up_and_down", "lift_and_drop")):
+        goal, q = 0.5 * np.sin((2 + i) * t), np.zeros(150)
+        for k in range(1, 150):
+            q[k] = q[k - 1] + 0.3 * (goal[k - 1] - q[k - 1])
+        rows = zip(t, goal, q, strict=True)
+        entries = [{"timestamp": a, "goal_position": b, "position": c, "torque_enable": True} for a, b, c in rows]
+        about = {"kp": 32, "vin": 12.0, "mass": 1.0, "length": 0.1, "trajectory": name, "entries": entries}
+        (folder / f"{name}.json").write_text(json.dumps(about))
+    return folder.parent
+
+
+def test_league(run, servo, tmp_path):
+    pytest.importorskip("mujoco.sysid")
+    kept = tmp_path / "kept.jsonl"
+    flags = ("--data", servo, "--sets", "sts3250", "--results", kept, "--entrants")
+    report = run("league", *flags, "sysid_delay", "pace", "bam_m1", "ours")
+    rows = {r["name"].removeprefix("league/sts3250/"): r for r in report["rows"]}
+    assert all(
+        0 < rows[f"{e}/{w}"]["value"] < 1e3 for e in ("sysid_delay", "pace", "bam_m1") for w in ("mean", "worst")
+    )
+    assert rows["ours/mean"]["value"] is None
+    assert "not there yet" in rows["ours/mean"]["yardstick"]
+    before = kept.read_text()
+    assert len(before.splitlines()) == 4
+    again = run("league", *flags, "pace", "bam_m1")
+    assert kept.read_text() == before, "nothing that was measured is measured again"
+    assert {f["value"] for f in again["folds"]} == {
+        f["value"] for f in report["folds"] if f["entrant"] in ("pace", "bam_m1")
+    }
+
+
 @pytest.mark.parametrize(
     ("data", "flags", "words"),
     [

@@ -1,0 +1,188 @@
+"""The league: every recording there is, with parts of it held out in turn, against the tools that others use.
+
+    python scripts/bench.py league --data DIR --json reports/league.json
+    python scripts/bench.py league --data DIR --sets xl330 --entrants bam_m1 bam_m6 --budget-s 20 --results league.jsonl
+
+Each entrant fits the same parts of the same recordings within the same processor time, seconds times processors,
+compiling included, and is judged on the part that was held out; ours takes what its pipeline's configuration takes,
+which is reported. Of every set the mean over its folds is given, and the worst.
+What was measured goes into --results at once, a line a fold and entrant: a run that was cut goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benches import figures, league_bam, league_mujoco, league_ours
+from benches.league_sets import SETS, Fold, LeagueSet
+from benches.sysid import Recording
+
+Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
+Fitted = tuple[Predict, str]
+ENTRANTS = {
+    "ours": "sim2real identify, as the pipeline is set up",
+    "sysid": "mujoco.sysid as its user would: gain, damping, dry friction, inertia; no delay",
+    "sysid_delay": "mujoco.sysid with a delay and our terms",
+    "pace": "PACE's form: inertia, damping, friction, bias of each joint, a delay in steps; CMA-ES",
+    "bam_m1": "BAM M1: Coulomb and viscous friction; CMA-ES",
+    "bam_m6": "BAM M6: Stribeck, load, direction, quadratic; CMA-ES",
+}
+QUICK: dict[str, Any] = {"budget_s": 0.2, "folds": 1, "samples": 120, "entrants": [e for e in ENTRANTS if e != "ours"]}
+
+
+class NotThereYet(Exception):  # noqa: N818
+    """An entrant cannot take part, for a reason."""
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--data", type=Path, required=True, help="folder of all recordings")
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument("--entrants", nargs="+", choices=list(ENTRANTS), default=list(ENTRANTS))
+    parser.add_argument("--budget-s", type=float, default=60.0, help="processor time of a fit, over all threads")
+    parser.add_argument("--folds", type=int, help="at most so many folds of a set; default: all")
+    parser.add_argument("--samples", type=int, help="at most so many samples of a recording; default: all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, help="JSON lines to go on from, and to add to")
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Fit, predict, and return the rows and every fold's figures."""
+    known = _known(options)
+    for name in options.sets:
+        own = SETS[name]
+        if not (options.data / own.folder).is_dir():
+            print(f"{options.data / own.folder} is not there: {name} is left out", file=sys.stderr)
+            continue
+        for fold in own.folds(options.data)[: options.folds]:
+            for entrant in options.entrants:
+                key = (name, fold.name, entrant, options.budget_s, options.seed)
+                if key not in known:
+                    known[key] = {**dict(zip(_KEY, key, strict=True)), **judge(own, fold, entrant, options)}
+                    _add(options.results, known[key])
+    measured = [r for r in known.values() if r["set"] in options.sets and r["entrant"] in options.entrants]
+    return {"rows": rows(measured), "folds": measured}
+
+
+_KEY = ("set", "fold", "entrant", "budget_s", "seed")
+
+
+def judge(own: LeagueSet, fold: Fold, entrant: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Return one entrant's figure on one fold, or why there is none."""
+    short = replace(fold, fitted=_short(fold.fitted, options.samples), test=_short(fold.test, options.samples))
+    begin = time.process_time()
+    try:
+        predict, told = fit(own.name, short, entrant, options)
+        seconds = time.process_time() - begin
+        each = [own.score(p, r) for p, r in zip(predict(short.test), short.test, strict=True)]
+    except NotThereYet as reason:
+        return {"value": None, "seconds": None, "told": str(reason)}
+    value = float(np.mean(each))
+    return {"value": value if np.isfinite(value) else None, "seconds": seconds, "told": told}
+
+
+def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fitted:
+    """Fit one entrant, and return what predicts, and what was done.
+
+    Raises:
+        NotThereYet: When it has no form for such a rig.
+    """
+    budget_s, seed = options.budget_s, options.seed
+    if entrant == "ours":
+        if name not in league_ours.SETS or fold.spec is None:
+            raise NotThereYet(
+                "not there yet: no pipeline; a robot from its MJCF, or another maker's servo, is on its way"
+            )
+        return league_ours.fit(name, fold, options.data, seed)
+    if entrant.startswith("bam"):
+        if name == "go2":
+            raise NotThereYet(
+                "BAM's form is a bench with one joint and a known load; of a leg the load is not one number"
+            )
+        kind = entrant.removeprefix("bam_").upper()
+        load = league_bam.DISK_LOAD if name == "disk" else league_bam.ARM_LOAD if name == "so101" else {}
+        loaded = replace(fold, fitted=tuple(_loaded(r, load) for r in fold.fitted))
+        predict, told = _joint_by_joint(loaded, lambda rs, s: league_bam.fit(kind, rs, s, seed), budget_s)
+        return lambda own: predict([_loaded(r, load) for r in own]), told
+    if name == "go2":
+        rig = league_mujoco.legs(fold.fitted[0])
+        return _mujoco(entrant, rig, fold.fitted, budget_s, seed)
+    rig = league_mujoco.one_joint(name)
+    return _joint_by_joint(fold, lambda rs, s: _mujoco(entrant, rig, rs, s, seed), budget_s)
+
+
+def _mujoco(entrant: str, rig: Any, fitted: Sequence[Recording], budget_s: float, seed: int) -> Fitted:
+    if entrant == "pace":
+        return league_mujoco.fit_pace(rig, fitted, budget_s, seed)
+    return league_mujoco.fit_sysid(rig, fitted, entrant == "sysid_delay", budget_s, seed)
+
+
+def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitted], budget_s: float) -> Fitted:
+    """Fit every joint by itself, each in its share of the seconds: on those recordings in which it is moved."""
+    joints = fold.fitted[0].position.shape[1]
+    found: list[Fitted] = []
+    for j in range(joints):
+        moved = [r.joint(j) for r in fold.fitted if joints == 1 or np.ptp(r.command[:, j]) > 0.02]
+        found.append(single(moved or [fold.fitted[0].joint(j)], budget_s / joints))
+
+    def predict(own: Sequence[Recording]) -> list[np.ndarray]:
+        columns = [p([r.joint(j) for r in own]) for j, (p, _) in enumerate(found)]
+        return [np.hstack(joint_columns) for joint_columns in zip(*columns, strict=True)]
+
+    return predict, "; ".join(dict.fromkeys(told for _, told in found))
+
+
+def _loaded(own: Recording, load: dict[str, Any]) -> Recording:
+    return replace(own, constants={**load, **own.constants})
+
+
+def _short(own: tuple[Recording, ...], samples: int | None) -> tuple[Recording, ...]:
+    return tuple(_first(r, samples) for r in own) if samples else own
+
+
+def _first(own: Recording, samples: int) -> Recording:
+    cut = own.part(0, samples)
+    constants = {n: v[:samples] if isinstance(v, np.ndarray) else v for n, v in own.constants.items()}
+    return replace(cut, constants=constants)
+
+
+def rows(measured: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return mean and worst over the folds of each set and entrant; without a figure, the reason."""
+    table = []
+    for name in dict.fromkeys(r["set"] for r in measured):
+        for entrant in dict.fromkeys(r["entrant"] for r in measured if r["set"] == name):
+            own = [r for r in measured if r["set"] == name and r["entrant"] == entrant]
+            values, unit = [r["value"] for r in own if r["value"] is not None], SETS[name].unit
+            lost = f", {len(own) - len(values)} without a figure" if len(values) < len(own) else ""
+            took = [r["seconds"] for r in own if r["seconds"] is not None]
+            spent = f"{len(own)} folds, {np.median(took):.0f} s of processor time a fit{lost}" if took else ""
+            about = spent if values else own[0]["told"]
+            for what, of in (("mean", np.mean), ("worst", np.max)):
+                value = float(f"{of(values):.4g}") if values else None
+                table.append(figures.row(f"league/{name}/{entrant}/{what}", value, unit, about))
+    return table
+
+
+def _known(options: argparse.Namespace) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Return what an earlier run has measured."""
+    if options.results is None or not options.results.is_file():
+        return {}
+    lines = [json.loads(line) for line in options.results.read_text().splitlines() if line.strip()]
+    return {tuple(r[k] for k in _KEY): r for r in lines}
+
+
+def _add(results: Path | None, measured: dict[str, Any]) -> None:
+    value = "no figure" if measured["value"] is None else f"{measured['value']:.4g}"
+    print(f"{measured['set']}, {measured['fold']}: {measured['entrant']} {value} ({measured['told']})", file=sys.stderr)
+    if results is not None:
+        with results.open("a") as file:
+            file.write(json.dumps(measured) + "\n")

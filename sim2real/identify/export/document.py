@@ -1,0 +1,38 @@
+"""The JSON document: everything that is known, for programs; docs/guides/export.md describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sim2real.artifacts.identification import Identification
+from sim2real.identify.export.terms import Delays, Terms
+
+FORMAT = 1
+_COLUMNS = (
+    *("name", "unit", "kind", "about", "estimate", "standard_error"),
+    *("low95", "high95", "lower", "upper", "verdict"),
+)
+
+
+def json_document(
+    found: Identification, terms: Terms | None, delays: Delays, about: Sequence[tuple[str, str]]
+) -> dict[str, Any]:
+    """Return the document.
+
+    Args:
+        found: What was identified.
+        terms: The robot in MuJoCo's terms; None where no MuJoCo model has it.
+        delays: Its delays.
+        about: Names and texts to keep with it.
+    """
+    mujoco = ("timestep_s", "joints", "bodies", "unexpressed")
+    return {
+        "format": FORMAT,
+        "about": dict(about),
+        "verdict": {"status": found.verdict.status, "reasons": found.verdict.reasons},
+        "parameters": [{n: getattr(p, n) for n in _COLUMNS} for p in found.parameters],
+        "posterior": found.posterior,
+        "delays_s": delays,
+        "mujoco": {n: getattr(terms, n) for n in mujoco} if terms else None,
+    }

@@ -1,0 +1,94 @@
+"""MJCF that C MuJoCo takes as it is: delays and profiles in MuJoCo's own terms, intervals as numerics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+
+from sim2real.errors import UsageError
+from sim2real.identify.export.terms import Term, Terms
+
+_mj: Any = mujoco
+_LINEAR = 1
+"""Interpolation in a history: of held commands it gives their mean over a step, as in the identified graph."""
+
+
+@dataclass(frozen=True)
+class Late:
+    """What of a robot's timing the model's text does not hold.
+
+    Attributes:
+        lead_s: What is added to the delay of commands [s], for the integrator's sake.
+        profile_rad_s: How fast setpoints move to goals; infinite: at once.
+    """
+
+    lead_s: float = 0.0
+    profile_rad_s: float = math.inf
+
+
+def late_mjcf(text: str, terms: Terms, late: Late, about: Sequence[tuple[str, str]]) -> str:
+    """Return a model with delays, profiles, sensors of its joints, and its intervals.
+
+    Args:
+        text: The model with what was identified.
+        terms: Its terms.
+        late: Its timing.
+        about: Names and texts to keep with it.
+    """
+    spec = _mj.MjSpec.from_string(text)
+    step_s, delays = spec.option.timestep, terms.delays
+    for actuator in spec.actuators:
+        if math.isfinite(late.profile_rad_s):
+            _follow(actuator, late.profile_rad_s)
+        if delays.command is not None:
+            _delay(actuator, delays.command.estimate + late.lead_s, step_s)
+    behind_s = delays.measurement.estimate if delays.measurement else 0.0
+    kinds = {"position": (_mj.mjtSensor.mjSENS_JOINTPOS, 0.0), "velocity": (_mj.mjtSensor.mjSENS_JOINTVEL, step_s / 2)}
+    for joint in terms.joints:
+        for kind, (type_, early_s) in kinds.items():
+            sensor = spec.add_sensor(
+                name=f"sim2real/{kind}/{joint}", type=type_, objtype=_mj.mjtObj.mjOBJ_JOINT, objname=joint
+            )
+            # A leapfrog's velocities are those of half a step before.
+            _delay(sensor, behind_s - early_s, step_s)
+    _keep(spec, terms, about)
+    spec.compile()
+    return spec.to_xml()
+
+
+def _follow(actuator: Any, profile_rad_s: float) -> None:
+    """Let an actuator's setpoint follow its goal with limited speed."""
+    stiffness, damping, limited = -actuator.biasprm[1], -actuator.biasprm[2], actuator.forcelimited
+    if stiffness <= 0:
+        raise UsageError(f"actuator {actuator.name!r} is told no position: it has no profile to move along")
+    most = list(actuator.forcerange)
+    told = int(_mj.mjtCtrlInput.mjINPUT_POS)
+    actuator.set_to_pid(kp=stiffness, kv=max(damping, 0.0), slewmax=profile_rad_s, ctrlspec=told)
+    actuator.forcerange, actuator.forcelimited = most, limited
+
+
+def _delay(element: Any, delay_s: float, step_s: float) -> None:
+    """Let an actuator or a sensor be late, where that is more than nothing."""
+    if delay_s > 0.0:
+        element.delay, element.nsample, element.interp = delay_s, math.ceil(delay_s / step_s) + 2, _LINEAR
+
+
+def _keep(spec: Any, terms: Terms, about: Sequence[tuple[str, str]]) -> None:
+    """Write the intervals, three numbers each: the estimate and both ends, and what else is known about the file."""
+
+    def number(name: str, term: Term | None) -> None:
+        if term is not None and not term.known:
+            spec.add_numeric(name=f"sim2real/{name}", data=[term.estimate, term.low, term.high], size=3)
+
+    for kind, elements in (("joint", terms.joints), ("body", terms.bodies)):
+        for element, own in elements.items():
+            for name, term in own.items():
+                number(f"{kind}/{element}/{name}", term)
+    for name in ("command", "measurement", "round_trip"):
+        number(f"delay/{name}", getattr(terms.delays, name))
+    for name, text in about:
+        spec.add_text(name=f"sim2real/{name}", data=text)
