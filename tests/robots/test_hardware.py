@@ -94,9 +94,9 @@ def test_the_gate_lets_through_what_both_the_robot_and_the_stage_allow(episodes)
     np.testing.assert_allclose(high, [1.4, 1.4, 1.5])
 
 
-def test_the_agents_place_plays_the_signal_and_then_zeros(episodes):
+def test_the_agents_place_plays_the_signal_and_then_holds_its_end(episodes):
     played = episodes.recorded.outputs["agent"]["goal"]
-    expected = np.concatenate([SIGNAL, np.zeros((len(played), 3))])[: len(played)]
+    expected = np.concatenate([SIGNAL, np.tile(SIGNAL[-1], (len(played), 1))])[: len(played)]
     assert len(played) > len(SIGNAL)
     np.testing.assert_allclose(played, expected)
 

@@ -9,11 +9,10 @@ import pytest
 from small_robot import SHEET
 
 from sim2real.composer.mjx.environment import State
-from sim2real.composer.world import ComposedWorld
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import DelayParams
-from sim2real.robots.messages import Decision, Goals, JointReading
+from sim2real.robots.messages import Decision, JointReading
 from sim2real.robots.simulated import SimActuator, SimSensor
 
 
@@ -36,17 +35,16 @@ def test_references_begin_where_the_joints_are(played):
     assert np.abs(played.goals[0] - expected).max() > 0.2, "these goals were far"
 
 
-def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair, monkeypatch):
+def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair):
     """What nobody measures is where profiles were up to; later ticks leave references alone."""
-    monkeypatch.setattr(ComposedWorld, "step", lambda self, step_state: (step_state, None))
     goal, before = jnp.array([0.7, -0.4]), jnp.array([0.1, 0.2])
     for resumed, tick, expected in ((True, 0, goal), (True, 1, before), (False, 0, before)):
         world = pair.make_world(resumed)
         state = State(*[None] * len(dataclasses.fields(State))).replace(
             steps=jnp.int32(tick), variables={"goal": before, "reference": before, "other": before}
         )
-        after, _ = world.step(StepState(state=state, inputs=heard("actuator", Goals(goal))))
-        np.testing.assert_array_equal(after.state.variables["reference"], expected)
+        after = world.entered(state, goal)
+        np.testing.assert_array_equal(after.variables["reference"], expected)
         np.testing.assert_array_equal(after.state.variables["goal"], before)
         np.testing.assert_array_equal(after.state.variables["other"], before)
 
