@@ -19,6 +19,8 @@ from sim2real.identify.verdict import Position
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note
 
+_LEAST_PARTS = 2
+"""Errors of which a mean and a worst are worth saying."""
 _LEAST = 4
 """Segments of which parts can be left out."""
 _FEWEST = 4
@@ -110,7 +112,7 @@ def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: fl
             (f"up to {horizon_s:g} s ahead", _of(rows, p, "ahead")),
             ("in one go", _of(rows, p, "free")),
         ):
-            if errors.size:
+            if errors.size >= _LEAST_PARTS:
                 unit = f" {p.unit}".rstrip()
                 said.append(
                     f"{p.name}, {what}, on parts that were left out of the fit: off by {errors.mean():.2g}{unit} on "

@@ -6,14 +6,17 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import synthetic_run
 
+from sim2real.artifacts.identification import Identification, Judgement, Left
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, decimals_for, fixed, number, spoken
+from sim2real.view.identify_section import _parts
 from sim2real.view.page import deploy_page, identify_page, report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
@@ -298,3 +301,17 @@ def test_a_browser_shows_it_without_an_error(finished_run, tmp_path):
     assert [attrs["id"] for tag, attrs in dom.elements if tag == "section"] == ["record", "identify", "train", "deploy"]
     assert sum(tag == "svg" for tag, _ in dom.elements) == done.stdout.count("<figure")
     assert synthetic_run.EVIL in dom.words
+
+
+def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
+    rows = tuple(
+        Left(name, terms, {}, {}, {"th": error}, {})
+        for name, terms, error in (("0 to 9 s", ("drag",), 0.1), ("9 to 18 s", (), 0.3))
+    )
+    found = Identification("robot", (), Judgement("", ()), (), left_out=rows, terms=("drag",), units={"th": "rad"})
+    (table,) = _parts(found)
+    assert table.columns == ["left out", "terms", "th ahead [rad]"]
+    assert table.rows == [
+        ["0 to 9 s", "drag", "0.1"], ["9 to 18 s", "none", "0.3"], ["mean", "", "0.2"], ["worst", "", "0.3"],
+    ]  # fmt: skip
+    assert _parts(replace(found, left_out=())) == []

@@ -1,0 +1,113 @@
+"""What is said of parts that were left out: against scipy's distributions and simulated parts, not against itself."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sim2real.artifacts.identification import Left
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.uncertainty import Uncertainty
+from sim2real.identify.verdict import Position
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.left_out import further, sentences, widened, widest
+
+ANGLE = Position("th", "tilt", "rad", 0.001)
+
+
+def left(name, value=1.0, ahead=0.1, share=0.2, **more):
+    return Left(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
+
+
+def test_one_more_part_stays_below_the_promise_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    logs = rng.normal(-3.0, 0.4, (4000, 6))
+    held = [np.exp(row[-1]) < further(np.exp(row[:-1])) for row in logs]
+    low, high = stats.binom.interval(0.999, len(held), 0.95)
+    assert low <= sum(held) <= high
+
+
+def test_mean_worst_and_promise_are_said_of_every_position_that_has_errors():
+    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=0.15, free={"th": 0.3})]
+    said = sentences(rows, [ANGLE, Position("x", "place", "m", 0.1)], 0.5)
+    assert len(said) == 1  # one error in one go is no mean
+    assert re.match(r"tilt, up to 0.5 s ahead, .* off by 0.15 rad on average, 0.2 rad at worst of 3; .*0.4", said[0])
+    assert sentences([], [ANGLE], 0.5) == []
+
+
+@pytest.fixture
+def known():
+    """An estimate of 1 with a standard error of 0.01, on a linear scale from 0 to 10."""
+    table = ParameterTable([Parameter("gain", "1", 1.0, 0.0, 10.0, "linear")])
+    error = np.array([0.01])
+    spread = Uncertainty(
+        covariance=np.diag(error**2),
+        scale_covariance=np.diag(error**2),
+        standard_error=error,
+        low=np.array([0.98]),
+        high=np.array([1.02]),
+        verdict=("accepted",),
+        correlation=np.eye(1),
+        inflation=1.0,
+        misfit=1.0,
+        widening=np.ones(1),
+    )
+    return SimpleNamespace(table=table, spread=spread, x=np.array([1.0]))
+
+
+def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknifes(known):
+    values = np.array([0.9, 1.0, 1.1, 1.05, 0.95])
+    found = widened(known.spread, known.table, known.x, [left(str(v), v) for v in values])
+    error = np.sqrt(4 / 5 * np.sum((values - values.mean()) ** 2))
+    reach = error * stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)
+    assert found.standard_error[0] == pytest.approx(reach, rel=0.01)
+    assert found.high[0] - 1.0 == pytest.approx(2.0 * reach, rel=0.01)
+    assert found.covariance[0, 0] == pytest.approx(reach**2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [left(str(k), 1.0 + 0.001 * k) for k in range(5)],  # no more than by chance
+        [left(str(k), 1.0 + 0.1 * k, share=0.6 if k == 1 else 0.1) for k in range(5)],  # one part says nearly all
+        [left(str(k), 1.0 + 0.1 * k) for k in range(3)],  # too few
+    ],
+    ids=["agree", "alone", "few"],
+)
+def test_otherwise_intervals_stay(known, rows):
+    found = widened(known.spread, known.table, known.x, rows)
+    assert found.standard_error[0] == pytest.approx(0.01)
+    assert found.high[0] == pytest.approx(1.02)
+
+
+def test_a_wider_interval_may_no_longer_be_accepted(known):
+    far = widened(known.spread, known.table, known.x, [left(str(k), 1.0 + k) for k in range(5)])
+    assert far.verdict == ("not identifiable",)
+    assert far.low[0] >= 0.0
+
+
+def test_the_flag_says_which_terms_are_there():
+    table = ParameterTable(
+        [
+            Parameter("gain", "1", 1.0, 0.5, 2.0),
+            Parameter("cogging", "1", 0.0, -1.0, 1.0, "linear", term="cogging"),
+            Parameter("bias", "1", 0.0, -1.0, 1.0, "linear", free=False, term="bias"),
+        ]
+    )
+    assert widest(table, "own") is table
+    assert widest(table, "auto").terms == widest(table, "all").terms == ("cogging", "bias")
+    assert widest(table, "none").terms == ()
+    assert widest(table, "bias, cogging").terms == ("cogging", "bias")
+    with pytest.raises(UsageError, match="unknown term 'drag'"):
+        widest(table, "drag")
+    with pytest.raises(UsageError, match="no optional terms"):
+        widest(ParameterTable([table["gain"]]), "auto")
+
+
+@pytest.mark.parametrize("options", [{"folds": 1}, {"folds": -1}, {"folds": 0, "terms": "auto"}])
+def test_folds_that_leave_nothing_to_compare_are_refused(options):
+    with pytest.raises(UsageError, match="folds must be 0, or 2 and more"):
+        IdentifyConfig(**options)
