@@ -312,6 +312,6 @@ def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
     (table,) = _parts(found)
     assert table.columns == ["left out", "terms", "th ahead [rad]"]
     assert table.rows == [
-        ["0 to 9 s", "drag", "0.1"], ["9 to 18 s", "none", "0.3"], ["mean", "", "0.2"], ["worst", "", "0.3"],
+        ["0 to 9 s", "drag", "0.100"], ["9 to 18 s", "none", "0.300"], ["mean", "", "0.200"], ["worst", "", "0.300"],
     ]  # fmt: skip
     assert _parts(replace(found, left_out=())) == []
