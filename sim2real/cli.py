@@ -257,30 +257,21 @@ def _files(command: str, arguments: list[str]) -> None:
         sys.exit(ERROR)
 
 
-def _log(command: str, arguments: list[str]) -> None:
-    """``sim2real log recover FILE [--out FILE]``."""
+def _only(command: str, arguments: list[str]) -> None:
+    """``sim2real log recover FILE`` and ``sim2real export identified RUN|PIPELINE|FILE --to FORMAT``."""
     from sim2real.stages import config, flags
 
-    prog, rest = _action(command, "recover", arguments, "FILE")
-    own = config.RecoverConfig()
-    epilog = _epilog(f"{prog} session.mcap", f"{prog} session.mcap --out saved.mcap")
+    what, kind, stage, usage, *examples = {
+        "log": ("recover", "Recover", "recovering", "FILE", "session.mcap", "session.mcap --out saved.mcap"),
+        "export": (
+            *("identified", "Export", "exporting", "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json"),
+            *(f"{DEMO_PIPELINE} --to json", "runs/arm/TIME --to mjcf --out arm.xml"),
+        ),
+    }[command]
+    prog, rest = _action(command, what, arguments, usage)
+    own, epilog = getattr(config, f"{kind}Config")(), _epilog(*(f"{prog} {example}" for example in examples))
     asked = flags.parse(own, rest, prog, _summary(own), epilog)
-    from sim2real.stages import recovering  # imports JAX
-
-    recovering.run(asked)
-
-
-def _export(command: str, arguments: list[str]) -> None:
-    """``sim2real export identified RUN|PIPELINE|FILE --to FORMAT``."""
-    from sim2real.stages import config, flags
-
-    prog, rest = _action(command, "identified", arguments, "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json")
-    own = config.ExportConfig()
-    epilog = _epilog(f"{prog} {DEMO_PIPELINE} --to json", f"{prog} runs/arm/TIME --to mjcf --out arm.xml")
-    asked = flags.parse(own, rest, prog, _summary(own), epilog)
-    from sim2real.stages import exporting  # imports JAX
-
-    exporting.run(asked)
+    importlib.import_module(f"sim2real.stages.{stage}").run(asked)  # imports JAX
 
 
 def _action(command: str, only: str, arguments: list[str], usage: str) -> tuple[str, list[str]]:
@@ -334,12 +325,9 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "view": _view,
     "report": _view,
     "info": _info,
-    "import": _files,
-    "export": _export,
     "check": _check,
-    "validate": _files,
-    "new": _files,
-    "log": _log,
+    **dict.fromkeys(("import", "validate", "new"), _files),
+    **dict.fromkeys(("log", "export"), _only),
 }
 
 

@@ -67,7 +67,7 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Selection:
     """What was chosen.
 
     Attributes:
@@ -105,7 +105,7 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
     )
 
 
-def choose(stats: Statistics, table: ParameterTable) -> Choice:
+def choose(stats: Statistics, table: ParameterTable) -> Selection:
     """Leave out terms one after the other, each time the one that is missed least, and say where to stop.
 
     Chosen is the smallest model that is worse than the best one by no more than one standard error of the difference
@@ -135,7 +135,7 @@ def choose(stats: Statistics, table: ParameterTable) -> Choice:
     excess = np.array([(s - best).mean() for s in scores])
     error = np.array([(s - best).std(ddof=1) / np.sqrt(len(best)) for s in scores])
     smallest = int(np.flatnonzero(excess <= error)[-1])
-    return Choice(path[smallest], tuple(order), excess, error)
+    return Selection(path[smallest], tuple(order), excess, error)
 
 
 def _left_out(stats: Statistics, table: ParameterTable, kept: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ _ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss":
 
 
 @dataclass(frozen=True)
-class Term:
+class ParameterPattern:
     """One quantity of some joints, identified as one value or as one for each.
 
     Attributes:
@@ -78,7 +78,7 @@ class Term:
             ) from None
 
     @staticmethod
-    def parse(text: str) -> Term:
+    def parse(text: str) -> ParameterPattern:
         """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, such as ``frictionloss:each`` or ``kp@.*_calf_joint``.
 
         Raises:
@@ -89,7 +89,7 @@ class Term:
             raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
         what: Any = found[1]
         value = float(found[4]) if found[4] else None
-        return Term(what, found[3] or ALL, bool(found[2]), value, free=value is None)
+        return ParameterPattern(what, found[3] or ALL, bool(found[2]), value, free=value is None)
 
     def label(self) -> str:
         """Return the name of a value that several joints share."""
@@ -111,7 +111,7 @@ class Placed:
     at: tuple[int, ...]
 
 
-def expand(terms: Sequence[Term], joints: Sequence[str], model: Any, own: Any) -> list[Placed]:
+def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any, own: Any) -> list[Placed]:
     """Return the parameters of a model.
 
     Args:
@@ -175,7 +175,7 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
     return base.replace(model=base.model.tree_replace(model), **drive)
 
 
-def _parameter(term: Term, name: str, nominal: float) -> Parameter:
+def _parameter(term: ParameterPattern, name: str, nominal: float) -> Parameter:
     unit, about = _ABOUT[term.what]
     transform: Transform = "log"
     kind: Any = "measurement" if term.what == "zero" else "dynamics"
@@ -189,7 +189,7 @@ def _parameter(term: Term, name: str, nominal: float) -> Parameter:
     return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free)
 
 
-def _nominal(term: Term, names: Sequence[str], own: Any) -> float:
+def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
     """Return the value that joints start from: the median of the model's own."""
     if term.nominal is not None:
         return term.nominal

@@ -19,7 +19,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.mjcf import driven, joints_of, read_model, read_spec
-from sim2real.robots.mjcf_parameters import Placed, Term, expand, place
+from sim2real.robots.mjcf_parameters import ParameterPattern, Placed, expand, place
 from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
@@ -64,7 +64,7 @@ class RobotConfig:
     kd_unit: float = 1.0
     fix_base: bool = False
     contacts: bool = False
-    terms: tuple[Term, ...] = ()
+    terms: tuple[ParameterPattern, ...] = ()
 
     def to_toml(self, model: str) -> str:
         """Return the text of a ``robot.toml`` that names the model's file."""
@@ -74,7 +74,7 @@ class RobotConfig:
         own["model"] = model
         lines += [f"{k} = {json.dumps(v)}" for k, v in own.items() if v != plain[k]]
         for term in self.terms:
-            usual = asdict(Term(term.what))
+            usual = asdict(ParameterPattern(term.what))
             said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
             lines += ["", "[[terms]]", *(f"{k} = {json.dumps(v)}" for k, v in said.items())]
         return "\n".join(lines) + "\n"
@@ -88,7 +88,7 @@ class RobotConfig:
         """
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
-            terms = tuple(Term(**row) for row in table.pop("terms", []))
+            terms = tuple(ParameterPattern(**row) for row in table.pop("terms", []))
             rest: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
             found = RobotConfig(**rest, terms=terms)
             return replace(found, model=path.parent / found.model)
@@ -257,7 +257,7 @@ class IdentifiableMjcf(IdentifiableRecording):
         return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero)}
 
 
-def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Term, ...]:
+def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:
     """Return what is identified unless somebody says otherwise.
 
     Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
@@ -270,12 +270,15 @@ def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Term, 
     """
     if "goal" in commands:
         factor: dict[str, Any] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
-        first: tuple[Term, ...] = (Term("kp", **factor), *([Term("kd", **factor)] if physical else []))
-        first += (Term("kd"),) if "enabled" in commands and not physical else ()
+        first: tuple[ParameterPattern, ...] = (
+            ParameterPattern("kp", **factor),
+            *([ParameterPattern("kd", **factor)] if physical else []),
+        )
+        first += (ParameterPattern("kd"),) if "enabled" in commands and not physical else ()
     else:
-        first = (Term("kd"),) if "goal_velocity" in commands else (Term("gain"),)
-    rest = () if "goal_velocity" in commands and "goal" not in commands else (Term("damping"),)
-    return (*first, *rest, Term("armature"), Term("frictionloss", each=True))
+        first = (ParameterPattern("kd"),) if "goal_velocity" in commands else (ParameterPattern("gain"),)
+    rest = () if "goal_velocity" in commands and "goal" not in commands else (ParameterPattern("damping"),)
+    return (*first, *rest, ParameterPattern("armature"), ParameterPattern("frictionloss", each=True))
 
 
 def all_joints(model: Path) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from sim2real.log.mapping import ImportMapping, load_mapping
 from sim2real.log.proposal import pipeline_name
 from sim2real.log.reader import read_log
 from sim2real.robots.mjcf import joints_of, read_model, read_spec
-from sim2real.robots.mjcf_parameters import Term
+from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
 from sim2real.stages import flags, importing
 from sim2real.stages.config import MODEL_IDENTIFY, CheckConfig, RobotFlags
@@ -182,5 +182,7 @@ def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
     units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
     if set(units) == {"kp"}:  # a firmware's own unit; both gains together are those of a motor's own torque loop
         found = replace(found, kp_unit=units["kp"])
-    terms = tuple(Term.parse(p) for p in told.parameter) or usual_terms(driving, physical=set(units) == {"kp", "kd"})
+    terms = tuple(ParameterPattern.parse(p) for p in told.parameter) or usual_terms(
+        driving, physical=set(units) == {"kp", "kd"}
+    )
     return replace(found, terms=terms)

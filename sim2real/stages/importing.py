@@ -150,7 +150,7 @@ def contradictions(episode: Episode) -> list[str]:
     sensor, actuator = ROLES.sensor, ROLES.actuator
     if not {sensor, actuator} <= set(episode.outputs):
         return []
-    commands, units = episode.outputs[actuator], episode.metadata["units"]
+    commands, units = episode.outputs[actuator], {**episode.units.get(actuator, {}), **episode.units.get(sensor, {})}
     said: list[str] = []
     for field, values in episode.outputs[sensor].items():
         if meaning(field).quantity != "position" or not units.get(field):

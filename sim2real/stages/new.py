@@ -9,7 +9,7 @@ from pathlib import Path
 from sim2real.errors import UsageError
 from sim2real.log.mapping import to_toml
 from sim2real.robots.mjcf import driven, joints_of, read_model
-from sim2real.robots.mjcf_parameters import Term, expand
+from sim2real.robots.mjcf_parameters import ParameterPattern, expand
 from sim2real.robots.mjcf_robot import RobotConfig, usual_terms
 from sim2real.stages import described
 from sim2real.stages.config import NewConfig
@@ -95,7 +95,9 @@ def _described(config: NewConfig) -> tuple[RobotConfig, str]:
         mapping = "" if found.mapping is None else to_toml(replace(found.mapping, pipeline=config.name))
         return found.description, mapping
     commands = _COMMANDS[config.drive]
-    terms = tuple(Term.parse(p) for p in flags.parameter) or usual_terms(commands, physical=config.drive == "mit")
+    terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
+        commands, physical=config.drive == "mit"
+    )
     model = Path(str(config.model))
     return RobotConfig(
         model=model,

@@ -10,7 +10,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.robots.mjcf import driven, gains_of, joints_of, limit_of, read_model
-from sim2real.robots.mjcf_parameters import Term, expand, place
+from sim2real.robots.mjcf_parameters import ParameterPattern, expand, place
 from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
 from sim2real.worlds.driven import DriveCommand
 
@@ -93,11 +93,11 @@ def control(robot, values=None, **told):
     return np.asarray(world._control(state)).reshape(3, 2)
 
 
-KP = Term("kp", nominal=10.0)
+KP = ParameterPattern("kp", nominal=10.0)
 
 
 def test_positions_are_pulled_to_goals_by_the_encoder(model_file):
-    robot = MjcfRobot(config(model_file, terms=(KP, Term("zero", each=True))))
+    robot = MjcfRobot(config(model_file, terms=(KP, ParameterPattern("zero", each=True))))
     force, kp, kd = control(robot, {"zero_left_knee": 0.1}, goal=[0.5, 0.2])
     np.testing.assert_allclose(force, [4.0, 2.0], rtol=1e-6)
     np.testing.assert_allclose(kp, 10.0)
@@ -105,7 +105,7 @@ def test_positions_are_pulled_to_goals_by_the_encoder(model_file):
 
 
 def test_torque_that_is_off_leaves_what_short_circuited_windings_brake(model_file):
-    terms = (KP, Term("kd", nominal=0.4), Term("released", nominal=0.25))
+    terms = (KP, ParameterPattern("kd", nominal=0.4), ParameterPattern("released", nominal=0.25))
     robot = MjcfRobot(config(model_file, commands=("goal", "enabled"), terms=terms))
     force, kp, kd = control(robot, goal=[0.5, 0.2], enabled=[0.0])
     assert not force.any()
@@ -115,7 +115,13 @@ def test_torque_that_is_off_leaves_what_short_circuited_windings_brake(model_fil
 
 def test_mit_mode_takes_everything_from_the_log(model_file):
     commands = ("goal", "goal_velocity", "torque", "kp", "kd")
-    robot = MjcfRobot(config(model_file, commands=commands, terms=(Term("kp", nominal=1.0), Term("kd", nominal=1.0))))
+    robot = MjcfRobot(
+        config(
+            model_file,
+            commands=commands,
+            terms=(ParameterPattern("kp", nominal=1.0), ParameterPattern("kd", nominal=1.0)),
+        )
+    )
     told = {"goal": [0.1, 0.2], "goal_velocity": [1.0, 2.0], "torque": [0.5, 0.0], "kp": [20.0, 10.0], "kd": [1.0, 2.0]}
     force, kp, kd = control(robot, **told)
     np.testing.assert_allclose(force, [20 * 0.1 + 1.0 * 1.0 + 0.5, 10 * 0.2 + 2.0 * 2.0], rtol=1e-6)
@@ -130,7 +136,7 @@ def test_a_firmwares_gain_counts_in_its_own_unit(model_file):
 @pytest.mark.parametrize(("commands", "told", "pushed"), [(("torque",), {"torque": [0.3, 0.1]}, [0.6, 0.2]),
                                                           (("duty",), {"duty": [0.5, 1.0]}, [1.0, 2.0])])  # fmt: skip
 def test_torques_and_duties_push_in_proportion(model_file, commands, told, pushed):
-    robot = MjcfRobot(config(model_file, commands=commands, terms=(Term("gain", nominal=2.0),)))
+    robot = MjcfRobot(config(model_file, commands=commands, terms=(ParameterPattern("gain", nominal=2.0),)))
     force, kp, _ = control(robot, **told)
     np.testing.assert_allclose(force, pushed, rtol=1e-6)
     assert not kp.any()
@@ -138,9 +144,13 @@ def test_torques_and_duties_push_in_proportion(model_file, commands, told, pushe
 
 def test_parameters_by_pattern_stand_where_they_belong(model_file):
     terms = (
-        Term("damping"), Term("armature", ".*_hip"), Term("frictionloss", each=True), Term("torque", "left_knee"),
-        Term("speed", ".*_hip"), Term("payload", "lower"),
-    )  # fmt: skip
+        ParameterPattern("damping"),
+        ParameterPattern("armature", ".*_hip"),
+        ParameterPattern("frictionloss", each=True),
+        ParameterPattern("torque", "left_knee"),
+        ParameterPattern("speed", ".*_hip"),
+        ParameterPattern("payload", "lower"),
+    )
     robot = MjcfRobot(config(model_file, terms=terms))
     names = [p.name for p in robot.dynamics()]
     assert names == ["damping", "armature_hip", "frictionloss_left_knee", "frictionloss_left_hip",
@@ -159,12 +169,17 @@ def test_parameters_by_pattern_stand_where_they_belong(model_file):
 
 def test_nominal_values_are_the_models_own(model_file):
     own, made = read_model(model_file), driven(model_file, JOINTS, 0.002, False, False)
-    placed = expand([Term("kp", each=True), Term("damping"), Term("kd", "left_knee")], JOINTS, made, own)
+    placed = expand(
+        [ParameterPattern("kp", each=True), ParameterPattern("damping"), ParameterPattern("kd", "left_knee")],
+        JOINTS,
+        made,
+        own,
+    )
     assert [p.parameter.nominal for p in placed] == pytest.approx([8.0, 12.0, 0.15, 0.5])
 
 
 def test_the_start_is_where_the_encoders_say(model_file):
-    robot = MjcfRobot(config(model_file, terms=(Term("zero", nominal=0.1, free=False),)))
+    robot = MjcfRobot(config(model_file, terms=(ParameterPattern("zero", nominal=0.1, free=False),)))
     params = robot.identifiable(0.02).params({"zero": 0.1, "delay": 0.0}, jnp.array([0.5, -0.3, 1.0, 2.0]))
     np.testing.assert_allclose(params["world"].qpos, [-0.4, 0.4], rtol=1e-6)
     np.testing.assert_allclose(params["world"].qvel, [2.0, 1.0])
@@ -173,13 +188,13 @@ def test_the_start_is_where_the_encoders_say(model_file):
 
 def test_a_description_survives_its_file(tmp_path, model_file):
     wanted = config(model_file, velocity=True, rate_hz=123.0, terms=(*usual_terms(("goal", "enabled")),
-                    Term("frictionloss", "left_.*", True, 0.1, 0.01, 1.0, "dry", False)))  # fmt: skip
+                    ParameterPattern("frictionloss", "left_.*", True, 0.1, 0.01, 1.0, "dry", False)))  # fmt: skip
     (tmp_path / "robot.toml").write_text(wanted.to_toml("robot.xml"))
     assert RobotConfig.load(tmp_path / "robot.toml") == wanted
 
 
 def test_identified_friction_leaves_as_mjcf(model_file):
-    robot = MjcfRobot(config(model_file, terms=(Term("damping"), Term("armature", each=True))))
+    robot = MjcfRobot(config(model_file, terms=(ParameterPattern("damping"), ParameterPattern("armature", each=True))))
     text = robot.identified_mjcf({"damping": 0.33, "armature_left_hip": 0.07, "armature_left_knee": 0.08})
     model = mujoco.MjModel.from_xml_string(text)
     np.testing.assert_allclose(model.dof_damping, [0.33, 0.33, 0.0])
@@ -206,7 +221,7 @@ def test_a_floating_base_is_held_only_where_that_is_said(tmp_path):
     [
         ({"joints": ("left_toe",)}, "left_toe"),
         ({"commands": ("kp",)}, "goal, goal_velocity, torque, duty"),
-        ({"terms": (Term("kp", "right_.*"),)}, "matches none"),
+        ({"terms": (ParameterPattern("kp", "right_.*"),)}, "matches none"),
     ],
 )
 def test_what_does_not_fit_is_named(model_file, change, named):
@@ -217,20 +232,20 @@ def test_what_does_not_fit_is_named(model_file, change, named):
 @pytest.mark.parametrize(
     ("text", "term"),
     [
-        ("kp", Term("kp")),
-        ("frictionloss:each", Term("frictionloss", each=True)),
-        ("kp@.*_hip", Term("kp", ".*_hip")),
-        ("armature:each@left_.*=0.01", Term("armature", "left_.*", True, 0.01, free=False)),
+        ("kp", ParameterPattern("kp")),
+        ("frictionloss:each", ParameterPattern("frictionloss", each=True)),
+        ("kp@.*_hip", ParameterPattern("kp", ".*_hip")),
+        ("armature:each@left_.*=0.01", ParameterPattern("armature", "left_.*", True, 0.01, free=False)),
     ],
 )
 def test_terms_as_flags(text, term):
-    assert Term.parse(text) == term
+    assert ParameterPattern.parse(text) == term
 
 
 @pytest.mark.parametrize("text", ["kq", "kp@(", "kp every"])
 def test_wrong_terms_are_refused(text):
     with pytest.raises(UsageError):
-        Term.parse(text)
+        ParameterPattern.parse(text)
 
 
 def test_placing_nothing_changes_nothing(model_file):

@@ -45,8 +45,8 @@ def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair):
         )
         after = world.entered(state, goal)
         np.testing.assert_array_equal(after.variables["reference"], expected)
-        np.testing.assert_array_equal(after.state.variables["goal"], before)
-        np.testing.assert_array_equal(after.state.variables["other"], before)
+        np.testing.assert_array_equal(after.variables["goal"], before)
+        np.testing.assert_array_equal(after.variables["other"], before)
 
 
 def test_the_world_is_half_a_step_behind_its_commands(played):

@@ -8,7 +8,7 @@ import pytest
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import read_log
-from sim2real.robots.mjcf_parameters import Term
+from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import RobotConfig
 from sim2real.stages import described
 from sim2real.stages.config import RobotFlags
@@ -60,7 +60,7 @@ def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
     own = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description
     assert (set(own.commands), set(own.shared)) == ({"goal", "kp", "enabled"}, {"kp", "enabled"})
     assert own.kp_unit == 32.0
-    assert Term("kd") in own.terms
+    assert ParameterPattern("kd") in own.terms
 
 
 def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
@@ -93,7 +93,7 @@ def test_new_without_a_log_goes_by_its_flags(workplace, capsys):
     assert cli.main(arguments) == 0
     own = RobotConfig.load(Path("pipelines/rig/robot.toml"))
     assert own.commands == ("goal", "goal_velocity", "torque", "kp", "kd")
-    assert own.terms == (Term("damping", each=True),)
+    assert own.terms == (ParameterPattern("damping", each=True),)
     assert cli.main(arguments) == 2
     assert "exists" in capsys.readouterr().err
 
