@@ -97,8 +97,9 @@ def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
 def linearise(problem: Problem, z: np.ndarray) -> Linearised:
     """Compute residuals and Jacobian at ``z (P,)``."""
     point = jnp.asarray(z, jnp.float32)
-    columns = jax.jit(problem.sensitivities)(point)
-    r, J, raw = (np.asarray(a, np.float64) for a in jax.jit(problem.linearised)(point, columns))
+    sensitivities = problem.programs.setdefault("sensitivities", jax.jit(problem.sensitivities))
+    linearised = problem.programs.setdefault("linearised", jax.jit(problem.linearised))
+    r, J, raw = (np.asarray(a, np.float64) for a in linearised(point, sensitivities(point)))
     x, stretch = problem.table.scale(z)
     priors = np.asarray(jax.jacfwd(problem.table.prior_residuals)(point), np.float64) / stretch
     prior = priors.T @ priors + np.diag(12.0 / problem.table.span**2)
