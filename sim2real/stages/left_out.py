@@ -25,8 +25,6 @@ _LEAST = 4
 """Segments of which parts can be left out."""
 _FEWEST = 4
 """Parts from which on they say how much estimates differ."""
-_STEPS = 8
-"""Most steps of Levenberg-Marquardt for each part: it starts where the linearised residuals say."""
 
 
 def widest(table: ParameterTable, wanted: str) -> ParameterTable:
@@ -75,7 +73,7 @@ def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[
         note(f"{segments} segments are too few to leave parts out of the fit")
         return ()
     parts = folds_of(found.problem, min(config.folds, segments // 2), names)
-    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", _STEPS, config.free_run_s)
+    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", config.refine_steps, config.free_run_s)
     return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
 
 
