@@ -27,73 +27,25 @@ class DiskRobot(LoggedRobot):
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
-        linear: Any = "linear"
+
+        def optional(
+            name: str, unit: str, nominal: float, low: float, high: float, about: str = "", leaf: str = "", **more: Any
+        ) -> Parameter:
+            end = {"about": about, "leaf": leaf, "term": name, "off": 0.0, **more}
+            return Parameter(name, unit, nominal, low, high, "linear", **end)
+
         share = "share of the radial load that rubs"
         return [
             Parameter("gain", "rad/s^2/V", 28.0, 5.0, 100.0, about="acceleration per volt", leaf="world.gain"),
             Parameter("gravity", "rad/s^2", 134.0, 40.0, 300.0, about="m g l / J", leaf="world.gravity"),
             Parameter("damping", "1/s", 1.5, 0.1, 6.0, about="friction and back-EMF", leaf="world.friction.viscous"),
             Parameter("load", "1", 0.047, 0.003, 0.3, about=share, leaf="world.friction.load", term="load", off=0.0),
-            Parameter(
-                "swing",
-                "1",
-                0.05,
-                0.0,
-                1.0,
-                linear,
-                about="load by the swing",
-                leaf="world.swing",
-                term="swing",
-                off=0.0,
-            ),
-            Parameter(
-                "cogging",
-                "rad/s^2",
-                0.0,
-                -5.0,
-                5.0,
-                linear,
-                about="twice a turn",
-                leaf="world.cogging",
-                term="cogging",
-                off=0.0,
-            ),
+            optional("swing", "1", 0.05, 0.0, 1.0, about="load by the swing", leaf="world.swing"),
+            optional("cogging", "rad/s^2", 0.0, -5.0, 5.0, about="twice a turn", leaf="world.cogging"),
             # Nearly the same as the two before it on these swings: free it and fix cogging to compare.
-            Parameter(
-                "voltage_offset",
-                "V",
-                0.0,
-                -0.3,
-                0.3,
-                linear,
-                leaf="world.voltage_offset",
-                free=False,
-                term="voltage_offset",
-            ),
-            Parameter(
-                "offset",
-                "rad",
-                0.0,
-                -0.15,
-                0.15,
-                linear,
-                "measurement",
-                "encoder's zero",
-                leaf="sensor.offset",
-                term="offset",
-            ),
-            Parameter(
-                "eccentricity",
-                "rad",
-                0.0,
-                -0.05,
-                0.05,
-                linear,
-                "measurement",
-                "encoder",
-                leaf="sensor.eccentricity",
-                term="eccentricity",
-            ),
+            optional("voltage_offset", "V", 0.0, -0.3, 0.3, leaf="world.voltage_offset", free=False),
+            optional("offset", "rad", 0.0, -0.15, 0.15, "encoder's zero", "sensor.offset", kind="measurement"),
+            optional("eccentricity", "rad", 0.0, -0.05, 0.05, "encoder", "sensor.eccentricity", kind="measurement"),
         ]
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:

@@ -82,7 +82,8 @@ def identify(
     terms = found.problem.table.terms or None
     if config.terms == "auto":
         terms = left_out.chosen(found, config, names)
-        table = table.with_terms(terms).with_nominal(found.values)
+        # What a flag holds stays held, whatever term it belongs to.
+        table = table.with_terms(terms).with_nominal(found.values).with_fixed(config.fix)
         again = replace(config, generations=0)
         with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
             found = patiently(lambda: _fit(model, episodes, len(fitted), windows, again, table, told))
