@@ -77,16 +77,7 @@ def identify(
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
-    with _told("identify", best) as told:
-        all_terms = found = patiently(lambda: _fit(model, episodes, len(fitted), windows, config, table, told, _begins))
-    terms = found.problem.table.terms or None
-    if config.terms == "auto":
-        terms = left_out.chosen(found, config, names)
-        # What a flag holds stays held, whatever term it belongs to.
-        table = table.with_terms(terms).with_nominal(found.values).with_fixed(config.fix)
-        again = replace(config, generations=0)
-        with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
-            found = patiently(lambda: _fit(model, episodes, len(fitted), windows, again, table, told))
+    all_terms, found, table, terms = _with_terms(model, episodes, windows, config, table, names, best)
     with progress(None, "identify: errors, predictions and baselines"):
         without = patiently(lambda: left_out.examined(all_terms, config, names)) if config.folds else ()
         findings = patiently(lambda: identified.Findings.of(found, without))
@@ -103,6 +94,29 @@ def identify(
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
     )
+
+
+def _with_terms(
+    model: IdentifiableModel,
+    episodes: Sequence[Episode],
+    windows: Sequence[Span],
+    config: IdentifyConfig,
+    table: ParameterTable,
+    names: Sequence[str],
+    best: Best | None,
+) -> tuple[Fit, Fit, ParameterTable, tuple[str, ...] | None]:
+    """Return the fit with all optional terms, that with those that are needed, the latter's table, and their names."""
+    with _told("identify", best) as told:
+        found = patiently(lambda: _fit(model, episodes, len(names), windows, config, table, told, _begins))
+    if config.terms != "auto":
+        return found, found, table, found.problem.table.terms or None
+    terms = left_out.chosen(found, config, names)
+    # What a flag holds stays held, whatever term it belongs to.
+    fewer = table.with_terms(terms).with_nominal(found.values).with_fixed(config.fix)
+    again = replace(config, generations=0)
+    with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
+        narrow = patiently(lambda: _fit(model, episodes, len(names), windows, again, fewer, told))
+    return found, narrow, fewer, terms
 
 
 def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | None) -> StageFolder:
