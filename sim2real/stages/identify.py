@@ -111,8 +111,9 @@ def _with_terms(
     if config.terms != "auto":
         return found, found, table, found.problem.table.terms or None
     terms = left_out.chosen(found, config, names)
-    # What a flag holds stays held, whatever term it belongs to.
-    fewer = table.with_terms(terms).with_nominal(found.values).with_fixed(config.fix)
+    # What a flag holds stays held, whatever term it belongs to; what is left out is what it is without its term.
+    fewer = table.with_terms(terms).with_fixed(config.fix)
+    fewer = fewer.with_nominal({p.name: found.values[p.name] for p in fewer if p.free and not p.per_recording})
     again = replace(config, generations=0)
     with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
         narrow = patiently(lambda: _fit(model, episodes, len(names), windows, again, fewer, told))
