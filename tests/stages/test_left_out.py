@@ -12,6 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty import Uncertainty
 from sim2real.identify.verdict import Position
+from sim2real.stages import identify
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.left_out import further, sentences, widened, widest
 
@@ -111,3 +112,30 @@ def test_the_flag_says_which_terms_are_there():
 def test_folds_that_leave_nothing_to_compare_are_refused(options):
     with pytest.raises(UsageError, match="folds must be 0, or 2 and more"):
         IdentifyConfig(**options)
+
+
+def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatch):
+    table = ParameterTable(
+        [
+            Parameter("gain", "1", 1.0, 0.5, 2.0),
+            Parameter("cogging", "1", 0.1, -1.0, 1.0, "linear", term="cogging"),
+            Parameter("swing", "1", 0.1, -1.0, 1.0, "linear", term="swing", off=0.0),
+            Parameter("bias", "1", 0.2, -1.0, 1.0, "linear", term="bias"),
+        ]
+    ).with_fixed({"swing": 0.3})
+    values = {"gain": 1.5, "cogging": 0.4, "swing": 0.3, "bias": 0.6}
+    tables = []
+
+    def fit(model, episodes, fitted, windows, config, table, tell, begins=None):
+        tables.append((config.generations, table))
+        return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
+
+    monkeypatch.setattr(identify, "_fit", fit)
+    monkeypatch.setattr(identify.left_out, "chosen", lambda *_: ("cogging",))
+    config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
+    _, _, fewer, terms = identify._with_terms(None, [], [], config, table, ["log"], None)
+    assert terms == ("cogging",)
+    assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]
+    assert {p.name: (p.nominal, p.free) for p in fewer} == {
+        "gain": (1.5, True), "cogging": (0.4, True), "swing": (0.3, False), "bias": (0.2, False),
+    }  # fmt: skip
