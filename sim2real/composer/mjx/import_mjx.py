@@ -5,3 +5,7 @@ import io
 
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx as mjx
+
+    from sim2real.composer.mjx.chains import hold_links
+
+hold_links()

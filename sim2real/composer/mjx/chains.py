@@ -1,0 +1,33 @@
+"""Chains of bodies on the CPU: the pose of a link is computed once, not again for every link beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from mujoco.mjx._src import scan  # private: mujoco-mjx is pinned, and a test would see it change
+
+_vmap = scan._nvmap
+
+
+def hold_links() -> None:
+    """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link.
+
+    On a CPU XLA fuses the whole chain, and computes each link's pose where it is used: twice as often with every link.
+    Six in a row (SO-101), 256 copies: 2.9 ms for ``mjx.kinematics`` instead of 151. On a GPU, XLA weighs that itself.
+    """
+    scan._nvmap = _held
+
+
+def _held(f: Callable[..., Any], carry: Any, *args: Any) -> Any:
+    if carry is not None and jax.default_backend() == "cpu":
+        carry = jax.tree.map(_barrier, carry)
+    return _vmap(f, carry, *args)
+
+
+def _barrier(leaf: Any) -> Any:
+    """Return a leaf behind a barrier, unless it is a type of joint, which decides what is traced."""
+    known = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
+    return leaf if known else jax.lax.optimization_barrier(leaf)
