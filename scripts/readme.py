@@ -21,6 +21,7 @@ from benches.provenance import ROOT, why_stale
 TABLES = {
     "demo": ("demo",),
     "arm": ("arm_cpu", "arm_h200"),
+    "so101": ("so101_cpu",),
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
 }
 """Tables of README.md, and the reports that each is made of."""
@@ -82,11 +83,9 @@ def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
-    """Return the table of the arm: the first seed of the run on a CPU, and training on an accelerator."""
+def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> str:
+    """Return the table of an arm: the first seed of the run on a CPU, and training on an accelerator if measured."""
     seed = cpu["seeds"][0]
-    trained = {r["name"].removeprefix("arm/train/"): r["value"] for r in reversed(gpu["rows"])}
-    device = gpu["rows"][0]["yardstick"].partition("--")[0].strip()
 
     def reached(key: str) -> str:
         distances = seed[key]
@@ -96,15 +95,19 @@ def arm(cpu: dict[str, Any], gpu: dict[str, Any]) -> str:
     truth = seed["round_trip_ms"] - seed["round_trip_error_ms"]
     stages = ", ".join(f"{stage} {seed[f'{stage}_s']:.0f}" for stage in ("record", "identify", "train", "deploy"))
     lines = [
-        ("", "the arm: three position-controlled servos on one bus"),
+        ("", what),
         ("---", "---"),
         ("held-out motion, 1 s ahead", f"{seed['mae_mrad']:.1f} mrad mean absolute error"),
         ("round-trip delay", f"{abs(seed['round_trip_error_ms']):.1f} ms off the true {truth:.0f} ms"),
         ("within 2 cm of the target", reached("distances_m")),
         ("the same without identification", reached("nominal_distances_m")),
         ("time", f"{seed['total_s']:.0f} s on two CPU cores ({stages} s)"),
-        ("training on a GPU", f"{trained['train_s']:.0f} s, and {trained['compile_s']:.0f} s to compile ({device})"),
     ]
+    if gpu is not None:
+        trained = {r["name"].removeprefix("arm/train/"): r["value"] for r in reversed(gpu["rows"])}
+        device = gpu["rows"][0]["yardstick"].partition("--")[0].strip()
+        took = f"{trained['train_s']:.0f} s, and {trained['compile_s']:.0f} s to compile ({device})"
+        lines.append(("training on a GPU", took))
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
 
@@ -135,7 +138,8 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
     own = {table: {name: reports[name] for name in names} for table, names in TABLES.items()}
     text = {
         "demo": demo(own["demo"]["demo"]),
-        "arm": arm(own["arm"]["arm_cpu"], own["arm"]["arm_h200"]),
+        "arm": arm("the arm: three position-controlled servos on one bus", *own["arm"].values()),
+        "so101": arm("the SO-101: six servos with the parameters of a real one", *own["so101"].values()),
         "real": real_motors(own["real"]),
     }
     return {table: text[table] + origin(own[table]) for table in TABLES}
