@@ -37,7 +37,7 @@ def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, t
     assert script.main([]) == 1
     told = capsys.readouterr().err
     assert "reports/demo.json: it does not say which state of the code it is of" in told
-    assert "hint: measure again, or --stale-ok demo arm_cpu arm_h200 identify_disk" in told
+    assert "hint: measure again, or --stale-ok demo arm_cpu arm_h200 so101_cpu identify_disk" in told
     assert (tmp_path / "README.md").read_text() == readme
     assert script.main(["--stale-ok", *reports]) == 0
     assert "Commit that was measured: not recorded (demo)." in (tmp_path / "README.md").read_text()

@@ -11,8 +11,18 @@ _LONGEST_S = 1.0
 """The longest delay that can be asked for [s]."""
 
 
+def is_physical(p: Parameter, upper: bool) -> bool:
+    """Return whether nothing lies beyond a bound: there is no delay and no friction below 0.
+
+    Args:
+        p: The parameter, with its bounds.
+        upper: Whether the upper one is meant.
+    """
+    return not upper and p.low == 0.0 and (p.kind == "delay" or p.transform == "linear")
+
+
 def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
-    """Return flags that widen the bound at which a parameter lies, or fix it there where the bound is physical.
+    """Return flags that widen the bound at which a parameter lies.
 
     Args:
         p: The parameter, with its bounds.
@@ -20,14 +30,12 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
         max_delay_s: For which delays the model is made [s].
     """
     if p.kind == "delay":
-        return _longer(p, max_delay_s) if upper else f"--fix {p.name} {p.low:g}"
+        return _longer(p, max_delay_s) if upper else f"--bounds {p.name} 0 {p.high:g}"
     low, high = p.low, p.high
     if p.transform == "log":
         low, high = (low, high * _WIDER) if upper else (low / _WIDER, high)
     elif p.transform == "logit":
         low, high = (low, 1.0 - (1.0 - high) / _WIDER) if upper else (low / _WIDER, high)
-    elif low == 0.0 and not upper:  # friction, say, that cannot be negative
-        return f"--fix {p.name} 0"
     else:
         low, high = (low, high + (high - low)) if upper else (low - (high - low), high)
     return f"--bounds {p.name} {low:.6g} {high:.6g}"

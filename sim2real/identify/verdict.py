@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.identification import Prediction
-from sim2real.identify.bounds import way_out, way_out_of
+from sim2real.identify.bounds import is_physical, way_out, way_out_of
 from sim2real.identify.identifiability import Check
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.round_trip import RoundTrip
@@ -161,8 +161,9 @@ def judge(
     improves, reasons = _on_held_out(found)
     reasons += beyond
     known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
-    bounded, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
+    bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
+    reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)
     loose = [message for group, message in groups if not set(group) <= set(together)]
@@ -216,26 +217,32 @@ def _at_bounds(
     known: Sequence[int],
     trip: RoundTrip | None,
     max_delay_s: float,
-) -> tuple[list[str], str]:
-    """Return a sentence about each estimate at a bound, and the flags to identify again with.
+) -> tuple[list[str], list[str], str]:
+    """Return a sentence about each estimate at a bound, names of those at 0 that cannot be less, and flags to widen.
 
     Only parameters in ``known`` count: for one that the data does not determine, other bounds do not help.
     """
-    said, flags = [], []
+    said, least, flags = [], [], []
     for i in known:
         c = table.columns[i]
         if spread.verdict[i] == "at a bound":
             upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
+            if is_physical(c.parameter, upper):
+                least.append(c.label)
+                continue
             out = way_out(c.parameter, upper, max_delay_s)
             bound = c.parameter.high if upper else c.parameter.low
             said.append(_bound(c.label, "upper" if upper else "lower", f"{bound:.4g} {c.parameter.unit}", out))
             flags.append(out)
     if trip and not trip.apart and trip.verdict == "at a bound":
-        out = way_out_of(trip, {c.label: c.parameter for c in table.columns}, max_delay_s)
+        parameters = {c.label: c.parameter for c in table.columns}
+        if all(is_physical(parameters[n], trip.at_bound == "upper") for n in trip.parts):
+            return said, [*least, "the sum of the delays"], " ".join(dict.fromkeys(f for f in flags if f))
+        out = way_out_of(trip, parameters, max_delay_s)
         bound = trip.lower if trip.at_bound == "lower" else trip.upper
         said.append(_bound("the sum of the delays", trip.at_bound, f"{1e3 * bound:.4g} ms", out))
         flags.append(out)
-    return said, " ".join(dict.fromkeys(f for f in flags if f))
+    return said, least, " ".join(dict.fromkeys(f for f in flags if f))
 
 
 def _bound(name: str, side: str, bound: str, flags: str) -> str:

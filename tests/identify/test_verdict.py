@@ -130,7 +130,6 @@ def test_worse_than_without_delays_is_a_failure_and_as_good_is_none():
         ("gain", "lower", "--bounds gain 0.25 4"),
         ("offset", "upper", "--bounds offset -1 3"),
         ("static", "upper", "--bounds static 0 0.6"),
-        ("static", "lower", "--fix static 0"),
         ("share", "upper", "--bounds share 0.1 0.975"),
         ("share", "lower", "--bounds share 0.025 0.9"),
     ],
@@ -143,20 +142,27 @@ def test_a_bound_comes_with_flags_that_are_accepted(name, side, flags):
     assert found.status == "hit a bound"
     assert found.flags == flags
     assert any(r.startswith(f"at a bound: {name} is at its {side} one, ") and flags in r for r in found.reasons)
-    kind, _, *numbers = flags.split()
-    values = [float(v) for v in numbers]
-    wider = TABLE.with_bounds({name: tuple(values)}) if kind == "--bounds" else TABLE.with_fixed({name: values[0]})
-    assert wider[name].free == (kind == "--bounds")
+    low, high = (float(v) for v in flags.split()[2:])
+    assert TABLE.with_bounds({name: (low, high)})[name].free
 
 
-@pytest.mark.parametrize(
-    ("total", "flags"), [(0.0, "--fix sensor_delay 0 --fix actuator_delay 0"), (0.12, "--max-delay-s 0.12")]
-)
-def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not(total, flags):
+@pytest.mark.parametrize("name", ["static", "sensor_delay"])
+def test_a_friction_or_a_delay_of_0_is_told_and_accepted(name):
+    x = (TABLE.low + TABLE.high) / 2
+    x[TABLE.names.index(name)] = 0.0
+    found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
+    assert (found.status, found.flags) == ("accepted", "")
+    assert f"{name} comes out at 0, less than which there is not: held there, the same fit" in found.reasons
+
+
+def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not():
     loose = dict.fromkeys(DELAYS, "not identifiable")
-    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(total))
-    assert (found.status, found.flags) == ("hit a bound", flags)
-    assert any("the sum of the delays is at its" in r for r in found.reasons)
+    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.12))
+    assert (found.status, found.flags) == ("hit a bound", "--max-delay-s 0.12")
+    assert any("the sum of the delays is at its upper one" in r for r in found.reasons)
+    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.0))
+    assert found.status == "accepted"
+    assert any("the sum of the delays comes out at 0" in r for r in found.reasons)
 
 
 def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
