@@ -6,9 +6,10 @@ import argparse
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from itertools import cycle, islice
+from queue import SimpleQueue
 from typing import Any
 
 ONE_THREAD = {
@@ -33,41 +34,32 @@ def each(
         for i, task in enumerate(tasks):
             yield i, work(*task, options)
         return
-    context, jobs = multiprocessing.get_context("spawn"), max(min(options.jobs, len(tasks)), 1)
-    processors = context.Queue()
-    for number in islice(cycle(_processors()), jobs):
-        processors.put(number)
-    # A process a task: none finds programs compiled that another had to compile.
-    with (
-        _environment(),
-        ProcessPoolExecutor(jobs, context, _take, (processors,), max_tasks_per_child=1) as pool,
-    ):
-        numbers = {pool.submit(_alone, work, task, options): i for i, task in enumerate(tasks)}
+    context, free = multiprocessing.get_context("spawn"), SimpleQueue()
+    for number in islice(cycle(_processors()), options.jobs):
+        free.put(number)
+
+    def alone(task: Sequence[Any]) -> dict[str, Any]:
+        number = free.get()
+        try:
+            # A process a task: none finds programs compiled that another had to compile.
+            with ProcessPoolExecutor(1, context, _hold, (number,)) as pool:
+                return pool.submit(work, *task, options).result()
+        finally:
+            free.put(number)
+
+    with _environment(), ThreadPoolExecutor(options.jobs) as threads:
+        numbers = {threads.submit(alone, task): i for i, task in enumerate(tasks)}
         try:
             for done in as_completed(numbers):
                 yield numbers[done], done.result()
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            threads.shutdown(cancel_futures=True)
 
 
-_free: Any = None
-"""Of a process: the processors that no other has."""
-
-
-def _take(processors: Any) -> None:
-    global _free
-    _free = processors
-
-
-def _alone(work: Callable[..., dict[str, Any]], task: Sequence[Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Do the work on one processor: C engines count those that a process may use, and take a thread for each."""
-    number = _free.get()
-    try:
-        if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {number})
-        return work(*task, options)
-    finally:
-        _free.put(number)
+def _hold(number: int) -> None:
+    """Hold this process on one processor: C engines count those that it may use, and take a thread for each."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {number})
 
 
 def _processors() -> list[int]:

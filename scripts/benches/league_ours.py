@@ -126,7 +126,7 @@ def _written(own: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
     """
     paths = []
     for i, r in enumerate(own):
-        columns = {"t_s": r.t, "q_rad": r.position, "q_goal_rad": r.command}
+        columns: dict[str, Any] = {"t_s": r.t, "q_rad": r.position, "q_goal_rad": r.command}
         if "torque_enable" in r.constants:
             columns["torque_enable"] = np.asarray(r.constants["torque_enable"], np.float64)[:, None]
         if gains:
