@@ -9,7 +9,7 @@ import argparse
 import json
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,23 @@ TABLES = {
     "arm": ("arm_cpu", "arm_h200"),
     "so101": ("so101_cpu",),
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
+    "league": ("league",),
 }
-"""Tables of README.md, and the reports that each is made of."""
+"""Tables of README.md, and the reports that each is made of; one whose reports are not all there is left out."""
+LEAGUE_SETS = {
+    "disk": "motor with eccentric mass, RMSE",
+    "xl330": "DYNAMIXEL XL330, MAE",
+    "so101": "SO-101 arm, joints that move, RMSE",
+    "go2": "Unitree Go2 in the air, RMSE",
+    "sts3250": "Feetech STS3250, MAE",
+}
+LEAGUE_ENTRANTS = {
+    "sysid": "mujoco.sysid",
+    "sysid_delay": "the same with a delay",
+    "pace": "PACE",
+    "bam_m1": "BAM M1",
+    "bam_m6": "BAM M6",
+}
 CLOSE_M = 0.02
 """How near the arm's tip must come to its target [m]."""
 
@@ -83,6 +98,27 @@ def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
+def league(report: Mapping[str, Any]) -> str:
+    """Return the table of the league: a line a set, ours with its worst fold, of the others the means [mrad]."""
+    scale = {"rad": 1e3, "mrad": 1.0}
+    v = {r["name"]: scale[r["unit"]] * r["value"] for r in report["rows"] if r["value"] is not None}
+    folds = {name: {f["fold"] for f in report["folds"] if f["set"] == name} for name in LEAGUE_SETS}
+
+    def told(name: str, entrant: str, what: str = "mean") -> str:
+        value = v.get(f"league/{name}/{entrant}/{what}")
+        return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+    lines = [
+        ("held out in turn, mean [mrad]", "sim2real", "its worst", *LEAGUE_ENTRANTS.values()),
+        ("---", *["---:"] * (2 + len(LEAGUE_ENTRANTS))),
+    ]
+    for name, about in LEAGUE_SETS.items():
+        if folds[name]:
+            own = (told(name, "ours"), told(name, "ours", "worst"))
+            lines.append((f"{about}, {len(folds[name])} folds", *own, *(told(name, e) for e in LEAGUE_ENTRANTS)))
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
 def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> str:
     """Return the table of an arm: the first seed of the run on a CPU, and training on an accelerator if measured."""
     seed = cpu["seeds"][0]
@@ -129,20 +165,22 @@ def updated(readme: str, tables: Mapping[str, str]) -> str:
 
 def read_reports() -> dict[str, dict[str, Any]]:
     """Return the committed reports that the tables are made of, by name."""
-    names = [name for table in TABLES.values() for name in table]
-    return {name: json.loads((ROOT / "reports" / f"{name}.json").read_text()) for name in names}
+    paths = {name: ROOT / "reports" / f"{name}.json" for table in TABLES.values() for name in table}
+    return {name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()}
 
 
 def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
-    """Return the tables."""
-    own = {table: {name: reports[name] for name in names} for table, names in TABLES.items()}
-    text = {
-        "demo": demo(own["demo"]["demo"]),
-        "arm": arm("the arm: three position-controlled servos on one bus", *own["arm"].values()),
-        "so101": arm("the SO-101: six servos with the parameters of a real one", *own["so101"].values()),
-        "real": real_motors(own["real"]),
+    """Return the tables of which there are all reports."""
+    write: dict[str, Callable[[dict[str, dict[str, Any]]], str]] = {
+        "demo": lambda own: demo(own["demo"]),
+        "arm": lambda own: arm("the arm: three position-controlled servos on one bus", *own.values()),
+        "so101": lambda own: arm("the SO-101: six servos with the parameters of a real one", *own.values()),
+        "real": real_motors,
+        "league": lambda own: league(own["league"]),
     }
-    return {table: text[table] + origin(own[table]) for table in TABLES}
+    there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
+    own = {table: {name: reports[name] for name in names} for table, names in there.items()}
+    return {table: write[table](own[table]) + origin(own[table]) for table in there}
 
 
 def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str, str]:

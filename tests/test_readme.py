@@ -43,6 +43,41 @@ def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, t
     assert "Commit that was measured: not recorded (demo)." in (tmp_path / "README.md").read_text()
 
 
+@pytest.fixture
+def league():
+    """A report of the league: two sets, one of them in radians, and an entrant without a figure."""
+    values = {
+        "disk": {"ours": (0.0251, 0.0302), "sysid": (0.1, 0.2), "sysid_delay": (0.035, 0.04), "bam_m1": (None, None)},
+        "go2": {"ours": (4.14, 5.0), "pace": (123.4, 150.0)},
+    }
+    units = {"disk": "rad", "go2": "mrad"}
+    rows = [
+        {"name": f"league/{name}/{entrant}/{what}", "value": value, "unit": units[name]}
+        for name, entrants in values.items()
+        for entrant, both in entrants.items()
+        for what, value in zip(("mean", "worst"), both, strict=True)
+    ]
+    folds = [{"set": name, "fold": f"block {i}"} for name, count in (("disk", 5), ("go2", 3)) for i in range(count)]
+    return {"rows": rows, "folds": folds, "commit": "0123456789"}
+
+
+def test_the_league_has_a_line_a_set_in_one_unit(script, league):
+    text = script.tables({"league": league})["league"]
+    assert "| motor with eccentric mass, RMSE, 5 folds | 25.1 | 30.2 | 100 | 35.0 | - | - | - |\n" in text
+    assert "| Unitree Go2 in the air, RMSE, 3 folds | 4.1 | 5.0 | - | - | 123 | - | - |\n" in text
+    assert "XL330" not in text
+    assert text.endswith("Commit that was measured: `0123456` (league).\n")
+    widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
+    assert len(widths) == 1
+
+
+def test_a_table_whose_reports_are_not_all_there_is_left_as_it_is(script):
+    reports = script.read_reports()
+    assert set(script.tables(reports)) >= {"demo", "arm", "real"}
+    few = {name: r for name, r in reports.items() if name not in ("arm_h200", "league")}
+    assert set(script.tables(few)) == {"demo", "real"}
+
+
 def test_links_lead_somewhere():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "guides").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):

@@ -6,6 +6,7 @@
 Each entrant fits the same parts of the same recordings within the same processor time, seconds times processors,
 compiling included, and is judged on the part that was held out; ours takes what its pipeline's configuration takes,
 which is reported. Of every set the mean over its folds is given, and the worst.
+With --jobs there are so many fits at once, each in a process of its own that has one processor.
 What was measured goes into --results at once, a line a fold and entrant: a run that was cut goes on where it ended.
 """
 
@@ -22,14 +23,15 @@ from typing import Any
 
 import numpy as np
 
-from benches import figures, league_bam, league_mujoco, league_ours
-from benches.league_sets import SETS, Fold, LeagueSet
+from benches import figures, league_bam, league_jobs, league_mujoco, league_ours
+from benches.league_sets import SETS, Fold
 from benches.sysid import Recording
+from sim2real.errors import UsageError
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 Fitted = tuple[Predict, str]
 ENTRANTS = {
-    "ours": "sim2real identify, as the pipeline is set up",
+    "ours": "sim2real identify, as the pipeline is set up; of go2 and sts3250, with --mjcf and --log alone",
     "sysid": "mujoco.sysid as its user would: gain, damping, dry friction, inertia; no delay",
     "sysid_delay": "mujoco.sysid with a delay and our terms",
     "pace": "PACE's form: inertia, damping, friction, bias of each joint, a delay in steps; CMA-ES",
@@ -52,12 +54,30 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--folds", type=int, help="at most so many folds of a set; default: all")
     parser.add_argument("--samples", type=int, help="at most so many samples of a recording; default: all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="fits at once, of one thread each; 1: in this process")
     parser.add_argument("--results", type=Path, help="JSON lines to go on from, and to add to")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Fit, predict, and return the rows and every fold's figures."""
-    known = _known(options)
+    if options.jobs < 1:
+        raise UsageError(f"jobs must be at least 1, got {options.jobs}")
+    known, tasks = _known(options), _tasks(options)
+    missing = {key: task for key, task in tasks.items() if key not in known}
+    keys = list(missing)
+    for i, found in league_jobs.each(judge, list(missing.values()), options):
+        known[keys[i]] = {**dict(zip(_KEY, keys[i], strict=True)), **found}
+        _add(options.results, known[keys[i]])
+    measured = [known[key] for key in tasks]
+    return {"rows": rows(measured), "folds": measured}
+
+
+_KEY = ("set", "fold", "entrant", "budget_s", "seed")
+
+
+def _tasks(options: argparse.Namespace) -> dict[tuple[Any, ...], tuple[str, Fold, str]]:
+    """Return what is to be judged, by its key in --results."""
+    tasks = {}
     for name in options.sets:
         own = SETS[name]
         if not (options.data / own.folder).is_dir():
@@ -65,23 +85,17 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             continue
         for fold in own.folds(options.data)[: options.folds]:
             for entrant in options.entrants:
-                key = (name, fold.name, entrant, options.budget_s, options.seed)
-                if key not in known:
-                    known[key] = {**dict(zip(_KEY, key, strict=True)), **judge(own, fold, entrant, options)}
-                    _add(options.results, known[key])
-    measured = [r for r in known.values() if r["set"] in options.sets and r["entrant"] in options.entrants]
-    return {"rows": rows(measured), "folds": measured}
+                tasks[name, fold.name, entrant, options.budget_s, options.seed] = (name, fold, entrant)
+    return tasks
 
 
-_KEY = ("set", "fold", "entrant", "budget_s", "seed")
-
-
-def judge(own: LeagueSet, fold: Fold, entrant: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Return one entrant's figure on one fold, or why there is none."""
+def judge(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Return one entrant's figure on one fold of a set, or why there is none."""
+    own = SETS[name]
     short = replace(fold, fitted=_short(fold.fitted, options.samples), test=_short(fold.test, options.samples))
     begin = time.process_time()
     try:
-        predict, told = fit(own.name, short, entrant, options)
+        predict, told = fit(name, short, entrant, options)
         seconds = time.process_time() - begin
         each = [own.score(p, r) for p, r in zip(predict(short.test), short.test, strict=True)]
     except NotThereYet as reason:
@@ -98,10 +112,6 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
     """
     budget_s, seed = options.budget_s, options.seed
     if entrant == "ours":
-        if name not in league_ours.SETS or fold.spec is None:
-            raise NotThereYet(
-                "not there yet: no pipeline; a robot from its MJCF, or another maker's servo, is on its way"
-            )
         return league_ours.fit(name, fold, options.data, seed)
     if entrant.startswith("bam"):
         if name == "go2":

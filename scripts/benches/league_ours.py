@@ -1,8 +1,11 @@
-"""Our own entry in the league: what `sim2real identify` does with a pipeline as it is set up, a fold at a time."""
+"""Our own entry in the league: what `sim2real identify` does with a robot as it is set up, a fold at a time."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,23 +16,47 @@ import numpy as np
 from benches import identify, recordings
 from benches.league_sets import DISK_BLOCK, DISK_BLOCKS, Fold
 from benches.sysid import Recording
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.identify import prediction
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+from sim2real.stages import described
+from sim2real.stages.config import RobotFlags
+from sim2real.stages.recordings import open_recording
 
+Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 SETS = ("disk", "xl330", "so101")
-"""Sets with a pipeline of ours."""
+"""Sets with a pipeline of ours; of the others a model and logs are known, as behind --mjcf and --log."""
+ARM = """<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="servo" axis="0 1 0" damping="1" armature="0.02" frictionloss="0.2"/>
+      <inertial pos="0 0 -{length}" mass="{mass}" diaginertia="1e-4 1e-4 1e-4"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""The model that docs/guides/any_robot.md gives for a servo with a mass on an arm."""
 
 
-def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
-    """Identify with the pipeline's own configuration, which takes the time that it takes.
+def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
+    """Identify with our own configuration, which takes the time that it takes.
 
     Args:
-        name: The set, and the pipeline.
-        fold: What is held out; what is fitted is read anew, as logs.
+        name: The set.
+        fold: What is held out; where there is a pipeline, what is fitted is read anew, as logs.
         data: Folder of all recordings.
         seed: Seed of the search.
 
     Returns:
         What predicts the fold's test recordings, and what was done in words.
     """
+    return _fit_pipeline(name, fold, data, seed) if name in SETS else _fit_described(name, fold, seed)
+
+
+def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
     case = identify.make_case(argparse.Namespace(case=name, **dict.fromkeys(identify.BUDGET)))
     case = replace(case, config=replace(case.config, seed=seed))
     fit_spec, test_spec = fold.spec or ("", "")
@@ -48,8 +75,96 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Callable[[Sequenc
     return predict, f"{found.search.evaluations if found.search else 0} candidates, then refined"
 
 
-def _at(case: Any, columns: dict[str, np.ndarray], recording: int, own: Recording) -> np.ndarray:
-    """Return predicted positions at a recording's stamps, ``(N, joints)``."""
+def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:
+    """Identify a robot of which there is a model and logs, with the terms and the settings of `--mjcf`."""
+    # Whether gains are in the logs is decided by what is fitted; where they are all the same there is nothing to tell.
+    gains = len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
+    with tempfile.TemporaryDirectory() as folder:
+        logs = _written(fold.fitted, Path(folder), gains)
+        with contextlib.redirect_stderr(io.StringIO()):  # it says what it takes each column for, fold after fold
+            pipeline = described.from_flags(RobotFlags(mjcf=_model(fold.fitted, Path(folder))), [str(p) for p in logs])
+        robot = pipeline.load()
+        fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
+    config = replace(pipeline.identify, seed=seed)
+    case = identify.Case(name, config, robot, robot.identifiable(config.max_delay_s))
+    found = identify.identify(case, fitted)
+
+    def predict(own: Sequence[Recording]) -> list[np.ndarray]:
+        with tempfile.TemporaryDirectory() as folder:
+            test = [open_recording(p, pipeline, robot).episode for p in _written(own, Path(folder), gains)]
+        columns = _free_run(case, found.values, test, own)
+        return [_at(case, columns, r, one, started=True) for r, one in enumerate(own)]
+
+    terms = f"{len(found.problem.table)} parameters of --mjcf, refined from the model's"
+    return predict, f"{terms}; engine {found.problem.engine.name}"
+
+
+def _model(fitted: Sequence[Recording], folder: Path) -> Path:
+    """Return the model's file: the one that comes with the recordings, or the guide's arm with their load.
+
+    Raises:
+        UsageError: When their loads differ.
+    """
+    if "mjcf" in fitted[0].constants:
+        return Path(fitted[0].constants["mjcf"])
+    loads = {(r.constants["mass"], r.constants["length"]) for r in fitted}
+    if len(loads) > 1:
+        raise UsageError(f"recordings of one model have one load, got masses and lengths {sorted(loads)}")
+    ((mass, length),) = loads
+    path = folder / "arm.xml"
+    path.write_text(ARM.format(mass=mass, length=length))
+    return path
+
+
+def _written(own: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
+    """Return recordings as files of another recorder, with names that say what is what.
+
+    Args:
+        own: The recordings.
+        folder: Where to write.
+        gains: Whether the firmware's gain differs between recordings, and is in them.
+    """
+    paths = []
+    for i, r in enumerate(own):
+        columns: dict[str, Any] = {"t_s": r.t, "q_rad": r.position, "q_goal_rad": r.command}
+        if "torque_enable" in r.constants:
+            columns["torque_enable"] = np.asarray(r.constants["torque_enable"], np.float64)[:, None]
+        if gains:
+            columns["kp"] = np.full((len(r.t), 1), r.constants["duty_per_rad"])
+        np.savez(path := folder / f"log_{i}.npz", **columns)
+        paths.append(path)
+    return paths
+
+
+def _free_run(
+    case: identify.Case, values: dict[str, Any], test: Sequence[Episode], own: Sequence[Recording]
+) -> dict[str, np.ndarray]:
+    """Return columns of one simulation of each test recording, from the state that every entrant is given."""
+    # What is shown before the largest delay is not compared: without room beyond the delay that is next to nothing.
+    config = replace(case.config, max_delay_s=values["delay"] + 2 * case.robot.tick_s)
+    spans = [Span(r, 0.0, False) for r in range(len(test))]
+    problem = Problem(case.model, test, spans, max(e.duration_s for e in test), config)
+    # A cubic in time for each joint, of which position and velocity are known.
+    starts = np.stack([np.pad(r.start, ((0, 0), (0, 2))) for r in own])
+    problem.data = problem.data._replace(starts=starts.astype(np.float32))
+    columns = prediction.samples(problem, {"identified": values}, 0.0)
+    return columns | {"ahead": columns["into"]}
+
+
+def _at(
+    case: identify.Case, columns: dict[str, np.ndarray], recording: int, own: Recording, started: bool = False
+) -> np.ndarray:
+    """Return predicted positions at a recording's stamps, ``(N, joints)``.
+
+    Args:
+        case: What was identified.
+        columns: What was simulated.
+        recording: Which recording.
+        own: The same.
+        started: Whether the simulation begins in its first state, which then stands before what was predicted.
+    """
     pick = (columns["recording"] == recording) & (columns["ahead"] > 0)
-    t = columns["ahead"][pick]
-    return np.stack([np.interp(own.t - own.t[0], t, columns[f"{f}_identified"][pick]) for f in case.fields], axis=1)
+    t, first = columns["ahead"][pick], [0.0] if started else []
+    predicted = [columns[f"{f}_identified"][pick] for f in case.fields]
+    lines = [[*(own.start[j, :1] if started else []), *line] for j, line in enumerate(predicted)]
+    return np.stack([np.interp(own.t - own.t[0], [*first, *t], line) for line in lines], axis=1)

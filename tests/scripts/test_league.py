@@ -1,15 +1,33 @@
 """The league's entrants and its sets: each finds again what made a recording of its own form."""
 
+import argparse
+import importlib
+import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
+from sim2real.errors import UsageError
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import cmaes, league_bam, league_sets
+from benches import cmaes, league_bam, league_jobs, league_ours, league_sets
+from benches.league_sets import Fold
 from benches.sysid import Recording
+
+TASK = """
+import os
+
+def where(name, options):
+    flags, threads = os.environ["XLA_FLAGS"], os.environ["OPENBLAS_NUM_THREADS"]
+    return {"name": name, "process": os.getpid(), "processors": os.sched_getaffinity(0), "threads": (threads, flags)}
+"""
+"""A module of its own: a process imports the one of its task, and this one takes seconds."""
 
 
 def test_cma_es_finds_a_bent_valley_in_a_box():
@@ -101,3 +119,83 @@ def test_scores():
         "a joint that is not moved does not count"
     )
     assert league_sets.mae_mrad(predicted[:, :1], own.joint(0)) == pytest.approx(2.0)
+
+
+@pytest.fixture
+def quick_to_compile():
+    """What runs for milliseconds need not be compiled for speed."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def recorded():
+    """Records the guide's arm in C MuJoCo: a gain [N m/rad] for a duty per radian, a goal's frequency [rad/s]."""
+    model = mujoco.MjModel.from_xml_string(league_ours.ARM.format(mass=0.5, length=0.1))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+    def record(duty_per_rad, speed, start=(0.0, 0.0)):
+        data = mujoco.MjData(model)
+        data.qpos[0], data.qvel[0] = start
+        t = 0.02 * np.arange(100)
+        goal, q = 0.5 * np.sin(speed * t), []
+        for told in goal:
+            q.append(data.qpos[0])
+            for _ in range(10):
+                data.qfrc_applied[0] = 3.0 * duty_per_rad * (told - data.qpos[0])
+                mujoco.mj_step(model, data)
+        known = {"duty_per_rad": duty_per_rad, "mass": 0.5, "length": 0.1, "torque_enable": np.ones(100, bool)}
+        return Recording(t, goal[:, None], np.array(q)[:, None], np.array([start]), known)
+
+    return record
+
+
+def test_ours_identifies_an_arm_from_logs_and_sees_of_the_test_its_start_alone(recorded, quick_to_compile):
+    fold = Fold("a gain", (recorded(5.0, 4.0), recorded(10.0, 7.0)), (recorded(7.0, 5.0, (0.2, -1.0)),))
+    predict, told = league_ours.fit("sts3250", fold, Path(), 0)
+    assert told == "6 parameters of --mjcf, refined from the model's; engine c"
+    (test,) = fold.test
+    found, blind = predict([test, replace(test, position=np.full_like(test.position, 9.0))])
+    assert np.ptp(test.position) > 0.5
+    assert league_sets.mae_mrad(found, test) < 3.0, "gains that differ are a factor of one stiffness"
+    assert found[0, 0] == 0.2
+    np.testing.assert_allclose(blind, found, atol=1e-5)
+
+
+def test_ours_takes_the_model_that_comes_with_recordings_and_refuses_two_loads(recorded, tmp_path):
+    own = recorded(5.0, 4.0)
+    assert league_ours._model([replace(own, constants={"mjcf": "/a/robot.xml"})], tmp_path) == Path("/a/robot.xml")
+    model = mujoco.MjModel.from_xml_path(str(league_ours._model([own], tmp_path)))
+    assert model.body("arm").mass[0] == 0.5
+    with pytest.raises(UsageError, match="one load"):
+        league_ours._model([own, replace(own, constants={**own.constants, "mass": 1.0})], tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux holds a process on a processor")
+def test_jobs_are_processes_of_one_thread_and_one_processor(tmp_path, monkeypatch):
+    """What a task returns is told by its number, in whatever order they end."""
+    (tmp_path / "a_task.py").write_text(TASK)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", "--kept")
+    where, before = importlib.import_module("a_task").where, dict(os.environ)
+    found = dict(league_jobs.each(where, [("a",), ("b",), ("c",)], argparse.Namespace(jobs=2)))
+    assert os.environ == before
+    assert [found[i]["name"] for i in range(3)] == ["a", "b", "c"]
+    assert len({found[i]["process"] for i in range(3)} | {os.getpid()}) == 4, "a process a task"
+    flags = "--kept --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    assert all(f["threads"] == ("1", flags) and len(f["processors"]) == 1 for f in found.values())
+
+
+def test_one_job_is_done_here():
+    ((number, found),) = league_jobs.each(lambda a, o: {"sum": a + o.jobs}, [(2,)], argparse.Namespace(jobs=1))
+    assert (number, found) == (0, {"sum": 3})
+
+
+def test_a_job_that_fails_ends_the_others_and_leaves_the_environment(monkeypatch, tmp_path):
+    (tmp_path / "bad_task.py").write_text("def bad(name, options):\n    raise ValueError(name)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = dict(os.environ)
+    with pytest.raises(ValueError, match="a"):
+        list(league_jobs.each(importlib.import_module("bad_task").bad, [("a",)], argparse.Namespace(jobs=2)))
+    assert os.environ == before
