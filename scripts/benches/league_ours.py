@@ -57,16 +57,17 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
 
 
 def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
-    case = identify.make_case(argparse.Namespace(case=name, **dict.fromkeys(identify.BUDGET)))
+    pipeline = SETS[name]
+    case = identify.make_case(argparse.Namespace(case=pipeline, **dict.fromkeys(identify.BUDGET)))
     case = replace(case, config=replace(case.config, seed=seed))
     fit_spec, test_spec = fold.spec or ("", "")
     specs = [fit_spec]
     if name == "disk":
         left = int(fit_spec.split()[1])
         specs = [f"{DISK_BLOCK * i}:{DISK_BLOCK * (i + 1)}" for i in range(DISK_BLOCKS) if i != left]
-    fitted = {k: e for spec in specs for k, e in recordings.load(name, data, spec).items()}
+    fitted = {k: e for spec in specs for k, e in recordings.load(pipeline, data, spec).items()}
     found = identify.identify(case, fitted)
-    test = recordings.load(name, data, test_spec, recordings.PAST)
+    test = recordings.load(pipeline, data, test_spec, recordings.PAST)
 
     def predict(own: Sequence[Recording]) -> list[np.ndarray]:
         columns = identify.predict(case, {"identified": found.values}, test)

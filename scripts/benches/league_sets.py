@@ -141,7 +141,7 @@ def xl330(data: Path) -> list[Fold]:
 
 def so101(data: Path) -> list[Fold]:
     """Return one fold a motion."""
-    every = recordings.load("so101", data, "*")
+    every = recordings.load("so101_log", data, "*")
     own = {name: recording(e, "goal", "position") for name, e in every.items()}
     return [
         Fold(n, tuple(r for m, r in own.items() if m != n), (own[n],), (" ".join(m for m in own if m != n), n))
