@@ -26,8 +26,8 @@ from sim2real.stages.config import RobotFlags
 from sim2real.stages.recordings import open_recording
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
-SETS = ("disk", "xl330", "so101")
-"""Sets with a pipeline of ours; of the others a model and logs are known, as behind --mjcf and --log."""
+SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
+"""Sets with a pipeline of ours, and its name."""
 ARM = """<mujoco>
   <option timestep="0.002"/>
   <worldbody>

@@ -87,8 +87,9 @@ def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, e
         ahead: Whether samples behind ``begin`` may be used: those before it alone for what is predicted.
     """
     near = slice(max(begin - PAST, 0), begin + (PAST if ahead else 1))
-    if near.stop - near.start < PAST:
-        begin, near = begin + PAST, slice(begin, begin + PAST + 1)
+    if near.stop - near.start < PAST:  # where ours begins: recordings.PAST samples in
+        begin += recordings.PAST
+        near = slice(begin - PAST, begin + (PAST if ahead else 1))
     fits = [np.polyfit(t[near] - t[begin], own[near], 3) for own in position.T]
     start = np.array([[f[3], f[2]] for f in fits])
     return Recording(t[begin:end] - t[begin], command[begin:end], position[begin:end], start)

@@ -16,7 +16,7 @@ import pytest
 from sim2real.errors import UsageError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import cmaes, league_bam, league_jobs, league_ours, league_sets
+from benches import cmaes, league_bam, league_jobs, league_ours, league_sets, recordings
 from benches.league_sets import Fold
 from benches.sysid import Recording
 
@@ -92,7 +92,7 @@ def test_blocks_are_held_out_with_states_from_the_past_alone():
     np.testing.assert_allclose(test.start[0], [1.0, 2.0], rtol=1e-6)
     assert (test.t[0], len(test.t)) == (0.0, 51)
     (first,) = folds[0].test
-    assert len(first.t) == 100 - league_sets.PAST, "a state has to be known before it starts"
+    assert len(first.t) == 100 - recordings.PAST, "a state has to be known before it starts"
     shifted = position.copy()
     shifted[101:] = -9.0
     (same,) = league_sets.blocks(t, command, shifted, [0, 100, 151, 300], lambda i: None)[1].test
