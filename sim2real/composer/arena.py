@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.entity import Entity
 from sim2real.composer.models import parse
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.model import Model
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjSpec, RandomState
 
 BASE = """
 <mujoco model="base">
@@ -26,7 +29,7 @@ BASE = """
 
 
 @functools.cache
-def _base() -> Any:
+def _base() -> MjSpec:
     return parse.from_string(BASE)[0]
 
 
@@ -60,7 +63,7 @@ class Arena(Entity):
         frame.add("freejoint")
         return frame
 
-    def add_entity(self, entity: Entity, attachment_frame: Any = None) -> Element:
+    def add_entity(self, entity: Entity, attachment_frame: Model | Element | None = None) -> Element:
         """Attach an entity; the same as ``attach``."""
         return self.attach(entity, attachment_frame)
 
@@ -69,5 +72,5 @@ class Arena(Entity):
         """The geoms of the ground; none unless a subclass says so."""
         return []
 
-    def regenerate(self, random_state: Any) -> None:
+    def regenerate(self, random_state: RandomState) -> None:
         """Lay the arena out anew; nothing unless a subclass does."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from sim2real.composer.types import Array
 
-def is_jax(value: Any) -> bool:
+
+def is_jax(value: object) -> bool:
     """Return whether a value is a JAX array or tracer, without importing JAX."""
     jax = sys.modules.get("jax")
     return jax is not None and isinstance(value, jax.Array)
 
 
-def namespace(*values: Any) -> Any:
+def namespace(*values: object) -> Any:
     """Return ``jax.numpy`` when one of the values, or of their items, is JAX's; else ``numpy``."""
     for value in values:
         items = value if isinstance(value, list | tuple) else (value,)
@@ -25,7 +28,7 @@ def namespace(*values: Any) -> Any:
     return np
 
 
-def multiply_quaternions(a: Any, b: Any) -> Any:
+def multiply_quaternions(a: Array, b: Array) -> Array:
     """Return the product of two quaternions ``(4,)``, scalar first: first rotate by b, then by a."""
     xp = namespace(a, b)
     w1, x1, y1, z1 = (a[i] for i in range(4))
@@ -40,7 +43,7 @@ def multiply_quaternions(a: Any, b: Any) -> Any:
     )
 
 
-def rotate(vector: Any, quaternion: Any) -> Any:
+def rotate(vector: Array, quaternion: Array) -> Array:
     """Return a vector ``(3,)`` rotated by a unit quaternion ``(4,)``, scalar first."""
     xp = namespace(vector, quaternion)
     w, axis = quaternion[0], quaternion[1:]

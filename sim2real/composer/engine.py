@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from sim2real.composer.c.rendering import Graphics, new_scene
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.c.views import DataView, ModelView
+    from sim2real.composer.types import ArrayLike, MjrContext, MjrRect, MjvOption, MjvScene
 
 _FONTS = {name: getattr(mj.mjtFont, f"mjFONT_{name.upper()}") for name in ("normal", "shadow", "big")}
 _PLACES = {
@@ -21,8 +25,8 @@ _PLACES = {
 class Scenery(Protocol):
     """What a camera can look at: a ``Physics``."""
 
-    model: Any
-    data: Any
+    model: ModelView
+    data: DataView
     graphics: Graphics
 
 
@@ -85,8 +89,8 @@ class Camera:
         width: int = 320,
         camera_id: int | str = -1,
         max_geom: int | None = None,
-        scene_callback: Callable[[Any, Any], None] | None = None,
-        scene: Any = None,
+        scene_callback: Callable[[Any, MjvScene], None] | None = None,
+        scene: MjvScene | None = None,
     ) -> None:
         model = physics.model.ptr
         for name, size in (("width", width), ("height", height)):
@@ -122,12 +126,12 @@ class Camera:
         return self._size[1]
 
     @property
-    def option(self) -> Any:
+    def option(self) -> MjvOption:
         """What is drawn: an ``MjvOption``, to be changed in place."""
         return self._option
 
     @property
-    def scene(self) -> Any:
+    def scene(self) -> MjvScene:
         """The ``MjvScene``."""
         return self._scene
 
@@ -159,7 +163,7 @@ class Camera:
         translation[:3, 3] = -position
         return CameraMatrices(image, np.diag([-length, length, 1.0, 0.0])[:3], rotation, translation)
 
-    def update(self, scene_option: Any = None) -> None:
+    def update(self, scene_option: MjvOption | None = None) -> None:
         """Fill the scene with what the physics looks like now.
 
         Args:
@@ -177,8 +181,8 @@ class Camera:
         overlays: Sequence[TextOverlay] = (),
         depth: bool = False,
         segmentation: bool = False,
-        scene_option: Any = None,
-        render_flag_overrides: Mapping[Any, bool] | None = None,
+        scene_option: MjvOption | None = None,
+        render_flag_overrides: Mapping[str | int, bool] | None = None,
     ) -> np.ndarray:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
@@ -239,7 +243,7 @@ class MovableCamera(Camera):
         height: int = 240,
         width: int = 320,
         max_geom: int | None = None,
-        scene_callback: Callable[[Any, Any], None] | None = None,
+        scene_callback: Callable[[Any, MjvScene], None] | None = None,
     ) -> None:
         super().__init__(physics, height, width, -1, max_geom, scene_callback)
 
@@ -248,7 +252,7 @@ class MovableCamera(Camera):
         camera = self._camera
         return Pose(camera.lookat.copy(), camera.distance, camera.azimuth, camera.elevation)
 
-    def set_pose(self, lookat: Any, distance: float, azimuth: float, elevation: float) -> None:
+    def set_pose(self, lookat: ArrayLike, distance: float, azimuth: float, elevation: float) -> None:
         """Put the camera somewhere; see ``Pose``.
 
         Args:
@@ -280,6 +284,6 @@ class TextOverlay:
                 raise UsageError(f"texts have no style or position {given!r}. Available: {', '.join(known)}")
         self.title, self.body, self.style, self.position = title, body, _FONTS[style], _PLACES[position]
 
-    def draw(self, context: Any, rect: Any) -> None:
+    def draw(self, context: MjrContext, rect: MjrRect) -> None:
         """Draw it with an ``MjrContext`` into an ``MjrRect``."""
         mj.mjr_overlay(self.style, self.position, rect, self.title, self.body, context)

@@ -6,7 +6,7 @@ import logging
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arrays import multiply_quaternions, namespace, rotate
 from sim2real.composer.errors import NotAttachedError
@@ -16,6 +16,10 @@ from sim2real.composer.models.traversal import get_attachment_frame, get_frame_f
 from sim2real.composer.observables import Observables
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.observation.observable.base import Observable
+    from sim2real.composer.types import AnyPhysics, Array, ArrayLike, Hook, MjSpec, RandomState
+
 _log = logging.getLogger(__name__)
 
 
@@ -24,22 +28,22 @@ class FreePropObservableMixin(ABC):
 
     @property
     @abstractmethod
-    def position(self) -> Any:
+    def position(self) -> Observable:
         """Position ``(3,)`` [m]."""
 
     @property
     @abstractmethod
-    def orientation(self) -> Any:
+    def orientation(self) -> Observable:
         """Quaternion ``(4,)``, scalar first."""
 
     @property
     @abstractmethod
-    def linear_velocity(self) -> Any:
+    def linear_velocity(self) -> Observable:
         """Velocity ``(3,)`` [m/s]."""
 
     @property
     @abstractmethod
-    def angular_velocity(self) -> Any:
+    def angular_velocity(self) -> Observable:
         """Angular velocity ``(3,)`` [rad/s]."""
 
 
@@ -55,8 +59,8 @@ class Entity(ABC):
     """
 
     def __init__(self, *args: Any, observable_options: dict[str, Any] | None = None, **kwargs: Any) -> None:
-        self._post_init_hooks: list[Any] = []
-        self._parent: Any = None
+        self._post_init_hooks: list[Hook] = []
+        self._parent: weakref.ref[Entity] | None = None
         self._attached: list[Entity] = []
         self._default_model: Model | None = None
         self._build(*args, **kwargs)
@@ -97,7 +101,7 @@ class Entity(ABC):
         return self._parent() if self._parent else None
 
     @property
-    def attachment_site(self) -> Any:
+    def attachment_site(self) -> Model | Element:
         """Where other entities are attached unless told otherwise: a site or the model."""
         return self.mjcf_model
 
@@ -113,7 +117,7 @@ class Entity(ABC):
         for entity in self._attached:
             yield from entity.iter_entities()
 
-    def attach(self, entity: Entity, attach_site: Any = None) -> Element:
+    def attach(self, entity: Entity, attach_site: Model | Element | None = None) -> Element:
         """Attach another entity without degrees of freedom; return its frame, to which joints may be added.
 
         Args:
@@ -141,30 +145,30 @@ class Entity(ABC):
 
     # -- hooks: they do nothing unless a subclass overrides them
 
-    def initialize_episode_mjcf(self, random_state: Any) -> None:  # noqa: B027
+    def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
         """Change the model before it is compiled for an episode."""
 
-    def after_compile(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_compile(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Look at the compiled model."""
 
-    def initialize_episode(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def initialize_episode(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Set the state at the start of an episode."""
 
-    def before_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def before_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act before a control step."""
 
-    def before_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def before_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act before a step of the physics."""
 
-    def after_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a step of the physics."""
 
-    def after_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a control step."""
 
     # -- poses and frames
 
-    def global_vector_to_local_frame(self, physics: Any, vec_in_world_frame: Any) -> Any:
+    def global_vector_to_local_frame(self, physics: AnyPhysics, vec_in_world_frame: ArrayLike) -> Array:
         """Return vectors of the world, shape ``(..., 3)`` or ``(..., 2)``, in this entity's axes; same shape.
 
         Raises:
@@ -178,7 +182,7 @@ class Entity(ABC):
         xmat = xp.reshape(xp.asarray(physics.bind(self.root_body).xmat), (3, 3))
         return xp.dot(vector, xmat[:size, :size])
 
-    def global_xmat_to_local_frame(self, physics: Any, xmat: Any) -> Any:
+    def global_xmat_to_local_frame(self, physics: AnyPhysics, xmat: ArrayLike) -> Array:
         """Return a rotation of the world, shape ``(3, 3)`` or ``(9,)``, seen from this entity; same shape.
 
         Raises:
@@ -198,13 +202,15 @@ class Entity(ABC):
         joint = get_frame_freejoint(self.mjcf_model)
         return (get_attachment_frame(self.mjcf_model), False) if joint is None else (joint, True)
 
-    def get_pose(self, physics: Any) -> tuple[Any, Any]:
+    def get_pose(self, physics: AnyPhysics) -> tuple[Array, Array]:
         """Return position ``(3,)`` [m] and quaternion ``(4,)``: of the world with a free joint, else of the parent."""
         holder, free = self._pose_holder()
         bound = physics.bind(holder)
         return (bound.qpos[:3], bound.qpos[3:]) if free else (bound.pos, bound.quat)
 
-    def set_pose(self, physics: Any, position: Any = None, quaternion: Any = None) -> None:
+    def set_pose(
+        self, physics: AnyPhysics, position: ArrayLike | None = None, quaternion: ArrayLike | None = None
+    ) -> None:
         """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent.
 
         Args:
@@ -228,7 +234,11 @@ class Entity(ABC):
             physics.set(holder, "quat", quaternion)
 
     def shift_pose(
-        self, physics: Any, position: Any = None, quaternion: Any = None, rotate_velocity: bool = False
+        self,
+        physics: AnyPhysics,
+        position: ArrayLike | None = None,
+        quaternion: ArrayLike | None = None,
+        rotate_velocity: bool = False,
     ) -> None:
         """Move and turn from the present pose.
 
@@ -245,13 +255,13 @@ class Entity(ABC):
             new_position = xp.asarray(old_position) + xp.asarray(position)
         if quaternion is not None:
             xp = namespace(quaternion, old_quaternion)
-            quaternion = xp.asarray(quaternion, dtype=float)
-            new_quaternion = multiply_quaternions(quaternion, xp.asarray(old_quaternion))
+            turn = xp.asarray(quaternion, dtype=float)
+            new_quaternion = multiply_quaternions(turn, xp.asarray(old_quaternion))
             if rotate_velocity and self._pose_holder()[1]:
-                self.set_velocity(physics, rotate(xp.asarray(self.get_velocity(physics)[0]), quaternion))
+                self.set_velocity(physics, rotate(xp.asarray(self.get_velocity(physics)[0]), turn))
         self.set_pose(physics, new_position, new_quaternion)
 
-    def get_velocity(self, physics: Any) -> tuple[Any, Any]:
+    def get_velocity(self, physics: AnyPhysics) -> tuple[Array, Array]:
         """Return linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s, local frame].
 
         Raises:
@@ -263,7 +273,9 @@ class Entity(ABC):
         qvel = physics.bind(holder).qvel
         return qvel[:3], qvel[3:]
 
-    def set_velocity(self, physics: Any, velocity: Any = None, angular_velocity: Any = None) -> None:
+    def set_velocity(
+        self, physics: AnyPhysics, velocity: ArrayLike | None = None, angular_velocity: ArrayLike | None = None
+    ) -> None:
         """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint.
 
         Args:
@@ -280,7 +292,7 @@ class Entity(ABC):
         if angular_velocity is not None:
             physics.write(holder, "qvel", angular_velocity, slice(3, 6))
 
-    def configure_joints(self, physics: Any, position: Any) -> None:
+    def configure_joints(self, physics: AnyPhysics, position: ArrayLike) -> None:
         """Set the positions of this entity's own joints, frame joints of its children included."""
         physics.set(self.mjcf_model.find_all("joint", exclude_attachments=True), "qpos", position)
 
@@ -292,7 +304,7 @@ class ModelWrapperEntity(Entity):
         mjcf_model: The model, or an ``MjSpec``.
     """
 
-    def _build(self, mjcf_model: Any) -> None:
+    def _build(self, mjcf_model: Model | MjSpec) -> None:
         self._mjcf_model = mjcf_model if isinstance(mjcf_model, Model) else Model(spec=mjcf_model)
 
     @property

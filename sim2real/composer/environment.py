@@ -8,7 +8,7 @@ import warnings
 import weakref
 from collections import OrderedDict
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dm_env
 import numpy as np
@@ -19,6 +19,11 @@ from sim2real.composer.hooks import Hooks
 from sim2real.composer.observation.updater import Updater
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.c.physics import Physics
+    from sim2real.composer.entity import Entity
+    from sim2real.composer.types import Hook
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +72,7 @@ class Environment(dm_env.Environment):
         self,
         task: Task,
         time_limit: float = math.inf,
-        random_state: Any = None,
+        random_state: np.random.RandomState | int | None = None,
         n_sub_steps: int | None = None,
         raise_exception_on_physics_error: bool = True,
         strip_singleton_obs_buffer_dim: bool = False,
@@ -77,7 +82,7 @@ class Environment(dm_env.Environment):
         delayed_observation_padding: ObservationPadding = ObservationPadding.ZERO,
         legacy_step: bool = True,
         *,
-        arena: Any = None,
+        arena: Entity | None = None,
     ) -> None:
         if not isinstance(delayed_observation_padding, ObservationPadding):
             raise UsageError(
@@ -128,7 +133,7 @@ class Environment(dm_env.Environment):
         return self._task
 
     @property
-    def physics(self) -> Any:
+    def physics(self) -> Physics:
         """The physics, as a weak reference: it dies when the models are compiled anew and at ``close``."""
         return self._proxy
 
@@ -143,7 +148,7 @@ class Environment(dm_env.Environment):
             return self._physics.timestep() * self._n_sub_steps_given
         return self._task.control_timestep
 
-    def add_extra_hook(self, hook_name: str, hook_callable: Any) -> None:
+    def add_extra_hook(self, hook_name: str, hook_callable: Hook) -> None:
         """Run a function after the hooks of the task and its entities; the arguments are those of the task's hook.
 
         Raises:

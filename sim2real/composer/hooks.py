@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sim2real.composer.entity import Entity
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sim2real.composer.types import Hook
+
+T = TypeVar("T")
 
 HOOK_NAMES = (
     "initialize_episode_mjcf",
@@ -33,8 +39,8 @@ class Hooks:
     def __init__(self, task: Task) -> None:
         self._task = task
         self._labels = {name: f"{type(task).__name__}.{name}" for name in HOOK_NAMES}
-        self._entity_hooks: dict[str, list[tuple[str, Callable[..., Any]]]] = {}
-        self._extra: dict[str, list[Callable[..., Any]]] = {name: [] for name in HOOK_NAMES}
+        self._entity_hooks: dict[str, list[tuple[str, Hook]]] = {}
+        self._extra: dict[str, list[Hook]] = {name: [] for name in HOOK_NAMES}
         self.refresh()
 
     def refresh(self) -> None:
@@ -45,7 +51,7 @@ class Hooks:
             found = [(f"{type(e).__name__}.{name}", getattr(e, name)) for e in entities if _overrides(e, Entity, name)]
             self._entity_hooks[name] = [(label, wrap(hook)) for label, hook in found]
 
-    def add(self, name: str, hook: Callable[..., Any]) -> None:
+    def add(self, name: str, hook: Hook) -> None:
         """Run a function after the hooks of the task and the entities.
 
         Raises:
@@ -69,22 +75,22 @@ class Hooks:
         for hook in self._extra[name]:
             self.call(name, hook, *args)
 
-    def call(self, label: str, function: Callable[..., Any], *args: Any) -> Any:
+    def call(self, label: str, function: Callable[..., T], *args: Any) -> T:
         """Return what a function returns; ``label`` says which one it is."""
         del label
         return function(*args)
 
 
-def _overrides(owner: Any, base: type, name: str) -> bool:
+def _overrides(owner: Task | Entity, base: type, name: str) -> bool:
     """Return whether an object has a hook of its own, in its class or as an attribute."""
     return name in vars(owner) or getattr(type(owner), name, None) is not getattr(base, name)
 
 
-def _as_it_is(hook: Callable[..., Any]) -> Callable[..., Any]:
+def _as_it_is(hook: Hook) -> Hook:
     return hook
 
 
-def _with_action(hook: Callable[..., Any]) -> Callable[..., Any]:
+def _with_action(hook: Hook) -> Hook:
     """Return an entity's hook as a function of physics, action and randomness; most take no action."""
     try:
         parameters = inspect.signature(hook).parameters.values()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import AnyPhysics, RandomState
 
 
 class Initializer(ABC):
     """Sets a part of the initial state; called from ``initialize_episode``."""
 
     @abstractmethod
-    def __call__(self, physics: Any, random_state: Any) -> Any:
+    def __call__(self, physics: AnyPhysics, random_state: RandomState) -> Any:
         """Set the state.
 
         Raises:

@@ -6,10 +6,15 @@ import functools
 import inspect
 import weakref
 from collections import OrderedDict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer import define
 from sim2real.composer.observation.observable.base import Generic, Observable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sim2real.composer.types import AnyPhysics
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
 """What ``set_options`` can set."""
@@ -18,7 +23,7 @@ OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "c
 class ObservableKeys:
     """``observables.dict_keys.position`` is the key of ``position`` in an observation."""
 
-    def __init__(self, entity: Any, observables: dict[str, Any]) -> None:
+    def __init__(self, entity: Any, observables: dict[str, Observable]) -> None:
         self._entity, self._observables = entity, observables
 
     def __getattr__(self, name: str) -> str:
@@ -42,7 +47,7 @@ class Observables:
 
     def __init__(self, entity: Any) -> None:
         self._entity = weakref.proxy(entity)
-        self._observables: OrderedDict[str, Any] = OrderedDict()
+        self._observables: OrderedDict[str, Observable] = OrderedDict()
         self._keys = ObservableKeys(self._entity, self._observables)
         for name in _declared(type(self)):
             self._observables[name] = getattr(self, name)
@@ -54,12 +59,12 @@ class Observables:
         """Name -> key in an observation, as attributes."""
         return self._keys
 
-    def as_dict(self, fully_qualified: bool = True) -> OrderedDict[str, Any]:
+    def as_dict(self, fully_qualified: bool = True) -> OrderedDict[str, Observable]:
         """Return name -> observable; names are prefixed with the entity's full name unless told otherwise."""
         prefix = self._entity.mjcf_model.full_identifier if fully_qualified else ""
         return OrderedDict((prefix + name, value) for name, value in self._observables.items())
 
-    def get_observable(self, name: str, name_fully_qualified: bool = False) -> Any:
+    def get_observable(self, name: str, name_fully_qualified: bool = False) -> Observable:
         """Return an observable.
 
         Raises:
@@ -104,7 +109,7 @@ class Observables:
         for value in self._observables.values():
             value.enabled = False
 
-    def add_observable(self, name: str, observable: Any, enabled: bool = True) -> None:
+    def add_observable(self, name: str, observable: Observable | Callable[[Any], Any], enabled: bool = True) -> None:
         """Add an observable, or a function of ``physics`` that returns the value.
 
         Args:
@@ -117,7 +122,7 @@ class Observables:
         self._observables[name] = observable
         observable.enabled = enabled
 
-    def get_observation(self, physics: Any) -> dict[str, Any]:
+    def get_observation(self, physics: AnyPhysics) -> dict[str, Any]:
         """Return the present value of every observable, without delays and buffers."""
         return {name: value(physics) for name, value in self._observables.items()}
 

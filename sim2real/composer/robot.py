@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.composer.entity import Entity
 from sim2real.composer.models.element import Element
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 DOWN_QUATERNION = np.array([0.0, 0.70710678118, 0.70710678118, 0.0])
 """The orientation of a hand that points down."""
@@ -19,7 +22,7 @@ class Robot(Entity):
 
     @property
     @abstractmethod
-    def actuators(self) -> Any:
+    def actuators(self) -> Sequence[Element]:
         """The actuators, in the order of an action."""
 
     @property

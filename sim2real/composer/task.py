@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dm_env import specs
@@ -16,6 +16,12 @@ from sim2real.composer.entity import Entity
 from sim2real.composer.models.layout import names_of
 from sim2real.composer.observation.observable.base import Generic
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sim2real.composer.observation.observable.base import Observable
+    from sim2real.composer.types import AnyPhysics, Array, RandomState
 
 UNLIMITED = 1e10
 """Bound of an action that has none, in dm_control's specs."""
@@ -54,9 +60,9 @@ class Task(ABC):
         return self.root_entity.iter_entities()
 
     @property
-    def observables(self) -> OrderedDict[str, Any]:
+    def observables(self) -> OrderedDict[str, Observable]:
         """Name -> observable: those of the task, then those of every entity."""
-        found: OrderedDict[str, Any] = OrderedDict()
+        found: OrderedDict[str, Observable] = OrderedDict()
         for name, function in define.declared(self).items():
             found[name] = Generic(function)
             found[name].enabled = True
@@ -66,7 +72,7 @@ class Task(ABC):
         return found
 
     @property
-    def task_observables(self) -> Any:
+    def task_observables(self) -> Mapping[str, Observable]:
         """Name -> observable of what belongs to no entity."""
         return OrderedDict()
 
@@ -117,7 +123,7 @@ class Task(ABC):
         """Physics steps in a control step."""
         return _steps(self.control_timestep, self.physics_timestep)
 
-    def action_spec(self, physics: Any) -> specs.BoundedArray:
+    def action_spec(self, physics: AnyPhysics) -> specs.BoundedArray:
         """Return shape ``(nu,)`` and bounds of an action; its name lists the actuators, separated by tabs."""
         model = physics.model
         limited = np.asarray(model.actuator_ctrllimited, bool)
@@ -131,26 +137,26 @@ class Task(ABC):
             name="\t".join(name or str(i) for i, name in enumerate(names)),
         )
 
-    def get_reward_spec(self) -> Any:
+    def get_reward_spec(self) -> specs.Array | None:
         """Return the spec of a reward that is no number; None: it is one."""
         return None
 
-    def get_discount_spec(self) -> Any:
+    def get_discount_spec(self) -> specs.BoundedArray | None:
         """Return the spec of a discount that is no number in [0, 1]; None: it is one."""
         return None
 
     # -- hooks
 
-    def initialize_episode_mjcf(self, random_state: Any) -> None:  # noqa: B027
+    def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
         """Change the models before they are compiled for an episode."""
 
-    def after_compile(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_compile(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Look at the compiled model."""
 
-    def initialize_episode(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def initialize_episode(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Set the state at the start of an episode."""
 
-    def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+    def before_step(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:
         """Act before a control step; default: the action, shape ``(nu,)``, becomes the control.
 
         Args:
@@ -161,7 +167,7 @@ class Task(ABC):
         del random_state
         physics.set_control(action)
 
-    def before_substep(self, physics: Any, action: Any, random_state: Any) -> None:  # noqa: B027
+    def before_substep(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:  # noqa: B027
         """Act before a step of the physics.
 
         Args:
@@ -170,26 +176,26 @@ class Task(ABC):
             random_state: The random numbers of this episode.
         """
 
-    def after_substep(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a step of the physics."""
 
-    def after_step(self, physics: Any, random_state: Any) -> None:  # noqa: B027
+    def after_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a control step."""
 
     @abstractmethod
-    def get_reward(self, physics: Any) -> Any:
+    def get_reward(self, physics: AnyPhysics) -> Any:
         """Return the reward of the step that was just taken."""
 
-    def should_terminate_episode(self, physics: Any) -> Any:
+    def should_terminate_episode(self, physics: AnyPhysics) -> bool | Array:
         """Return whether the episode ends here; default: what ``get_termination`` says."""
         return self.get_termination(physics)
 
-    def get_termination(self, physics: Any) -> Any:
+    def get_termination(self, physics: AnyPhysics) -> bool | Array:
         """Return whether the episode ends here; another name for ``should_terminate_episode``."""
         del physics
         return False
 
-    def get_discount(self, physics: Any) -> Any:
+    def get_discount(self, physics: AnyPhysics) -> float | Array:
         """Return the discount of what comes after this step, in [0, 1]."""
         del physics
         return 1.0
@@ -205,7 +211,7 @@ class NullTask(Task):
     def __init__(self, root_entity: Entity | None = None) -> None:
         self._root_entity = Arena() if root_entity is None else root_entity
 
-    def get_reward(self, physics: Any) -> float:
+    def get_reward(self, physics: AnyPhysics) -> float:
         """Return 0."""
         del physics
         return 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,13 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseWorld
 
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
+    from mujoco import mjx
+
+    from sim2real.composer.models.element import Elements
+    from sim2real.composer.types import MjModel
+
 
 @struct.dataclass
 class WorldParams(Base):
@@ -32,9 +39,9 @@ class WorldParams(Base):
         qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
     """
 
-    values: Any
-    qpos: Any = None
-    qvel: Any = None
+    values: dict[str, jax.Array]
+    qpos: ArrayLike | None = None
+    qvel: ArrayLike | None = None
 
 
 @struct.dataclass
@@ -45,7 +52,7 @@ class Observations(Base):
         values: Key of the observable -> array.
     """
 
-    values: Any
+    values: dict[str, jax.Array]
 
 
 class ComposedWorld(BaseWorld):
@@ -79,7 +86,7 @@ class ComposedWorld(BaseWorld):
         task: Task,
         command: str = "actuator",
         field: str = "action",
-        parameters: Mapping[str, tuple[Any, str]] | None = None,
+        parameters: Mapping[str, tuple[Elements, str]] | None = None,
         rate: float | None = None,
         color: str | None = None,
         order: int | None = None,
@@ -112,7 +119,7 @@ class ComposedWorld(BaseWorld):
         for name, (elements, attribute) in self._parameters.items():
             physics.set(elements, attribute, params.values[name])
 
-    def _model(self, params: WorldParams, starts: bool = False) -> Any:
+    def _model(self, params: WorldParams, starts: bool = False) -> mjx.Model:
         """Return the model with the parameters in it; what follows from masses and lengths is computed at the start."""
         physics = self._view()
         self._set(physics, params)
@@ -120,13 +127,13 @@ class ComposedWorld(BaseWorld):
             physics.recompute_constants()
         return physics.mjx_model
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> WorldParams:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> WorldParams:
         """Return the parameters' compiled values."""
         del rng, graph_state
         physics = self._view()
         return WorldParams({k: jnp.asarray(physics.get(*place)) for k, place in self._parameters.items()})
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> State:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> State:
         """Return the start of an episode."""
         key, params = jax.random.key(0) if rng is None else rng, self._params(graph_state)
         model = self.environment.model
@@ -140,12 +147,12 @@ class ComposedWorld(BaseWorld):
         """Return the message that says what a state is; default: the task's observation."""
         return Observations(state.observation)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the message at the start of the episode."""
         state = (graph_state or GraphState()).state.get(self.name)
         return self.output(self.init_state(rng, graph_state) if state is None else state)
 
-    def entered(self, state: State, action: Any) -> State:
+    def entered(self, state: State, action: jax.Array) -> State:
         """Return the state with which a control step under an action begins; default: as it is.
 
         Args:
@@ -178,14 +185,14 @@ class ComposedWorld(BaseWorld):
         """Whether constants of the model follow from fields that differ."""
         return self._derives
 
-    def open_loop(self) -> Any:
+    def open_loop(self) -> MjModel:
         """Take the physics out and return the ``MjModel``; UsageError where that would change what happens."""
         check_steps(self, ComposedWorld)
         open_loop.check(self.environment, self.entered, self.output, self.name)
         self._apart = True
         return self.environment.model
 
-    def fields(self, params: WorldParams, state: State) -> dict[str, Any]:
+    def fields(self, params: WorldParams, state: State) -> dict[str, jax.Array]:
         """Return the fields of the model that differ from the compiled one: parameters, and what hooks set at a start.
 
         Args:
@@ -207,14 +214,14 @@ class ComposedWorld(BaseWorld):
         del params
         return Start(state.data.qpos, state.data.qvel, state.data.qacc_warmstart)
 
-    def controls(self, step_state: StepState) -> tuple[StepState, Any]:
+    def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
         """Run the hooks of a tick without its physics; return the controls of its physics steps ``(substeps, nu)``."""
         action = self._action(step_state)
         state = self.entered(step_state.state, action)
         state, controls = self.environment.step_apart(state, action, self._model(step_state.params))
         return step_state.replace(state=state), controls
 
-    def message(self, state: State, qpos: Any, qvel: Any, qacc: Any) -> Any:
+    def message(self, state: State, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> Any:
         """Return what the world sends.
 
         Args:
@@ -226,11 +233,11 @@ class ComposedWorld(BaseWorld):
         data = state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)
         return self.output(dataclasses.replace(state, data=data))
 
-    def ends(self, state: State) -> tuple[Any, Any]:
+    def ends(self, state: State) -> tuple[jax.Array, jax.Array]:
         """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""
         return state.done & ~state.truncated, state.truncated
 
-    def _action(self, step_state: StepState) -> Any:
+    def _action(self, step_state: StepState) -> jax.Array:
         return getattr(step_state.inputs[self.input_name].data, self.field)[-1]
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from typing import Any, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar, cast
 
 import jax
+import numpy as np
 from flax import struct
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 T = TypeVar("T", bound="Base")
+Array: TypeAlias = jax.Array | np.ndarray
+"""JAX's arrays where a program is compiled, numpy's where nodes run on a clock."""
+Number: TypeAlias = Array | np.number | np.bool_ | float
+"""A scalar of either, or Python's."""
+Value: TypeAlias = jax.Array | float
+"""A quantity in a compiled program: a number, or one for each joint."""
 
 
 class Base:
@@ -24,7 +34,7 @@ class Base:
         # flax gives each of its dataclasses this very method, where no type checker sees it.
         return dataclasses.replace(cast(Any, self), **changes)
 
-    def _map(self: T, op: Any, other: Any) -> T:
+    def _map(self: T, op: Callable[..., Any], other: Any) -> T:
         same = jax.tree_util.tree_structure(self) == jax.tree_util.tree_structure(other)
         if same:
             return jax.tree_util.tree_map(op, self, other)
@@ -66,9 +76,9 @@ class InputState(Base):
         delay_dist: The connection's ``TrainableDist``, None if its delay is not trainable; indexing leaves it whole.
     """
 
-    seq: Any
-    ts_sent: Any
-    ts_recv: Any
+    seq: Array
+    ts_sent: Array
+    ts_recv: Array
     data: Any
     delay_dist: Any = None
 
@@ -91,13 +101,13 @@ class StepState(Base):
         ts: float32: when the step started [s from the episode's start].
     """
 
-    rng: Any = None
+    rng: jax.Array | None = None
     state: Any = None
     params: Any = None
-    inputs: Any = struct.field(default_factory=dict)
-    eps: Any = 0
-    seq: Any = 0
-    ts: Any = 0.0
+    inputs: dict[str, InputState] = struct.field(default_factory=dict)
+    eps: Number = 0
+    seq: Number = 0
+    ts: Number = 0.0
 
 
 @struct.dataclass
@@ -118,12 +128,12 @@ class GraphState(Base):
         aux: For the user; the graph passes it on unchanged.
     """
 
-    eps: Any = 0
-    step: Any = -1
-    rng: Any = struct.field(default_factory=dict)
-    params: Any = struct.field(default_factory=dict)
-    state: Any = struct.field(default_factory=dict)
-    seq: Any = struct.field(default_factory=dict)
-    delays: Any = struct.field(default_factory=dict)
-    buffer: Any = struct.field(default_factory=dict)
-    aux: Any = struct.field(default_factory=dict)
+    eps: Number = 0
+    step: Number = -1
+    rng: dict[str, jax.Array] = struct.field(default_factory=dict)
+    params: dict[str, Any] = struct.field(default_factory=dict)
+    state: dict[str, Any] = struct.field(default_factory=dict)
+    seq: dict[str, Number] = struct.field(default_factory=dict)
+    delays: dict[str, dict[str, Any]] = struct.field(default_factory=dict)
+    buffer: dict[str, Any] = struct.field(default_factory=dict)
+    aux: dict[str, Any] = struct.field(default_factory=dict)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
@@ -34,7 +33,7 @@ def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, Bas
     return found
 
 
-def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, Any] | None = None) -> None:
+def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, object] | None = None) -> None:
     """Check that every sender is in the graph: the object itself, not only a node of the same name.
 
     Args:

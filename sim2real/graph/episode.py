@@ -193,7 +193,7 @@ def named_leaves(tree: Any) -> dict[str, Any]:
         return dict(tree)
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
 
-    def label(path: Any) -> str:
+    def label(path: tuple[object, ...]) -> str:
         return ".".join(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path) or "value"
 
     return {label(path): leaf for path, leaf in flat}

@@ -7,12 +7,15 @@ import operator
 from collections.abc import Callable
 from enum import Enum
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import UsageError
-from sim2real.graph.base import Empty, GraphState, StepState
+from sim2real.graph.base import Empty, GraphState, StepState, Value
 from sim2real.graph.delays import DelayDistribution, StaticDist, TrainableDist
 from sim2real.graph.episode import TICKS_PER_S as TICKS_PER_S
+
+if TYPE_CHECKING:
+    import jax
 
 
 class Scheduling(Enum):
@@ -243,22 +246,22 @@ class BaseNode:
         """
         self._clock, self._origin_ns = clock, origin_ns
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the node's parameters."""
         del rng, graph_state
         return Empty()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the node's state at the start of an episode."""
         del rng, graph_state
         return Empty()
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the default output: the message in a reader's window before the first real one has arrived."""
         del rng, graph_state
         return Empty()
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+    def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return delays [s] by input name, for inputs with a trainable delay; other entries are ignored."""
         del rng, graph_state
         return {}
@@ -343,7 +346,7 @@ def _expected_delay(delay: float | None, dist: DelayDistribution, where: str) ->
     return float(value)
 
 
-def _rate(rate: Any, where: str) -> float:
+def _rate(rate: object, where: str) -> float:
     value = float(rate) if isinstance(rate, Real) else math.nan
     if not (math.isfinite(value) and value > 0):
         raise UsageError(f"{where}: rate must be a positive number of hertz, got {rate!r}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
+T = TypeVar("T")
 
-def tree_dynamic_slice(tree: Any, start_indices: jax.Array) -> Any:
+
+def tree_dynamic_slice(tree: T, start_indices: jax.Array) -> T:
     """Take one element along each of the leading axes, which stay as axes of length one; indices are clamped.
 
     Args:
@@ -29,6 +31,6 @@ def tree_dynamic_slice(tree: Any, start_indices: jax.Array) -> Any:
     return jax.tree_util.tree_map(one, tree)
 
 
-def strong(tree: Any) -> Any:
+def strong(tree: T) -> T:
     """Return the tree without JAX's weak types, which would change the type of a scan's carry."""
     return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)

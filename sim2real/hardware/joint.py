@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from sim2real.hardware.device import Device, Reading
 
 _POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0}
 """Unit -> power of the gear by which the motor's value is the larger one: it turns faster, with less torque."""
+
+
+T = TypeVar("T", "float", "np.ndarray")
 
 
 @dataclass(frozen=True)
@@ -54,15 +57,15 @@ class Joint:
         """Whether the joint's angle is the encoder's."""
         return self.zero_rad == 0.0 and self.direction == 1 and self.gear == 1.0
 
-    def angle(self, encoder_rad: Any) -> Any:
+    def angle(self, encoder_rad: T) -> T:
         """Return the joint's angle [rad] for an encoder's, of any shape."""
         return self.direction * (encoder_rad - self.zero_rad) / self.gear
 
-    def encoder(self, angle_rad: Any) -> Any:
+    def encoder(self, angle_rad: T) -> T:
         """Return what the encoder reads [rad] at an angle of the joint, of any shape."""
         return self.zero_rad + self.direction * self.gear * angle_rad
 
-    def speed(self, encoder_rad_s: Any) -> Any:
+    def speed(self, encoder_rad_s: T) -> T:
         """Return the joint's speed [rad/s] for the encoder's, of any shape."""
         return self.direction * encoder_rad_s / self.gear
 

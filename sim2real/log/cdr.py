@@ -9,11 +9,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 # The ROS name of every element type and its code in `struct`.
@@ -135,7 +138,7 @@ class Layout:
             }
         )
 
-    def pack(self, values: Sequence[Any]) -> bytes:
+    def pack(self, values: Sequence[npt.ArrayLike]) -> bytes:
         """Encode one message.
 
         Args:
@@ -158,7 +161,7 @@ class Layout:
         except (struct.error, TypeError, ValueError) as error:
             raise Sim2RealError(f"{self._culprit(values)}: {error}") from error
 
-    def _culprit(self, values: Sequence[Any]) -> str:
+    def _culprit(self, values: Sequence[npt.ArrayLike]) -> str:
         """Return a description of the scalar that could not be encoded."""
         for part, value in zip(self.fields, values, strict=True):
             if not part.shape:
@@ -170,7 +173,7 @@ class Layout:
         return "a message cannot be encoded"
 
 
-def _array_bytes(part: CdrField, value: Any) -> bytes:
+def _array_bytes(part: CdrField, value: npt.ArrayLike) -> bytes:
     array = np.asarray(value)
     if array.shape != part.shape:
         raise Sim2RealError(f"field {part.name!r} has shape {array.shape}, expected {part.shape}")

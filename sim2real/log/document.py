@@ -63,7 +63,7 @@ def decode(record: Mapping[str, str]) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     """Convert a value that JSON does not know."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

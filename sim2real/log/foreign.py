@@ -11,12 +11,15 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.bags import read_bag
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot", ".mcap": "mcap"}
 """File suffix -> format, used unless a format is given."""
@@ -291,7 +294,7 @@ _READERS: dict[str, Callable[[Path], ForeignFile]] = {
 }
 
 
-def _numbers(raw: Any, what: str) -> np.ndarray:
+def _numbers(raw: npt.ArrayLike, what: str) -> np.ndarray:
     """Return a value as an array of float64, float32 or int64."""
     try:
         values = np.asarray(raw)
@@ -312,7 +315,7 @@ def _index(text: str) -> int | slice:
     return slice(*(int(part) if part.strip() else None for part in text.split(":")))
 
 
-def _walk(value: Any, parts: Sequence[str], path: Path) -> Any:
+def _walk(value: object, parts: Sequence[str], path: Path) -> Any:
     """Return the value at a path in a JSON document; ``[]`` collects it from all elements of a list."""
     if not parts:
         return value
@@ -334,7 +337,7 @@ def _walk(value: Any, parts: Sequence[str], path: Path) -> Any:
     raise KeyError(head)
 
 
-def _paths(value: Any, trail: str = "") -> list[str]:
+def _paths(value: object, trail: str = "") -> list[str]:
     """Return the paths to all values of a JSON document; for a list of objects, those of the first object."""
     if isinstance(value, dict):
         return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."))]

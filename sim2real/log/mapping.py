@@ -229,7 +229,7 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
     )
 
 
-def _table(value: Any, where: str) -> Mapping[str, Any]:
+def _table(value: object, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise UsageError(f"{where} must be a table, got {value!r}", hint=_HINT)
     return value
@@ -279,7 +279,7 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _quoted(value: Any) -> str:
+def _quoted(value: object) -> str:
     """Return a value as TOML writes it."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)

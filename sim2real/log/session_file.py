@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -32,6 +32,9 @@ from sim2real.log.schema import (
     step_topic,
     unique_names,
 )
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 LIBRARY = "sim2real"
 # Small, so that reading a range decompresses little, and a damaged byte costs little data.
@@ -146,7 +149,7 @@ class SessionFile:
         for event in self._early_events:
             self.event(*event)
 
-    def step(self, record: StepRecord, leaves: Sequence[Any]) -> None:
+    def step(self, record: StepRecord, leaves: Sequence[npt.ArrayLike]) -> None:
         """Write a step, its output and its joint states."""
         node = self._nodes.get(record.node)
         if node is None:
@@ -286,8 +289,8 @@ def _to_host(leaves: list[Any]) -> list[Any]:
     return [np.asarray(leaf) if hasattr(leaf, "__array__") else leaf for leaf in leaves]
 
 
-def _joint_state(source: JointSource, leaves: Sequence[Any], time_ns: int) -> bytes:
-    values: list[Any] = [time_ns // 1_000_000_000, time_ns % 1_000_000_000]
+def _joint_state(source: JointSource, leaves: Sequence[npt.ArrayLike], time_ns: int) -> bytes:
+    values: list[int | list[float]] = [time_ns // 1_000_000_000, time_ns % 1_000_000_000]
     values += [
         [float("nan") if i < 0 else float(np.ravel(leaves[i])[element]) for i, element in picks]
         for picks in source.picks

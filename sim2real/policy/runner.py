@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,9 @@ OBSERVATION_CLIP = 10.0
 BACKENDS = ("numpy", "onnx")
 
 
+T = TypeVar("T")
+
+
 class Backend(Protocol):
     """Maps a finite observation, float32 of shape ``(1, O)``, to an action, shape ``(1, A)``."""
 
@@ -24,7 +27,7 @@ class Backend(Protocol):
         ...
 
 
-def layers_of(weights: Mapping[str, Any]) -> list[tuple[Any, Any]]:
+def layers_of(weights: Mapping[str, T]) -> list[tuple[T, T]]:
     """Return the pairs ``(kernel, bias)`` of ``layers.0.kernel``, ``layers.0.bias``, ``layers.1.kernel``, ...
 
     Raises:

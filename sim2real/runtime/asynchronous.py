@@ -345,7 +345,7 @@ class AsyncGraph:
         return Reply(step_state, self._run_data[self.supervisor.name].form.pack(output))
 
 
-def _check_supervisor(supervisor: Any, nodes: Any) -> None:
+def _check_supervisor(supervisor: object, nodes: Any) -> None:
     if isinstance(supervisor, BaseNode):
         return
     given = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,12 @@ from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.program import Rollout, RowProgram
 from sim2real.runtime.walk import Walk
 from sim2real.runtime.wiring import Wiring, wire
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Number
+
+
+T = TypeVar("T")
 
 
 class CompiledGraph:
@@ -93,7 +99,7 @@ class CompiledGraph:
         rng: jax.Array,
         params: Mapping[str, Any] | None = None,
         order: Sequence[str] = (),
-        eps: Any = 0,
+        eps: Number = 0,
     ) -> GraphState:
         """Return the state at the start of an episode.
 
@@ -202,7 +208,7 @@ class CompiledGraph:
         inside = not _traced(gs.step)
         return self._scan(gs, record, rows, lambda state: self._run_row(state, inside))
 
-    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, Any]]) -> Any:
+    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
         """Run the world's ticks alone, by another function in place of its step.
 
         For physics that runs outside of the program: ``drive`` says what the world hears and when, ``replay`` what the
@@ -248,9 +254,13 @@ class CompiledGraph:
         return self._scan(gs, record, self.rows, row)[1]
 
     def _scan(
-        self, gs: GraphState, record: Sequence[str], rows: int, row: Callable[[GraphState], tuple[GraphState, Any]]
+        self,
+        gs: GraphState,
+        record: Sequence[str],
+        rows: int,
+        row: Callable[[GraphState], tuple[GraphState, dict[str, list[Rollout]]]],
     ) -> tuple[GraphState, dict[str, Rollout]]:
-        def body(state: GraphState, _: None) -> tuple[GraphState, Any]:
+        def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
             state, outputs = row(state)
             kept = {n: outputs.get(n, []) for n in record}
             return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
@@ -277,7 +287,7 @@ class CompiledGraph:
                 hint="give its recorded outputs: CompiledGraph(..., given={...})",
             )
 
-    def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Any]:
+    def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Number]:
         """Run a row up to the supervisor's step, and return what the supervisor sees.
 
         Args:
@@ -349,7 +359,7 @@ class CompiledGraph:
         gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside)
         return self.program.run_world(gs, outputs, inside), outputs
 
-    def _awaited(self, gs: GraphState, call: str) -> Any:
+    def _awaited(self, gs: GraphState, call: str) -> Number:
         """Return the number of the supervisor's step that the caller makes next."""
         if self.supervisor not in gs.seq:
             raise UsageError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,10 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
 from sim2real.runtime.init import default_output
 from sim2real.runtime.wiring import EMPTY_AGE_S
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Array
+    from sim2real.graph.delays import DelayDistribution
 
 
 class Message(NamedTuple):
@@ -53,7 +57,7 @@ class Format:
             arrays[i] = array.astype(like.dtype, copy=False)
         return arrays
 
-    def unpack(self, leaves: Sequence[Any]) -> Any:
+    def unpack(self, leaves: Sequence[Array]) -> Any:
         """Return the output that has these leaves."""
         return jax.tree_util.tree_unflatten(self.tree, leaves)
 
@@ -77,7 +81,7 @@ class Window:
         delay_dist: The trainable delay that steps see in ``InputState.delay_dist``, or None.
     """
 
-    def __init__(self, connection: Connection, form: Format, size: int, delay_dist: Any) -> None:
+    def __init__(self, connection: Connection, form: Format, size: int, delay_dist: DelayDistribution | None) -> None:
         self.connection, self.size, self._form, self._dist = connection, size, form, delay_dist
         self._leaves = [np.broadcast_to(d, (size, *d.shape)).copy() for d in form.default]
         self._seq = np.full(size, -1, np.int32)
@@ -179,7 +183,7 @@ def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str
     )
 
 
-def _shift(old: np.ndarray, entries: Sequence[Any]) -> np.ndarray:
+def _shift(old: np.ndarray, entries: Sequence[int | np.ndarray]) -> np.ndarray:
     """Return ``old`` with new entries at its end and as many dropped at its start; at most ``len(old)`` new ones."""
     out = np.empty_like(old)
     count = len(entries)

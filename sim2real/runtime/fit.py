@@ -28,7 +28,7 @@ def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timel
     return {n: node for n, node in found.items() if n in timeline.vertices}
 
 
-def supervisor_of(supervisor: Any, nodes: Mapping[str, BaseNode]) -> str:
+def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> str:
     """Return the supervisor's name; ``supervisor`` is the name or the node.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,9 @@ def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: Base
         phase_ticks(node)
         waits_for_schedule(node)
     return found
+
+
+T = TypeVar("T")
 
 
 def init_graph_state(
@@ -110,7 +113,7 @@ def _delays(node: BaseNode, key: jax.Array, state: GraphState) -> dict[str, Trai
     return {n: dist.with_delay(given[n]) if n in given else dist for n, dist in trainable.items()}
 
 
-def _fixed(node: BaseNode, tree: Any) -> Any:
+def _fixed(node: BaseNode, tree: T) -> T:
     """Return arrays without JAX's weak types; a node in plain Python keeps its own objects."""
     return jax.tree_util.tree_map(_strong, tree) if node.jittable else tree
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,14 @@ import numpy as np
 
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
 
-def matched(node: str, what: str, got: Any, reference: str, like: Any) -> Any:
+
+T = TypeVar("T")
+
+
+def matched(node: str, what: str, got: T, reference: str, like: object) -> T:
     """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``; no value changes.
 
     Args:
@@ -26,14 +32,14 @@ def matched(node: str, what: str, got: Any, reference: str, like: Any) -> Any:
     """
     check_match(node, what, got, reference, like)
 
-    def cast(new: Any, old: Any) -> Any:
+    def cast(new: ArrayLike, old: ArrayLike) -> ArrayLike:
         dtype = jnp.result_type(old)
         return new if new is old or jnp.issubdtype(dtype, jax.dtypes.extended) else jnp.asarray(new, dtype)
 
     return jax.tree_util.tree_map(cast, got, like)
 
 
-def check_match(node: str, what: str, got: Any, reference: str, like: Any) -> None:
+def check_match(node: str, what: str, got: object, reference: str, like: object) -> None:
     """Check that two trees have equal structures, shapes and dtypes.
 
     Dtypes may differ where JAX converts without loss: a Python number takes the dtype of ``like`` (``0`` may become a
@@ -66,7 +72,7 @@ def check_match(node: str, what: str, got: Any, reference: str, like: Any) -> No
         )
 
 
-def _describe(leaf: Any) -> Any:
+def _describe(leaf: object) -> Any:
     """Return shape and dtype of a leaf; None if it is neither an array nor a number."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,12 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.runtime.match import check_match, matched
 from sim2real.runtime.wiring import SlotTable, Wiring
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Number
+
+
+T = TypeVar("T")
 
 
 class Rollout(NamedTuple):
@@ -22,7 +28,7 @@ class Rollout(NamedTuple):
         output: Leaves ``(C, ...)``; meaningless where ``seq`` is -1.
     """
 
-    seq: Any
+    seq: Number
     output: Any
 
 
@@ -92,7 +98,7 @@ class RowProgram:
         name, before, here = self.wiring.world, gs, None if inside else gs.step < self.wiring.rows
         if name is not None:
 
-            def tick(gs: GraphState, now: Any) -> tuple[GraphState, Rollout]:
+            def tick(gs: GraphState, now: dict[str, Any]) -> tuple[GraphState, Rollout]:
                 step_state = self._step_state(gs, name, now)
                 new, output = self.call(name, step_state)
                 return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
@@ -109,14 +115,14 @@ class RowProgram:
         gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
-    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, Any]]) -> Any:
+    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
         """Run the world's ticks of a whole episode by another function; see ``CompiledGraph.drive``."""
         world: Any = self.wiring.world
         flat = lambda t: t[:, gs.eps].reshape(-1, *t.shape[3:])  # noqa: E731 - (R, E, ticks, ...) -> (R * ticks, ...)
         # What a tick hears does not depend on the ticks before it: looked up for all of them at once.
         seen = jax.vmap(lambda now: self._step_state(gs, world, now))(jax.tree_util.tree_map(flat, self._world))
 
-        def tick(state: Any, now: Any) -> tuple[Any, Any]:
+        def tick(state: Any, now: tuple[dict[str, InputState], Number, Number]) -> tuple[Any, T]:
             inputs, seq, ts = now
             new, output = step(StepState(gs.rng[world], state, gs.params[world], inputs, gs.eps, seq, ts))
             return matched(world, "the state that a driven tick returns", new.state, "the one it got", state), output
@@ -144,12 +150,12 @@ class RowProgram:
             table["seq"] = self.seq(gs, slot)
         return self._step_state(gs, self.wiring.slots[slot], table)
 
-    def seq(self, gs: GraphState, slot: int) -> Any:
+    def seq(self, gs: GraphState, slot: int) -> jax.Array:
         """Return the number of the step that a slot makes; -1 if it makes none, and after the last row."""
         inside = gs.step < self.wiring.rows
         return jnp.where(inside, self._tables[slot]["seq"][gs.step, gs.eps], -1)
 
-    def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Any) -> GraphState:
+    def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Number | None) -> GraphState:
         """Put the results of a node's step into the graph's state.
 
         Args:
@@ -160,7 +166,7 @@ class RowProgram:
             ran: Bool scalar, whether the step counts; None: it does, which saves masking.
         """
 
-        def merge(field: str, fresh: Any, old: Any) -> Any:
+        def merge(field: str, fresh: T, old: T) -> T:
             if fresh is old:
                 return old
             fresh = matched(name, f"the {field} that step returns", fresh, "the one it got", old)
@@ -201,7 +207,7 @@ class RowProgram:
         rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
         return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
 
-    def _look_up(self, gs: GraphState, sender: str, seq: Any) -> Any:
+    def _look_up(self, gs: GraphState, sender: str, seq: jax.Array) -> Any:
         """Return the recorded messages with these ``seq (W,)``; the default output where it is -1."""
 
         def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
@@ -211,7 +217,7 @@ class RowProgram:
         return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
 
 
-def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
+def _window(kept: tuple[T, ...], age: jax.Array, width: int) -> T:
     """Return a window of ``width`` of a node's last outputs, oldest first; ``age`` newer ones are left out.
 
     The outputs are kept as separate arrays and chosen by selects, which XLA fuses with other elementwise operations.
@@ -224,7 +230,7 @@ def _window(kept: tuple[Any, ...], age: jax.Array, width: int) -> Any:
     return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
 
 
-def select(mask: Any, new: Any, old: Any) -> Any:
+def select(mask: Number, new: T, old: T) -> T:
     """Return ``new`` if ``mask`` is true, else ``old``, leaf by leaf.
 
     MJX's data is one leaf: its own ``where`` skips fields that need no merging.
@@ -243,7 +249,7 @@ def select(mask: Any, new: Any, old: Any) -> Any:
     return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
 
 
-def _is_mjx_data(leaf: Any) -> bool:
+def _is_mjx_data(leaf: object) -> bool:
     return type(leaf).__module__.startswith("mujoco.mjx") and hasattr(leaf, "where")
 
 
@@ -254,5 +260,5 @@ def _pytree(table: SlotTable | None) -> dict[str, Any]:
     return {"seq": table.seq, "ts": table.ts, "inputs": inputs}
 
 
-def _at(table: Any, gs: GraphState) -> Any:
+def _at(table: T, gs: GraphState) -> T:
     return jax.tree_util.tree_map(lambda t: t[gs.step, gs.eps], table)

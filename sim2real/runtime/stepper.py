@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,13 @@ from sim2real.runtime.data import NodeData
 from sim2real.runtime.handover import Reply
 from sim2real.runtime.match import matched
 
+if TYPE_CHECKING:
+    from sim2real.graph.base import Array, Number
+
 _CARRIED = ("rng", "params", "state")
+
+
+T = TypeVar("T")
 
 
 class Result(NamedTuple):
@@ -30,7 +36,7 @@ class Result(NamedTuple):
     """
 
     changed: dict[str, Any]
-    ts: Any
+    ts: Number | None
     leaves: list[np.ndarray]
 
 
@@ -66,7 +72,7 @@ class Stepper:
         if jit:
             default = data.form.unpack(data.form.default)
 
-            def call(step_state: StepState, ages: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+            def call(step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, Any], Any]:
                 return self._matched(step_state, *self._call(step_state, ages), default)
 
             traced = jax.jit(call).trace(*arguments)
@@ -108,7 +114,7 @@ class Stepper:
         made = self.run(data, reply.step_state or given, ages)
         return Result({**before, **made.changed}, made.ts, made.leaves)
 
-    def _call(self, step_state: StepState, ages: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+    def _call(self, step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, Any], Any]:
         result = self.node.step(_served(self.node, step_state, ages))
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], StepState)):
             raise UsageError(
@@ -117,7 +123,9 @@ class Stepper:
             )
         return _changed(step_state, result[0]), result[1]
 
-    def _matched(self, given: StepState, changed: dict[str, Any], output: Any, default: Any) -> tuple[dict, Any]:
+    def _matched(
+        self, given: StepState, changed: dict[str, Any], output: T, default: object
+    ) -> tuple[dict[str, Any], T]:
         """Return a step's results in the dtypes of the node's state and default output."""
         name = self.node.name
         for field in _CARRIED:
@@ -127,7 +135,7 @@ class Stepper:
         return changed, matched(name, "the output of step", output, "that of init_output", default)
 
 
-def overwritten(ts: Any, begin: int, now: int, node: str) -> int:
+def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
     """Return the start that a step has set itself [ticks]; -1 if it has not changed it (rule 4).
 
     Times are compared in float32, the type of ``StepState.ts``.
@@ -159,7 +167,7 @@ def _changed(given: StepState, new: StepState) -> dict[str, Any]:
     return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(given, f)}
 
 
-def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Any]) -> StepState:
+def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Array]) -> StepState:
     """Return the step state with trainable delays applied to the inputs that have ``ages``."""
     if not ages:
         return step_state

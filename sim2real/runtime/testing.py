@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.testing.nodes import hash_step
 from sim2real.runtime.wiring import SlotTable, Wiring
 
-Windows = dict[str, tuple[list[int], list[Any]]]
+Windows = dict[str, tuple[list[int], list[int]]]
 """Input name -> (seq of each message in the window, value of each), oldest first."""
 
 
@@ -23,10 +22,10 @@ def interpret(
     nodes: Mapping[str, BaseNode],
     wiring: Wiring,
     episode: int,
-    step: Callable[[str, int, Windows], Any],
-    defaults: Mapping[str, Any],
-    given: Mapping[str, list[Any]] | None = None,
-) -> dict[str, list[Any]]:
+    step: Callable[[str, int, Windows], int],
+    defaults: Mapping[str, int],
+    given: Mapping[str, list[int]] | None = None,
+) -> dict[str, list[int]]:
     """Play one episode and return the outputs of each node, by seq.
 
     Messages are looked up as in the compiled program, by their age in a buffer of the sender's last outputs, and each
@@ -44,7 +43,7 @@ def interpret(
         TableError: When a window has another message than the table says, or a node's steps are not in order.
     """
     rings = {n: [(-1, defaults[n])] * length for n, length in wiring.rings.items()}
-    made: dict[str, list[Any]] = {n: [] for n in nodes}
+    made: dict[str, list[int]] = {n: [] for n in nodes}
 
     def one(name: str, table: SlotTable, at: tuple[int, ...]) -> None:
         seq = int(table.seq[at])
@@ -84,8 +83,8 @@ def interpret_hashes(
     nodes: Mapping[str, BaseNode],
     wiring: Wiring,
     episode: int,
-    states: Mapping[str, Any],
-    outputs: Mapping[str, Any],
+    states: Mapping[str, int],
+    outputs: Mapping[str, int],
 ) -> dict[str, np.ndarray]:
     """Play one episode of hash nodes.
 

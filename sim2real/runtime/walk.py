@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.program import RowProgram, select
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Number
 
 
 class Walk:
@@ -85,11 +88,11 @@ class Walk:
         found = self.program.seq(gs, self.turns[0]) >= 0
         return self._stand(*self._search(gs, jnp.int32(0), found, int(self.places[:, 0].max())))
 
-    def turn_of(self, gs: GraphState, k: Any) -> Any:
+    def turn_of(self, gs: GraphState, k: Number) -> jax.Array:
         """Return the turn at which the supervisor makes step ``k``."""
         return jnp.asarray(self.places)[gs.eps, jnp.maximum(k, 0)] % len(self.turns)
 
-    def to_next(self, gs: GraphState, turn: Any, ended: Any) -> tuple[GraphState, StepState]:
+    def to_next(self, gs: GraphState, turn: jax.Array, ended: Number) -> tuple[GraphState, StepState]:
         """Run to the supervisor's next step.
 
         Args:
@@ -99,14 +102,14 @@ class Walk:
         """
         return self._stand(*self._search(gs, turn, ended, int(np.diff(self.places, axis=1).max(initial=1))))
 
-    def seen(self, gs: GraphState, turn: Any) -> StepState:
+    def seen(self, gs: GraphState, turn: jax.Array) -> StepState:
         """Return what the supervisor sees at a turn; ``seq`` is -1 if it makes no step there."""
         step_state = self.program.step_state(gs, self.turns[0])
         for i, slot in enumerate(self.turns[1:], start=1):
             step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
         return step_state
 
-    def _stand(self, gs: GraphState, turn: Any) -> tuple[GraphState, StepState]:
+    def _stand(self, gs: GraphState, turn: jax.Array) -> tuple[GraphState, StepState]:
         """Return the state with the supervisor's next step noted in ``seq``, and what the supervisor sees."""
         step_state = self.seen(gs, turn)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state
@@ -120,7 +123,7 @@ class Walk:
         gs = self.program.run_world(gs, {}, inside=True)
         return self.program.run_slots(gs, 0, self.turns[0], {})
 
-    def _search(self, gs: GraphState, turn: Any, found: Any, hops: int) -> tuple[GraphState, Any]:
+    def _search(self, gs: GraphState, turn: jax.Array, found: Number, hops: int) -> tuple[GraphState, jax.Array]:
         """Run from turn to turn until the supervisor makes a step; return the state and the turn.
 
         Always runs ``hops`` turns, the most that any step needs: once the step is found, and after the last row, the

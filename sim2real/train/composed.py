@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ from sim2real.composer.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
 from sim2real.train.protocol import Step
+
+if TYPE_CHECKING:
+    from sim2real.composer.mjx.environment import State
 
 
 class TaskEnvironment:
@@ -36,12 +39,12 @@ class TaskEnvironment:
             )
         self.action_low, self.action_high = bounds
 
-    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+    def reset(self, key: jax.Array) -> tuple[State, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state = self.environment.reset(key)
         return state, _vector(state)
 
-    def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
+    def step(self, state: State, action: jax.Array, key: jax.Array) -> Step:
         """Make one control step.
 
         Args:
@@ -55,7 +58,7 @@ class TaskEnvironment:
         return Step(new, _vector(new), new.reward, ends, new.truncated, jnp.bool_(True), {})
 
 
-def _vector(state: Any) -> jax.Array:
+def _vector(state: State) -> jax.Array:
     """Return all observables as one vector, shape ``(O,)``."""
     values = [jnp.ravel(value) for value in state.observation.values()]
     return jnp.concatenate(values) if values else jnp.zeros(0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ import numpy as np
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class TrainingTask(Protocol):
@@ -89,7 +92,9 @@ class GraphEnvironment:
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
         # Worlds of composed tasks have a method `ends`. Looked up by name: importing their class would import MuJoCo.
-        found: dict[str, Any] = {name: getattr(node, "ends", None) for name, node in graph.nodes.items()}
+        found: dict[str, Callable[[Any], tuple[jax.Array, jax.Array]] | None] = {
+            name: getattr(node, "ends", None) for name, node in graph.nodes.items()
+        }
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
 
     def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
@@ -104,7 +109,7 @@ class GraphEnvironment:
     def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
         """Make the supervisor's step with the policy's action, then run the graph up to its next step."""
         del key
-        valid = state.step_state.seq >= 0
+        valid: Any = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)
         gs = self.graph.advance(state.graph, step_state, output, inside=True)
         reward = self.task.reward(gs, action)
@@ -113,7 +118,7 @@ class GraphEnvironment:
         total = state.total + reward
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
         terminated = jnp.any(jnp.array([e[0] for e in ended], bool))
-        truncated = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
+        truncated: Any = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (self.length - self.length // 2)}
         new = EnvState(gs, step_state, total, good)

@@ -8,7 +8,6 @@ observation; use ``jax.vmap`` for more.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -91,12 +90,12 @@ class Policy(Base):
         high: Shape ``(A,)``: upper bound of the action.
     """
 
-    layers: Any
-    log_std: Any
-    mean: Any
-    std: Any
-    low: Any
-    high: Any
+    layers: Layers
+    log_std: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    low: jax.Array
+    high: jax.Array
 
     def normalise(self, observation: jax.Array) -> jax.Array:
         """Return the network's input for ``observation``, both of shape ``(O,)``."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from sim2real.train.networks import Policy, init_mlp
 from sim2real.train.protocol import TrainingEnvironment, check_environment
 from sim2real.train.rollout import Copies, evaluate
 from sim2real.train.update import Normaliser, TrainState, keys, make_optimiser, make_policy, update
+
+if TYPE_CHECKING:
+    import optax
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +143,7 @@ def _init(env: TrainingEnvironment, config: PPOConfig, key: jax.Array) -> TrainS
     count, size, actions = config.num_envs, env.observation_size, np.shape(env.action_low)[0]
     keys = jnp.stack([jax.random.fold_in(key, seed) for seed in range(config.num_seeds)])
 
-    def one(key_data: np.ndarray) -> tuple[Any, Any, Any]:
+    def one(key_data: np.ndarray) -> tuple[dict[str, Any], optax.OptState, tuple[np.float32, np.ndarray, np.ndarray]]:
         rng = np.random.default_rng(key_data)
         params = {
             "actor": init_mlp(rng, (size, *config.hidden, actions), 0.01),
@@ -159,7 +162,10 @@ def _init(env: TrainingEnvironment, config: PPOConfig, key: jax.Array) -> TrainS
     )
 
 
-def _blank(shapes: Any, leading: tuple[int, ...]) -> Any:
+T = TypeVar("T")
+
+
+def _blank(shapes: T, leading: tuple[int, ...]) -> T:
     """Return zeros of given shapes and dtypes, with leading axes; in numpy, as jnp.zeros compiles for each shape."""
 
     def leaf(struct: jax.ShapeDtypeStruct) -> jax.Array | np.ndarray:

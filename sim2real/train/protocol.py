@@ -105,7 +105,7 @@ def check_environment(env: TrainingEnvironment) -> None:
     _check_state(start, step.state)
 
 
-def _check_state(start: Any, after: Any) -> None:
+def _check_state(start: object, after: object) -> None:
     """Compare the states that ``reset`` and ``step`` return, leaf by leaf."""
     if jax.tree.structure(start) != jax.tree.structure(after):
         raise UsageError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ class Copies(NamedTuple):
 
     state: Any
     observation: jax.Array
+
+
+T = TypeVar("T")
 
 
 class Rows(NamedTuple):
@@ -46,7 +49,11 @@ class Rows(NamedTuple):
     following: jax.Array
 
 
-def select(mask: jax.Array, new: Any, old: Any) -> Any:
+_Carry = tuple[Copies, jax.Array, jax.Array, dict[str, jax.Array]]
+"""Copies, which of them run, their returns, and their metrics."""
+
+
+def select(mask: jax.Array, new: T, old: T) -> T:
     """Return ``new`` where ``mask`` is true, else ``old``, for each of N copies.
 
     Args:
@@ -130,7 +137,7 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
     zeros = jnp.zeros(config.eval_envs)
     start = (copies, jnp.ones(config.eval_envs, bool), zeros, {name: zeros for name in names})
 
-    def row(carry: Any, key: jax.Array) -> tuple[Any, None]:
+    def row(carry: _Carry, key: jax.Array) -> tuple[_Carry, None]:
         copies, running, total, metrics = carry
         keys = jax.random.split(key, config.eval_envs)
         step = jax.vmap(env.step)(copies.state, jax.vmap(policy.get_action)(copies.observation), keys)

@@ -42,11 +42,15 @@ class TrainState(NamedTuple):
     """
 
     params: dict[str, Any]
-    optimiser: Any
+    optimiser: optax.OptState
     normaliser: Normaliser
     copies: Copies
     update: jax.Array
     key: jax.Array
+
+
+_Learnt = tuple[Any, optax.OptState]
+"""Parameters, and the state of the optimiser."""
 
 
 class Batch(NamedTuple):
@@ -129,7 +133,7 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
 
     def back(
         carry: tuple[jax.Array, jax.Array, jax.Array], x: tuple[Rows, jax.Array, jax.Array]
-    ) -> tuple[Any, jax.Array]:
+    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
         later_advantage, later_value, later_reward = carry  # of the next policy step, and of the rows before it
         row, value, following = x
         end = row.terminated | row.truncated
@@ -242,7 +246,7 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
     batch = prepare(state.params, policy, rows, config)
     optimiser = make_optimiser(config)
 
-    def minibatch(carry: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], dict[str, jax.Array]]:
+    def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
         params, optimiser_state = carry
         part = jax.tree.map(lambda leaf: leaf[index].reshape(-1, *leaf.shape[2:]), batch)
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,12 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.worlds.mjx import MjxParams, MjxWorld
 from sim2real.worlds.recorded import command_delay
+
+if TYPE_CHECKING:
+    import jax
+
+    from sim2real.composer.types import MjModel
+    from sim2real.graph.base import Value
 
 
 @struct.dataclass
@@ -27,13 +33,13 @@ class DriveCommand(Base):
         enabled: 1 with torque on, 0 with torque off.
     """
 
-    goal: Any = None
-    goal_velocity: Any = None
-    torque: Any = None
-    duty: Any = None
-    kp: Any = None
-    kd: Any = None
-    enabled: Any = None
+    goal: Value | None = None
+    goal_velocity: Value | None = None
+    torque: Value | None = None
+    duty: Value | None = None
+    kp: Value | None = None
+    kd: Value | None = None
+    enabled: Value | None = None
 
 
 @struct.dataclass
@@ -51,11 +57,11 @@ class DriveParams(MjxParams):
         zero: What the encoders read at the model's zero [rad].
     """
 
-    kp: Any = 0.0
-    kd: Any = 0.0
-    gain: Any = 1.0
-    released: Any = 0.0
-    zero: Any = 0.0
+    kp: Value = 0.0
+    kd: Value = 0.0
+    gain: Value = 1.0
+    released: Value = 0.0
+    zero: Value = 0.0
 
 
 class DrivenWorld(MjxWorld):
@@ -73,7 +79,7 @@ class DrivenWorld(MjxWorld):
     """
 
     def __init__(
-        self, name: str, rate: float, model: Any, units: tuple[float, float] = (1.0, 1.0), **options: Any
+        self, name: str, rate: float, model: MjModel, units: tuple[float, float] = (1.0, 1.0), **options: Any
     ) -> None:
         super().__init__(name, rate, model, **options)
         self.units = units
@@ -81,12 +87,12 @@ class DrivenWorld(MjxWorld):
         self.qpos_at, self.qvel_at = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
         self.lead_s = 0.5 * float(model.opt.timestep)
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DriveParams:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DriveParams:
         """Return the model at its reference, with drives that do nothing."""
         own = super().init_params(rng, graph_state)
         return DriveParams(own.model, own.qpos, own.qvel)
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+    def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, where the actuator's parameters set one.
 
         MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: that is added.
@@ -94,7 +100,7 @@ class DrivenWorld(MjxWorld):
         del rng
         return {name: delay + self.lead_s for name, delay in command_delay(graph_state, self.input_name).items()}
 
-    def _control(self, step_state: StepState) -> Any:
+    def _control(self, step_state: StepState) -> jax.Array:
         """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command."""
         p: DriveParams = step_state.params
         told: DriveCommand = step_state.inputs[self.input_name][-1].data
@@ -109,6 +115,6 @@ class DrivenWorld(MjxWorld):
         return jnp.concatenate([force, kp, kd])
 
 
-def _of_log(gain: Any, unit: float) -> Any:
+def _of_log(gain: Value | None, unit: float) -> Value:
     """Return the log's own gain in its unit; 1 where it has none."""
     return 1.0 if gain is None else gain / unit

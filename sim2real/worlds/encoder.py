@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 from flax import struct
 
 from sim2real.graph.base import Base
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Value
 
 
 @struct.dataclass
@@ -23,19 +26,19 @@ class Encoder(Base):
         phase: Direction of that displacement [rad].
     """
 
-    offset: Any = 0.0
-    eccentricity: Any = 0.0
-    phase: Any = 0.0
+    offset: Value = 0.0
+    eccentricity: Value = 0.0
+    phase: Value = 0.0
 
-    def read(self, angle: Any) -> Any:
+    def read(self, angle: Value) -> Value:
         """Return the reading [rad] at an angle [rad]."""
         return angle + self.offset + self.eccentricity * jnp.sin(angle + self.phase)
 
-    def rate(self, angle: Any, velocity: Any) -> Any:
+    def rate(self, angle: Value, velocity: Value) -> Value:
         """Return the rate of change of the reading [rad/s] at an angle [rad] and a velocity [rad/s]."""
         return velocity * (1.0 + self.eccentricity * jnp.cos(angle + self.phase))
 
-    def angle(self, reading: Any) -> Any:
+    def angle(self, reading: Value) -> Value:
         """Return the angle [rad] for a reading [rad]: three fixed-point iterations, error of order eccentricity^4."""
         angle = reading - self.offset
         for _ in range(3):

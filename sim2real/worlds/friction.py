@@ -5,12 +5,17 @@ A robot has the terms whose coefficients are numbers; terms whose coefficient is
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 from flax import struct
 
 from sim2real.graph.base import Base
+
+if TYPE_CHECKING:
+    import jax
+
+    from sim2real.graph.base import Value
 
 
 @struct.dataclass
@@ -26,15 +31,15 @@ class FrictionParams(Base):
         load: Friction of gears and bearings, as a fraction of the load on them [1].
     """
 
-    viscous: Any = None
-    drag: Any = None
-    coulomb: Any = None
-    static: Any = None
-    stribeck_rad_s: Any = 0.1
-    load: Any = None
+    viscous: Value | None = None
+    drag: Value | None = None
+    coulomb: Value | None = None
+    static: Value | None = None
+    stribeck_rad_s: Value = 0.1
+    load: Value | None = None
 
 
-def damping(p: FrictionParams, velocity: Any) -> Any:
+def damping(p: FrictionParams, velocity: Value) -> Value:
     """Return the friction of the viscous and drag terms divided by the speed [1/s].
 
     Args:
@@ -46,7 +51,7 @@ def damping(p: FrictionParams, velocity: Any) -> Any:
     return sum(terms, start=0.0)
 
 
-def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
+def dry(p: FrictionParams, velocity: Value, load: Value = 0.0) -> Value:
     """Return the largest dry friction: the Coulomb, Stribeck and load-dependent terms [rad/s^2].
 
     Args:
@@ -60,7 +65,7 @@ def dry(p: FrictionParams, velocity: Any, load: Any = 0.0) -> Any:
     return sum(terms, start=0.0)
 
 
-def smooth(velocity: Any, width_rad_s: float) -> Any:
+def smooth(velocity: Value, width_rad_s: float) -> jax.Array:
     """Return a differentiable sign function of the velocity, for friction that is a smooth function of it.
 
     With such a friction a loaded joint creeps, where a real one sticks; ``stopped`` does stick.
@@ -72,7 +77,7 @@ def smooth(velocity: Any, width_rad_s: float) -> Any:
     return jnp.tanh(velocity / width_rad_s)
 
 
-def stopped(velocity: Any, most: Any) -> Any:
+def stopped(velocity: Value, most: Value) -> jax.Array:
     """Return the velocity after dry friction: its magnitude is reduced by ``most`` [rad/s], but not below 0.
 
     Exact for a friction that is constant during the step, whatever the step's length: the joint sticks without

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
 from sim2real.worlds.friction import stopped
 from sim2real.worlds.stepped import SteppedWorld
+
+if TYPE_CHECKING:
+    import jax
+
+    from sim2real.graph.base import Value
 
 
 @struct.dataclass
@@ -21,8 +26,8 @@ class JointState(Base):
         velocity: Shape ``()`` or ``(joints,)`` [rad/s].
     """
 
-    position: Any
-    velocity: Any
+    position: Value
+    velocity: Value
 
 
 class Forces(NamedTuple):
@@ -34,9 +39,9 @@ class Forces(NamedTuple):
         dry: Largest dry friction [rad/s^2].
     """
 
-    acceleration: Any
-    damping: Any
-    dry: Any
+    acceleration: Value
+    damping: Value
+    dry: Value
 
 
 class JointWorld(SteppedWorld):
@@ -62,14 +67,14 @@ class JointWorld(SteppedWorld):
     ) -> None:
         super().__init__(name, rate, substep_s, color=color, order=order)
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> JointState:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> JointState:
         """Return the initial positions and velocities that the parameters name."""
         start = ((graph_state or GraphState()).params.get(self.name) or self.init_params(rng)).start
         half = len(start) // 2
         return JointState(start[0], start[1]) if half == 1 else JointState(start[:half], start[half:])
 
     @abstractmethod
-    def forces(self, params: Any, position: Any, velocity: Any, command: Any) -> Forces:
+    def forces(self, params: Any, position: Value, velocity: Value, command: Any) -> Forces:
         """Return the forces on the joints.
 
         Args:
@@ -79,12 +84,12 @@ class JointWorld(SteppedWorld):
             command: What ``command`` returned for this tick.
         """
 
-    def confine(self, params: Any, state: Any) -> Any:
+    def confine(self, params: Any, state: JointState) -> JointState:
         """Return the state with the joints kept within their stops; called after every substep."""
         del params
         return state
 
-    def integrate(self, params: Any, state: Any, command: Any) -> Any:
+    def integrate(self, params: Any, state: JointState, command: Any) -> JointState:
         """Return the state one tick later.
 
         Args:
@@ -93,7 +98,7 @@ class JointWorld(SteppedWorld):
             command: The command, constant during the tick.
         """
 
-        def substep(s: Any, h: float) -> Any:
+        def substep(s: JointState, h: float) -> JointState:
             w = s.velocity
             f = self.forces(params, s.position + 0.5 * h * w, w, command)
             pushed = w * (1.0 - 0.5 * h * f.damping) + h * f.acceleration

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,12 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
 
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from sim2real.composer.mjx.warp import WarpEngine
+    from sim2real.composer.types import MjModel
+
 
 @struct.dataclass
 class MjxParams(Base):
@@ -30,9 +36,9 @@ class MjxParams(Base):
         qvel: Shape ``(nv,)``: velocities at the start [rad/s or m/s].
     """
 
-    model: Any
-    qpos: Any
-    qvel: Any
+    model: mjx.Model
+    qpos: jax.Array
+    qvel: jax.Array
 
 
 @struct.dataclass
@@ -44,8 +50,8 @@ class MjxState(Base):
         qvel: Shape ``(nv,)``: velocities [rad/s or m/s].
     """
 
-    qpos: Any
-    qvel: Any
+    qpos: jax.Array
+    qvel: jax.Array
 
 
 class MjxWorld(BaseWorld):
@@ -99,24 +105,24 @@ class MjxWorld(BaseWorld):
             self._warp = warp.make_engine(model, impl, nconmax, njmax)
         except UsageError as error:
             raise UsageError(f"world {name!r}: {error.args[0]}", hint=error.hint) from None
-        self._engine: Any = self._warp or stepping
-        self._mjx_model: Any = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
+        self._engine: ModuleType | WarpEngine = self._warp or stepping
+        self._mjx_model: mjx.Model = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
         self._apart = False
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxParams:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxParams:
         """Return the model and its reference position at rest."""
         del rng, graph_state
         return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(self.model.nv))
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return MJX data at the parameters' start."""
         if self._apart:
             return Empty()
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        start: Any = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
+        start = self._warp.start if self._warp else mjx.make_data(self.model, impl="jax")
         return self._engine.forward(params.model, start.replace(qpos=params.qpos, qvel=params.qvel))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> MjxState:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxState:
         """Return positions and velocities at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return MjxState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
@@ -134,7 +140,7 @@ class MjxWorld(BaseWorld):
 
     # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
 
-    def open_loop(self) -> Any:
+    def open_loop(self) -> MjModel:
         """Take the physics out and return the ``MjModel``; UsageError where a subclass steps in its own way."""
         check_steps(self, MjxWorld)
         if self._warp:
@@ -142,7 +148,7 @@ class MjxWorld(BaseWorld):
         self._apart = True
         return self.model
 
-    def fields(self, params: MjxParams, state: Any) -> dict[str, Any]:
+    def fields(self, params: MjxParams, state: Any) -> dict[str, jax.Array]:
         """Return the fields of the model that differ from the compiled one.
 
         Args:
@@ -168,12 +174,12 @@ class MjxWorld(BaseWorld):
         del state
         return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
 
-    def controls(self, step_state: StepState) -> tuple[StepState, Any]:
+    def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
         """Return the step state, and the newest control for each physics step ``(substeps, nu)``."""
         control = jnp.asarray(self._control(step_state), jnp.float32)
         return step_state, jnp.broadcast_to(control, (self.substeps, self.model.nu))
 
-    def message(self, state: Any, qpos: Any, qvel: Any, qacc: Any) -> MjxState:
+    def message(self, state: Any, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
         """Return what the world sends.
 
         Args:
@@ -185,6 +191,6 @@ class MjxWorld(BaseWorld):
         del state, qacc
         return MjxState(qpos, qvel)
 
-    def _control(self, step_state: StepState) -> Any:
+    def _control(self, step_state: StepState) -> jax.Array:
         """Return the controls ``(nu,)`` of a tick; they may depend on what it hears and on parameters."""
         return getattr(step_state.inputs[self.input_name].data, self.field)[-1]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
 from sim2real.worlds.stepped import SteppedWorld
+
+T = TypeVar("T")
 
 
 class OdeWorld(SteppedWorld):
@@ -65,6 +67,6 @@ class OdeWorld(SteppedWorld):
         return self.over_substeps(substep, state)
 
 
-def _axpy(x: Any, direction: Any, factor: float) -> Any:
+def _axpy(x: T, direction: T, factor: float) -> T:
     """Return ``x + factor * direction``, leaf by leaf."""
     return jax.tree_util.tree_map(lambda a, b: a + factor * b, x, direction)

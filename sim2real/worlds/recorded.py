@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.worlds.encoder import Encoder
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Value
 
 
 @struct.dataclass
@@ -22,7 +25,7 @@ class CommandDelay(Base):
         delay: Delay from a command's time stamp to its effect [s]; None: that of the connection.
     """
 
-    delay: Any = None
+    delay: Value | None = None
 
 
 class RecordedActuator(BaseNode):
@@ -38,12 +41,12 @@ class RecordedActuator(BaseNode):
         super().__init__(name, rate)
         self._message = message
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> CommandDelay:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> CommandDelay:
         """Return parameters without a delay."""
         del rng, graph_state
         return CommandDelay()
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the command that the node was made with."""
         del rng, graph_state
         return jax.tree_util.tree_map(lambda leaf: leaf, self._message)
@@ -59,15 +62,17 @@ class RecordedSensor(BaseNode):
         encoder: The encoder; its parameters may be identified. None: positions are shown as they are.
     """
 
-    def __init__(self, name: str, rate: float, message: Callable[[Any], Any], encoder: Encoder | None = None) -> None:
+    def __init__(
+        self, name: str, rate: float, message: Callable[[jax.Array], Any], encoder: Encoder | None = None
+    ) -> None:
         super().__init__(name, rate)
         self._message, self._encoder = message, encoder
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the encoder."""
         return self._encoder or super().init_params(rng, graph_state)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the message of a position of 0."""
         del rng, graph_state
         return self._message(jnp.float32(0.0))
@@ -78,7 +83,7 @@ class RecordedSensor(BaseNode):
         return step_state, self._message(step_state.params.read(position) if self._encoder else position)
 
 
-def command_delay(graph_state: GraphState | None, actuator: str = "actuator") -> dict[str, Any]:
+def command_delay(graph_state: GraphState | None, actuator: str = "actuator") -> dict[str, Value]:
     """Return what a world's ``init_delays`` returns: the actuator's delay [s], if its parameters have one."""
     delay = getattr((graph_state or GraphState()).params.get(actuator), "delay", None)
     return {} if delay is None else {actuator: delay}

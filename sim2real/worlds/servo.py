@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 
+if TYPE_CHECKING:
+    from sim2real.graph.base import Value
 
-def saturated(error: Any, limit: Any) -> Any:
+
+def saturated(error: Value, limit: Value) -> Value:
     """Return a position error clipped to ``[-limit, limit]``: beyond it the position loop is at full duty."""
     return jnp.clip(error, -limit, limit)
 
 
-def position_duty(goal: Any, position: Any, gain: Any, counts_per_unit: float, full: float) -> Any:
+def position_duty(goal: Value, position: Value, gain: Value, counts_per_unit: float, full: float) -> Value:
     """Return the duty, in [-1, 1], of a position loop that works on integers, like that of DYNAMIXEL's firmware.
 
     Args:
@@ -26,7 +29,7 @@ def position_duty(goal: Any, position: Any, gain: Any, counts_per_unit: float, f
     return jnp.trunc(jnp.clip(gain * off, -full, full)) / full
 
 
-def motor_torque(duty: Any, velocity: Any, stall: Any, back_emf: Any, softness: Any = 0.0) -> Any:
+def motor_torque(duty: Value, velocity: Value, stall: Value, back_emf: Value, softness: Value = 0.0) -> Value:
     """Return the torque of a motor under a duty [N m].
 
     Args:
@@ -40,7 +43,7 @@ def motor_torque(duty: Any, velocity: Any, stall: Any, back_emf: Any, softness: 
     return linear / (1.0 + softness * jnp.abs(linear))
 
 
-def play(driver: Any, follower: Any, gap: Any) -> Any:
+def play(driver: Value, follower: Value, gap: Value) -> Value:
     """Return the position of a part that is driven with play: it rests until the driver has crossed the gap.
 
     Args:

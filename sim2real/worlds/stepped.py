@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,12 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseWorld
 from sim2real.worlds.recorded import command_delay
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Value
+
+
+T = TypeVar("T")
 
 
 class SteppedWorld(BaseWorld):
@@ -56,13 +62,13 @@ class SteppedWorld(BaseWorld):
         del params
         return state
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return the output of the initial state: what a sensor sees before the first tick has ended."""
         gs = graph_state or GraphState()
         state = gs.state.get(self.name) or self.init_state(rng, graph_state)
         return self.output(gs.params.get(self.name) or self.init_params(rng), state)
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+    def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, where the actuator's parameters set one."""
         del rng
         return command_delay(graph_state)
@@ -74,7 +80,7 @@ class SteppedWorld(BaseWorld):
         new = step_state.replace(state=state)
         return new, self.output(params, state)
 
-    def over_substeps(self, substep: Callable[[Any, float], Any], state: Any) -> Any:
+    def over_substeps(self, substep: Callable[[T, float], T], state: T) -> T:
         """Return the state after one tick.
 
         Args:

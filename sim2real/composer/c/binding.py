@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.models import layout
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from typing import Literal
 
 
 class Staleness:
@@ -59,7 +62,9 @@ class SyncedArray(np.ndarray):
     _binding: Binding | None = None  # parts of this array do not take these over: they write to nothing
     _name: str = ""
 
-    def __array_wrap__(self, array: np.ndarray, context: Any = None, return_scalar: bool = False) -> Any:
+    def __array_wrap__(
+        self, array: np.ndarray, context: tuple[Any, ...] | None = None, return_scalar: bool = False
+    ) -> Any:
         """Return what is computed from this array as a plain one: sums of products then take a third less time."""
         return array[()] if return_scalar else array
 
@@ -73,17 +78,17 @@ class SyncedArray(np.ndarray):
         super().__setitem__(key, value)
         binding.write(self._name, np.asarray(self))
 
-    def copy(self, order: Any = "C") -> np.ndarray:
+    def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> np.ndarray:
         """Return a plain array."""
         return np.array(self, order=order, subok=False)
 
     def __copy__(self) -> np.ndarray:
         return self.copy()
 
-    def __deepcopy__(self, memo: Any) -> np.ndarray:
+    def __deepcopy__(self, memo: dict[int, Any] | None) -> np.ndarray:
         return self.copy()
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> str | tuple[Any, ...]:
         raise NotImplementedError("a bound array cannot be pickled: copy it first")
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import copy
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.c.physics import Physics
 from sim2real.composer.models.translate import mj
 from sim2real.composer.task import Task
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.model import Model
+    from sim2real.composer.types import MjData, MjModel
 
 _PART_NAMES: dict[type, tuple[str, ...]] = {}
 _PLAIN = (int, float, str, bytes, mj.MjModel)
@@ -25,8 +29,8 @@ class Compiler:
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._key: Any = None
-        self._model: Any = None
+        self._key: list[tuple[Model, int | None]] | None = None
+        self._model: MjModel | None = None
         self._content = np.empty(0, np.uint8)
         self._memory: _Memory | None = None
 
@@ -61,7 +65,7 @@ class _Memory:
         model: The model that it copies.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: MjModel) -> None:
         self.model = copy.copy(model)
         self.data = mj.MjData(self.model)
         self._parts = [self.model, self.data, *_parts(self.model), *_parts(self.data)]
@@ -75,7 +79,7 @@ class _Memory:
         return self._counts() != self._at_first
 
 
-def _parts(owner: Any) -> list[Any]:
+def _parts(owner: MjModel | MjData) -> list[Any]:
     """Return the arrays and lists of a model or a state that it hands out again and again."""
     if type(owner) not in _PART_NAMES:
         names = [n for n in dir(owner) if not n.startswith("_")]
@@ -84,11 +88,11 @@ def _parts(owner: Any) -> list[Any]:
     return [getattr(owner, name) for name in _PART_NAMES[type(owner)]]
 
 
-def _is_kept(owner: Any, name: str) -> bool:
+def _is_kept(owner: MjModel | MjData, name: str) -> bool:
     return not callable(getattr(owner, name)) and getattr(owner, name) is getattr(owner, name)
 
 
-def _content(model: Any) -> np.ndarray:
+def _content(model: MjModel) -> np.ndarray:
     """Return all that is in a model as bytes."""
     made = np.empty(mj.mj_sizeModel(model), np.uint8)
     mj.mj_saveModel(model, None, made)

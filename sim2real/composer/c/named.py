@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -12,6 +12,13 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from sim2real.composer.arrays import is_jax
 from sim2real.composer.models import layout
 from sim2real.composer.models.element import Element
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy.typing as npt
+
+    from sim2real.composer.types import MjModel
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
 _COLUMNS = {
@@ -33,17 +40,17 @@ class NamedArray(NDArrayOperatorsMixin):
         holder: What has the array as an attribute: the model or the data.
     """
 
-    def __init__(self, model: Any, field: layout.Field, holder: Any) -> None:
+    def __init__(self, model: MjModel, field: layout.Field, holder: object) -> None:
         self._model, self._field, self._holder = model, field, holder
 
     @property
     def _array(self) -> Any:
         return getattr(self._holder, self._field.name)
 
-    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self._array, dtype=dtype) if copy else np.asarray(self._array, dtype=dtype)
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         plain = [x._array if isinstance(x, NamedArray) else x for x in inputs]
         return getattr(ufunc, method)(*plain, **kwargs)
 
@@ -55,7 +62,7 @@ class NamedArray(NDArrayOperatorsMixin):
     def __len__(self) -> int:
         return len(self._array)
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[Any]:
         return iter(self._array)
 
     def __repr__(self) -> str:
@@ -72,7 +79,7 @@ class NamedArray(NDArrayOperatorsMixin):
             array[rows] = value
 
     @property
-    def axes(self) -> Any:
+    def axes(self) -> SimpleNamespace:
         """``axes.row.convert_key_item(names)`` returns the rows of some names, as in dm_control."""
         return SimpleNamespace(row=SimpleNamespace(convert_key_item=self._rows))
 
@@ -138,7 +145,7 @@ class NamedFields:
         holder: What has the arrays as attributes.
     """
 
-    def __init__(self, model: Any, struct: str, holder: Any) -> None:
+    def __init__(self, model: MjModel, struct: str, holder: object) -> None:
         self._model, self._struct, self._holder = model, struct, holder
 
     def __getattr__(self, name: str) -> NamedArray:
@@ -160,6 +167,6 @@ class Named:
         data_holder: What has the data's.
     """
 
-    def __init__(self, model: Any, model_holder: Any, data_holder: Any) -> None:
+    def __init__(self, model: MjModel, model_holder: object, data_holder: object) -> None:
         self.model = NamedFields(model, "model", model_holder)
         self.data = NamedFields(model, "data", data_holder)

@@ -7,7 +7,7 @@ import copy
 import logging
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,11 @@ from sim2real.composer.models import layout
 from sim2real.composer.models.element import as_elements
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.element import Element, Elements
+    from sim2real.composer.models.model import Model
+    from sim2real.composer.types import ArrayLike, MjData, MjModel, MjvOption, MjvScene
 
 _log = logging.getLogger(__name__)
 _RK4 = int(mj.mjtIntegrator.mjINT_RK4)
@@ -42,29 +47,29 @@ class Physics:
 
     np: Any = np
 
-    def __init__(self, model: Any, legacy_step: bool = True, data: Any = None) -> None:
+    def __init__(self, model: MjModel, legacy_step: bool = True, data: MjData | None = None) -> None:
         self.legacy_step = legacy_step
         self.variables: dict[str, Any] = {}
         self._suppress = False
         self._start(model, data)
 
-    def _start(self, model: Any, data: Any = None) -> None:
+    def _start(self, model: MjModel, data: MjData | None = None) -> None:
         self._load(model, mj.MjData(model) if data is None else data)
         with self.suppress_physics_errors():
             self.after_reset()
 
-    def _load(self, model: Any, data: Any) -> None:
+    def _load(self, model: MjModel, data: MjData) -> None:
         self.model = ModelView(model)
         self.data = DataView(data)
         self.named = Named(model, model, self.data.ptr)
-        self._bindings: dict[Any, Any] = {}
+        self._bindings: dict[Element | tuple[Element, ...], Binding | EmptyBinding] = {}
         self.graphics = Graphics(model)
         self.staleness = Staleness()
         self._warnings = self.data.ptr.warning.number
         self._warned = self._warnings.tobytes()
 
     @classmethod
-    def from_mjcf_model(cls, model: Any) -> Physics:
+    def from_mjcf_model(cls, model: Model) -> Physics:
         """Compile a model with all that is attached to it."""
         return cls(model.compile())
 
@@ -78,7 +83,7 @@ class Physics:
         """Compile an MJCF file."""
         return cls(mj.MjModel.from_xml_path(str(path)))
 
-    def reload_from_mjcf_model(self, model: Any) -> None:
+    def reload_from_mjcf_model(self, model: Model) -> None:
         """Compile a model anew and start from its initial state."""
         self._start(model.compile())
 
@@ -104,7 +109,7 @@ class Physics:
         """Return the controls, shape ``(nu,)``."""
         return self.data.ptr.ctrl
 
-    def set_control(self, control: Any) -> None:
+    def set_control(self, control: ArrayLike) -> None:
         """Set the controls, shape ``(nu,)`` [the actuators' units]."""
         np.copyto(self.data.ptr.ctrl, control)
 
@@ -131,7 +136,7 @@ class Physics:
 
     state = get_state
 
-    def set_state(self, state: Any, sig: int | None = None) -> None:
+    def set_state(self, state: ArrayLike, sig: int | None = None) -> None:
         """Set what ``get_state`` returns.
 
         Raises:
@@ -244,7 +249,7 @@ class Physics:
         """Have everything computed again before the next computed attribute is read through a binding."""
         self.staleness.dirty = True
 
-    def bind(self, elements: Any) -> Any:
+    def bind(self, elements: Elements) -> Any:
         """Return the attributes of an element, or of several of one kind, in this physics.
 
         Raises:
@@ -260,7 +265,7 @@ class Physics:
             self._bindings[key] = self._new_binding(found, single)
         return self._bindings[key]
 
-    def _new_binding(self, found: tuple[Any, ...], single: bool) -> Any:
+    def _new_binding(self, found: tuple[Element, ...], single: bool) -> Binding | EmptyBinding:
         if not found:
             return EmptyBinding()
         kind = found[0].kind
@@ -268,11 +273,11 @@ class Physics:
         ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
         return Binding(weakref.proxy(self), kind, ids, single)
 
-    def get(self, elements: Any, name: str) -> Any:
+    def get(self, elements: Elements, name: str) -> Any:
         """Return an attribute of elements; the same call on both engines."""
         return getattr(self.bind(elements), name)
 
-    def set(self, elements: Any, name: str, value: Any) -> Physics:
+    def set(self, elements: Elements, name: str, value: Any) -> Physics:
         """Set an attribute of elements and return the physics; the same call on both engines.
 
         Args:
@@ -283,7 +288,7 @@ class Physics:
         setattr(self.bind(elements), name, value)
         return self
 
-    def write(self, elements: Any, name: str, value: Any, index: Any) -> Physics:
+    def write(self, elements: Elements, name: str, value: Any, index: Any) -> Physics:
         """Set a part of an attribute of elements; the same call on both engines.
 
         Args:
@@ -295,7 +300,7 @@ class Physics:
         getattr(self.bind(elements), name)[index] = value
         return self
 
-    def fail(self, condition: Any = True) -> None:
+    def fail(self, condition: ArrayLike = True) -> None:
         """Give this initial state up where the condition holds; the same call on both engines.
 
         Raises:
@@ -327,9 +332,9 @@ class Physics:
         overlays: Sequence[TextOverlay] = (),
         depth: bool = False,
         segmentation: bool = False,
-        scene_option: Any = None,
-        render_flag_overrides: Mapping[Any, bool] | None = None,
-        scene_callback: Callable[[Physics, Any], None] | None = None,
+        scene_option: MjvOption | None = None,
+        render_flag_overrides: Mapping[str | int, bool] | None = None,
+        scene_callback: Callable[[Physics, MjvScene], None] | None = None,
     ) -> np.ndarray:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
@@ -363,7 +368,9 @@ class Physics:
         self._bindings.clear()
 
 
-def _restored(kind: type[Physics], model: Any, data: Any, legacy_step: bool, variables: dict[str, Any]) -> Physics:
+def _restored(
+    kind: type[Physics], model: MjModel, data: MjData, legacy_step: bool, variables: dict[str, Any]
+) -> Physics:
     made = object.__new__(kind)
     made.legacy_step, made.variables, made._suppress = legacy_step, variables, False
     made._load(model, data)

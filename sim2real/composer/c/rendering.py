@@ -6,12 +6,15 @@ import atexit
 import functools
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel, MjrContext, MjrRect, MjvScene
 
 _UPLOADED = {
     "hfield_data": ("nhfield", "mjr_uploadHField"),
@@ -19,7 +22,7 @@ _UPLOADED = {
     "mesh_vert": ("nmesh", "mjr_uploadMesh"),
 }
 """What a context has a copy of: the model's array -> how many objects it holds, and what uploads one of them."""
-_ABANDONED: list[Any] = []
+_ABANDONED: list[MjrContext] = []
 """Contexts of MuJoCo in threads that are no more. Their destructors would free the objects of whichever context is
 current; OpenGL frees theirs itself."""
 
@@ -30,7 +33,7 @@ class _Context:
     dm_control has one for all sizes of images as well: its shadow map alone takes 64 MB.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: MjModel) -> None:
         size = model.vis.global_
         self._gl = mj.GLContext(size.offwidth, size.offheight)
         self._gl.make_current()
@@ -40,7 +43,7 @@ class _Context:
         self._uploaded = {name: getattr(model, name).copy() for name in _UPLOADED}
         atexit.register(self.close)  # after the display was opened, so that it runs before that is closed
 
-    def update(self, model: Any) -> None:
+    def update(self, model: MjModel) -> None:
         """Make this the thread's context and bring it up to date with the model."""
         self._gl.make_current()
         size = model.vis.global_.offwidth, model.vis.global_.offheight
@@ -65,6 +68,13 @@ class _Context:
         self._gl.free()
 
 
+class Overlay(Protocol):
+    """What is drawn over an image, such as a text."""
+
+    def draw(self, context: MjrContext, rect: MjrRect) -> None:
+        """Draw it into a part of the image."""
+
+
 class Graphics:
     """Draws scenes of a model, with a context and a scene for every thread: those of OpenGL belong to threads.
 
@@ -72,12 +82,12 @@ class Graphics:
         model: The ``mujoco.MjModel``.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: MjModel) -> None:
         self._model = model
         self._contexts: dict[int, _Context] = {}
-        self._scenes: dict[int, Any] = {}
+        self._scenes: dict[int, MjvScene] = {}
 
-    def scene(self) -> Any:
+    def scene(self) -> MjvScene:
         """Return the thread's ``MjvScene``: making one takes as long as drawing a small image without shadows."""
         thread = threading.get_ident()
         if thread not in self._scenes:
@@ -86,10 +96,10 @@ class Graphics:
 
     def draw(
         self,
-        scene: Any,
+        scene: MjvScene,
         size: tuple[int, int],
-        overlays: Sequence[Any] = (),
-        flags: Mapping[Any, bool] | None = None,
+        overlays: Sequence[Overlay] = (),
+        flags: Mapping[str | int, bool] | None = None,
         depth: bool = False,
         segmentation: bool = False,
     ) -> np.ndarray:
@@ -147,13 +157,13 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
     return words and np.array_equal(first[whole:], second[whole:])
 
 
-def new_scene(model: Any, max_geom: int | None = None) -> Any:
+def new_scene(model: MjModel, max_geom: int | None = None) -> MjvScene:
     """Return an ``MjvScene`` of a model with room for a number of shapes; default: five for each object."""
     shown = ("body", "geom", "site", "jnt", "tendon", "u", "skin", "flex", "cam", "light")
     return mj.MjvScene(model, max_geom or max(1000, 5 * sum(getattr(model, f"n{kind}") for kind in shown)))
 
 
-def _distances(pixels: np.ndarray, scene: Any, model: Any) -> np.ndarray:
+def _distances(pixels: np.ndarray, scene: MjvScene, model: MjModel) -> np.ndarray:
     """Return distances [m] from depths, 1 for the nearest and 0 for the farthest.
 
     The coefficients are rounded as those of OpenGL's projection are: near the far end that matters most.
@@ -167,7 +177,7 @@ def _distances(pixels: np.ndarray, scene: Any, model: Any) -> np.ndarray:
     return (offset / (depths + scale)).astype(np.float32)
 
 
-def _objects(pixels: np.ndarray, scene: Any) -> np.ndarray:
+def _objects(pixels: np.ndarray, scene: MjvScene) -> np.ndarray:
     """Return numbers and types (``mjtObj``) of objects, int32 ``(height, width, 2)``, from colours; -1 for none."""
     number = pixels.astype(np.uint32) @ np.array([1, 2**8, 2**16], np.uint32)
     table = np.full((scene.ngeom + 1, 2), -1, np.int32)
@@ -183,7 +193,7 @@ def _flags() -> dict[str, int]:
     return {k.removeprefix("mjRND_").lower(): int(v) for k, v in members.items() if k != "mjNRNDFLAG"}
 
 
-def _flag(name: Any) -> int:
+def _flag(name: str | int) -> int:
     if not isinstance(name, str):
         return int(name)
     if name not in _flags():

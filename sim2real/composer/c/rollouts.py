@@ -6,13 +6,17 @@ import copy
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import StepState
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Array, ArrayLike, MjModel
+    from sim2real.graph.node import BaseWorld
 
 _LARGEST_BYTES = 2**26
 """Most memory for the states of the copies that run at a time."""
@@ -34,9 +38,9 @@ class Start(NamedTuple):
         warmstart: Where the solver starts ``(..., nv)`` [m/s^2 or rad/s^2].
     """
 
-    qpos: Any
-    qvel: Any
-    warmstart: Any
+    qpos: Array
+    qvel: Array
+    warmstart: Array
 
 
 class OpenLoop(Protocol):
@@ -60,7 +64,7 @@ class OpenLoop(Protocol):
         """See above."""
         ...
 
-    def open_loop(self) -> Any:
+    def open_loop(self) -> MjModel:
         """Take the physics out and return the ``MjModel``: from now on ``init_state`` computes nothing with it.
 
         Raises:
@@ -68,7 +72,7 @@ class OpenLoop(Protocol):
                 more than positions, velocities and accelerations.
         """
 
-    def fields(self, params: Any, state: Any) -> dict[str, Any]:
+    def fields(self, params: Any, state: Any) -> dict[str, Array]:
         """Return the fields of the model that differ from the compiled one.
 
         Args:
@@ -86,11 +90,11 @@ class OpenLoop(Protocol):
         """
         ...
 
-    def controls(self, step_state: StepState) -> tuple[StepState, Any]:
+    def controls(self, step_state: StepState) -> tuple[StepState, Array]:
         """Return what is left of a tick without physics: the next step state, and the controls ``(substeps, nu)``."""
         ...
 
-    def message(self, state: Any, qpos: Any, qvel: Any, qacc: Any) -> Any:
+    def message(self, state: Any, qpos: Array, qvel: Array, qacc: Array) -> Any:
         """Return what the world sends.
 
         Args:
@@ -102,7 +106,7 @@ class OpenLoop(Protocol):
         ...
 
 
-def check_steps(world: Any, base: type) -> None:
+def check_steps(world: BaseWorld, base: type) -> None:
     """Refuse a world whose class steps or starts in its own way: nobody knows what that depends on.
 
     Raises:
@@ -127,7 +131,7 @@ class Rollouts:
         UsageError: When C does not look at a field, or only MJX has it.
     """
 
-    def __init__(self, model: Any, substeps: int, names: tuple[str, ...], derives: bool = False) -> None:
+    def __init__(self, model: MjModel, substeps: int, names: tuple[str, ...], derives: bool = False) -> None:
         from mujoco import batch  # 30 ms
 
         unknown = sorted(set(names) - batch.MODEL_FIELDS)
@@ -158,7 +162,7 @@ class Rollouts:
         axes = np.broadcast_shapes(*(np.shape(a)[: np.ndim(a) - width] for a, width in arrays))
         count = int(np.prod(axes))
 
-        def flat(a: Any, width: int) -> np.ndarray:
+        def flat(a: ArrayLike, width: int) -> np.ndarray:
             a = np.asarray(a, np.float64)
             shape = a.shape[a.ndim - width :]
             return np.broadcast_to(a, (*axes, *shape)).reshape(count, *shape)
@@ -215,7 +219,7 @@ class Rollouts:
         return lanes
 
 
-def _value(model: Any, name: str) -> Any:
+def _value(model: MjModel, name: str) -> np.ndarray:
     """Return a field of a model; those of its options are called ``opt.NAME``."""
     holder, _, field = name.rpartition(".")
     return getattr(model.opt if holder else model, field)
@@ -233,7 +237,7 @@ def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
     return failed
 
 
-def _general(model: Any, names: tuple[str, ...], derives: bool) -> Any:
+def _general(model: MjModel, names: tuple[str, ...], derives: bool) -> MjModel:
     """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end.
 
     Raises:

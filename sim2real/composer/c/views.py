@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.models import layout
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjData, MjModel
 
 
 class _Wrapper:
@@ -16,7 +19,7 @@ class _Wrapper:
 
     __slots__ = ("ptr",)
 
-    def __init__(self, ptr: Any) -> None:
+    def __init__(self, ptr: MjModel | MjData) -> None:
         object.__setattr__(self, "ptr", ptr)
 
     def __getattr__(self, name: str) -> Any:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.composer.models.translate import mj
+
+if TYPE_CHECKING:
+    from sim2real.composer.c.physics import Physics
+    from sim2real.composer.models.element import Element, Elements
+    from sim2real.composer.types import ArrayLike
 
 TOLERANCE = 1e-10
 """Norm of the error, metres and radians together, at which the pose is reached."""
@@ -14,7 +19,14 @@ _FAR, _DAMPING = 0.1, 3e-2
 _LONGEST_STEP, _SLOWEST, _STEPS = 2.0, 20.0, 100
 
 
-def reach(physics: Any, site: Any, joints: Any, position: Any, quaternion: Any, rotation_weight: float = 2.0) -> bool:
+def reach(
+    physics: Physics,
+    site: Element,
+    joints: Elements,
+    position: ArrayLike,
+    quaternion: ArrayLike,
+    rotation_weight: float = 2.0,
+) -> bool:
     """Move joints until a site has a pose; return whether that was reached. Limits of joints are not heeded.
 
     Damped least squares, undamped near the goal: Buss, Introduction to inverse kinematics with Jacobian transpose,
@@ -54,7 +66,7 @@ def reach(physics: Any, site: Any, joints: Any, position: Any, quaternion: Any, 
     return False
 
 
-def _columns(physics: Any, joints: Any) -> list[np.ndarray]:
+def _columns(physics: Physics, joints: Elements) -> list[np.ndarray]:
     """Return the degrees of freedom of each joint."""
     model = physics.model.ptr
     width = {int(mj.mjtJoint.mjJNT_FREE): 6, int(mj.mjtJoint.mjJNT_BALL): 3}
@@ -62,7 +74,7 @@ def _columns(physics: Any, joints: Any) -> list[np.ndarray]:
     return [model.jnt_dofadr[i] + np.arange(width.get(int(model.jnt_type[i]), 1)) for i in ids]
 
 
-def _error(xpos: np.ndarray, xmat: np.ndarray, position: Any, quaternion: Any) -> np.ndarray:
+def _error(xpos: np.ndarray, xmat: np.ndarray, position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
     """Return what is missing: a translation [m] and a rotation vector [rad], in the world's axes, shape ``(6,)``."""
     error, there, missing = np.empty(6), np.empty(4), np.empty(4)
     error[:3] = np.asarray(position) - xpos

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,18 @@ from sim2real.composer.models.traversal import get_frame_freejoint
 from sim2real.composer.variation.rotations import IDENTITY_QUATERNION
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.c.physics import Physics
+    from sim2real.composer.entity import Entity
+    from sim2real.composer.mjx.physics import MjxPhysics
+    from sim2real.composer.mjx.random import JaxRandomState
+    from sim2real.composer.types import RandomState, Varying
+
 _log = logging.getLogger(__name__)
+
+
+_Contacts = tuple[Any, Any, Any]
+"""Bound geoms, and which contacts they had; Nones where an entity has no geoms."""
 
 
 class PropPlacer(Initializer):
@@ -42,9 +53,9 @@ class PropPlacer(Initializer):
 
     def __init__(
         self,
-        props: Iterable[Any],
-        position: Any,
-        quaternion: Any = IDENTITY_QUATERNION,
+        props: Iterable[Entity],
+        position: Varying,
+        quaternion: Varying = IDENTITY_QUATERNION,
         ignore_collisions: bool = False,
         max_qvel_tol: float = 1e-3,
         max_qacc_tol: float = 1e-2,
@@ -73,7 +84,9 @@ class PropPlacer(Initializer):
             own = prop.mjcf_model.find_all("joint")
             self._joints += own if free is None or free in own else [free, *own]
 
-    def __call__(self, physics: Any, random_state: Any, ignore_contacts_with_entities: Any = None) -> None:
+    def __call__(
+        self, physics: Any, random_state: Any, ignore_contacts_with_entities: Iterable[Entity] | None = None
+    ) -> None:
         """Place the props.
 
         Args:
@@ -101,7 +114,7 @@ class PropPlacer(Initializer):
         else:
             self._place(physics, random_state, cached)
 
-    def _place_on_mjx(self, physics: Any, random_state: Any, ignored: list[Any]) -> None:
+    def _place_on_mjx(self, physics: MjxPhysics, random_state: JaxRandomState, ignored: list[Entity]) -> None:
         """Place the props inside a compiled program; ``physics.fail`` says where that did not work."""
         from sim2real.composer.mjx.placing import place
 
@@ -113,7 +126,7 @@ class PropPlacer(Initializer):
         pose = (self._position, self._quaternion)
         place(physics, random_state, self._props, pose, self._max_attempts, self._ignore_collisions, ignored)
 
-    def _disable_contacts(self, physics: Any, entity: Any) -> tuple[Any, Any, Any]:
+    def _disable_contacts(self, physics: Physics, entity: Entity) -> _Contacts:
         """Switch contacts with an entity off; return what brings them back. Contact buffers may be small."""
         geoms = physics.bind(entity.mjcf_model.find_all("geom"))
         if not len(geoms.element_id):
@@ -122,7 +135,7 @@ class PropPlacer(Initializer):
         geoms.contype, geoms.conaffinity = 0, 0
         return before
 
-    def _place(self, physics: Any, random_state: Any, cached: list[tuple[Any, Any, Any]]) -> None:
+    def _place(self, physics: Physics, random_state: RandomState, cached: list[_Contacts]) -> None:
         for prop, contacts in zip(self._props, cached, strict=False):
             _restore(contacts)
             if not self._place_one(physics, random_state, prop):
@@ -134,7 +147,7 @@ class PropPlacer(Initializer):
         for contacts in cached[len(self._props) :]:
             _restore(contacts)
 
-    def _place_one(self, physics: Any, random_state: Any, prop: Any) -> bool:
+    def _place_one(self, physics: Physics, random_state: RandomState, prop: Entity) -> bool:
         initial = tuple(np.array(v) for v in prop.get_pose(physics))
         pose = initial
         for _ in range(self._max_attempts):
@@ -152,7 +165,7 @@ class PropPlacer(Initializer):
                 return True
         return False
 
-    def _place_and_settle(self, physics: Any, random_state: Any, cached: list[tuple[Any, Any, Any]]) -> None:
+    def _place_and_settle(self, physics: Physics, random_state: RandomState, cached: list[_Contacts]) -> None:
         speed = acceleration = np.inf
         moving = physics.bind(self._joints)
         for _ in range(self._settle_attempts):
@@ -180,13 +193,13 @@ class PropPlacer(Initializer):
         _log.warning(message)
 
 
-def _restore(contacts: tuple[Any, Any, Any]) -> None:
+def _restore(contacts: _Contacts) -> None:
     geoms, contype, conaffinity = contacts
     if geoms is not None:
         geoms.contype, geoms.conaffinity = contype, conaffinity
 
 
-def _touches(physics: Any, prop: Any) -> bool:
+def _touches(physics: Physics, prop: Entity) -> bool:
     """Return whether a prop touches anything."""
     geoms = physics.bind(prop.mjcf_model.find_all("geom")).element_id
     contact = physics.data.contact

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from sim2real.composer.models.translate import mj
 from sim2real.composer.models.traversal import get_freejoint
 from sim2real.composer.robot import DOWN_QUATERNION
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.c.physics import Physics
+    from sim2real.composer.models.element import Element
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 
 class ToolCenterPointInitializer(Initializer):
@@ -33,8 +38,8 @@ class ToolCenterPointInitializer(Initializer):
         self,
         hand: Any,
         arm: Any,
-        position: Any,
-        quaternion: Any = DOWN_QUATERNION,
+        position: Varying,
+        quaternion: Varying = DOWN_QUATERNION,
         ignore_collisions: bool = False,
         max_ik_attempts: int = 10,
         max_rejection_samples: int = 10,
@@ -44,7 +49,7 @@ class ToolCenterPointInitializer(Initializer):
         self._ignore_collisions = ignore_collisions
         self._attempts, self._samples = max_ik_attempts, max_rejection_samples
 
-    def __call__(self, physics: Any, random_state: Any) -> None:
+    def __call__(self, physics: Any, random_state: RandomState) -> None:
         """Move the arm.
 
         Raises:
@@ -71,7 +76,9 @@ class ToolCenterPointInitializer(Initializer):
             hint="sample from a broader distribution, raise max_rejection_samples, or set ignore_collisions",
         )
 
-    def _reach(self, physics: Any, random_state: Any, site: Any, position: Any, quaternion: Any) -> bool:
+    def _reach(
+        self, physics: Physics, random_state: RandomState, site: Element, position: ArrayLike, quaternion: ArrayLike
+    ) -> bool:
         own = getattr(self._arm, "set_site_to_xpos", None)
         if own is not None:
             return own(
@@ -94,7 +101,7 @@ class ToolCenterPointInitializer(Initializer):
                     return True
         return False
 
-    def _limits(self, physics: Any) -> np.ndarray:
+    def _limits(self, physics: Physics) -> np.ndarray:
         """Return the lowest and the highest positions of the joints, shape ``(2, n)``; hinges without: a turn."""
         joints = physics.bind(self._arm.joints)
         limits, limited = np.array(joints.range), np.asarray(joints.limited, bool)
@@ -105,7 +112,7 @@ class ToolCenterPointInitializer(Initializer):
         limits[~limited] = 0.0, 2.0 * np.pi
         return limits.T
 
-    def _touches(self, physics: Any) -> bool:
+    def _touches(self, physics: Physics) -> bool:
         """Return whether the arm touches itself or the hand, or one of both touches what is not free."""
         arm = self._numbers(physics, self._arm.mjcf_model.find_all("geom", exclude_attachments=True))
         hand = [] if self._hand is None else self._hand.mjcf_model.find_all("geom", exclude_attachments=True)
@@ -122,5 +129,5 @@ class ToolCenterPointInitializer(Initializer):
                 return True
         return False
 
-    def _numbers(self, physics: Any, geoms: list[Any]) -> set[int]:
+    def _numbers(self, physics: Physics, geoms: list[Element]) -> set[int]:
         return set(np.atleast_1d(physics.bind(geoms).element_id).tolist())

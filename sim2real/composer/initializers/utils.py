@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models.element import Element
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.c.physics import Physics
+    from sim2real.composer.models.element import Elements
 
 
 class JointStaticIsolator:
@@ -19,7 +23,7 @@ class JointStaticIsolator:
         UsageError: When the joints belong to different worlds, or there are none.
     """
 
-    def __init__(self, physics: Any, joints: Any) -> None:
+    def __init__(self, physics: Physics, joints: Elements) -> None:
         moving = [joints] if isinstance(joints, Element) else list(joints)
         roots = {id(j.root.root_model): j.root.root_model for j in moving}
         if len(roots) != 1:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sim2real.composer.mjx.environment import MjxEnvironment
+from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.errors import Sim2RealError
 
 try:
@@ -40,12 +40,12 @@ class BraxEnv(Env):
         self.environment, self._fresh_starts = environment, fresh_starts
         self._size = sum(leaf.size for leaf in environment.observation_spec().values())
 
-    def reset(self, rng: Any) -> BraxState:
+    def reset(self, rng: jax.Array) -> BraxState:
         """Return a copy at the start of an episode."""
         rng, key = jax.random.split(rng)
         return self._state(self.environment.reset(rng), {"key": key})
 
-    def step(self, state: BraxState, action: Any) -> BraxState:
+    def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Return the copy one control step later."""
         before: Any = state.pipeline_state
         info = {**state.info}
@@ -83,6 +83,6 @@ class BraxEnv(Env):
         return self.environment.task.control_timestep
 
 
-def _observed(state: Any) -> Any:
+def _observed(state: State) -> jax.Array:
     values = [jnp.ravel(v) for v in state.observation.values()]
     return jnp.concatenate(values) if values else jnp.zeros(0)

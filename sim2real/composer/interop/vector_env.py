@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -11,6 +11,9 @@ from dm_env import specs
 from sim2real.composer.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike
 
 try:
     import gymnasium
@@ -47,11 +50,13 @@ class MjxVectorEnv(VectorEnv):
         self._state: Any = None
         self._done = np.zeros(num_envs, bool)
 
-    def _keys(self) -> Any:
+    def _keys(self) -> jax.Array:
         self._key, key = jax.random.split(self._key)
         return jax.random.split(key, self.num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start all copies; return observations and infos."""
         del options
         if seed is not None:
@@ -60,7 +65,9 @@ class MjxVectorEnv(VectorEnv):
         self._done = np.zeros(self.num_envs, bool)
         return self._observation(), {"failed": np.asarray(self._state.failed)}
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step all copies; return observations, rewards, terminations, truncations and infos."""
         before, done = self._state, self._done
         self._state = self._step(before, np.asarray(actions))
@@ -76,7 +83,7 @@ class MjxVectorEnv(VectorEnv):
         return {k: np.asarray(v) for k, v in self._state.observation.items()}
 
 
-def _action_box(spec: Any) -> gymnasium.spaces.Box:
+def _action_box(spec: object) -> gymnasium.spaces.Box:
     """Return the space of actions; what dm_env writes as a bound of 1e10 has none."""
     if not isinstance(spec, specs.Array):
         raise UsageError(
@@ -90,7 +97,7 @@ def _action_box(spec: Any) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
-def _box(leaf: Any) -> gymnasium.spaces.Box:
+def _box(leaf: jax.ShapeDtypeStruct) -> gymnasium.spaces.Box:
     if np.issubdtype(leaf.dtype, np.floating):
         return gymnasium.spaces.Box(-np.inf, np.inf, leaf.shape, leaf.dtype)
     if leaf.dtype == bool:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from mujoco.mjx._src import scan  # private: mujoco-mjx is pinned, and a test would see it change
 
+T = TypeVar("T")
 _vmap = scan._nvmap
 
 
@@ -21,7 +22,7 @@ def hold_links() -> None:
     scan._nvmap = _held
 
 
-def _held(f: Callable[..., Any], carry: Any, *args: Any) -> Any:
+def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
     if carry is not None and jax.default_backend() == "cpu":
         carry = jax.tree.map(_barrier, carry)
     return _vmap(f, carry, *args)

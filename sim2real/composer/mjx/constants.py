@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,9 @@ from sim2real.composer.arrays import multiply_quaternions, rotate
 from sim2real.composer.mjx.warp_fields import is_warp, varies
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel
 
 _WIDTHS = {
     int(mj.mjtJoint.mjJNT_FREE): (3, 3),
@@ -27,7 +30,7 @@ _IS_DERIVED = 11
 """Where the data of a weld say whether its pose is that at the reference position."""
 
 
-def derive(host: Any, model: Any) -> dict[str, Any]:
+def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     """Return the constants of an ``mjx.Model`` whose masses, inertias, lengths or poses were changed: path -> array.
 
     Args:
@@ -53,7 +56,7 @@ def derive(host: Any, model: Any) -> dict[str, Any]:
     return found | _cameras(host, model, data) if host.ncam else found
 
 
-def _twin(host: Any, model: Any) -> Any:
+def _twin(host: MjModel, model: mjx.Model) -> mjx.Model:
     """Return a model of Warp as one of MJX's JAX, which computes constants from fields that both have."""
     try:
         twin: Any = mjx.put_model(host, impl="jax")
@@ -67,15 +70,16 @@ def _twin(host: Any, model: Any) -> Any:
     return twin.tree_replace({n: a.astype(b.dtype) for n, (a, b) in both.items() if jnp.shape(a) == jnp.shape(b)})
 
 
-def _subtree_masses(host: Any, model: Any) -> Any:
+def _subtree_masses(host: MjModel, model: mjx.Model) -> jax.Array:
     below = np.eye(host.nbody)  # below[i, j]: body j is in the subtree of body i
     for body in range(host.nbody - 1, 0, -1):
         below[host.body_parentid[body]] += below[body]
     return jnp.asarray(below, model.body_mass.dtype) @ model.body_mass
 
 
-def _inverse_weights(host: Any, model: Any, data: Any) -> dict[str, Any]:
+def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     """Return the inverse inertias that constraints see of bodies, degrees of freedom and tendons; ``(A M^-1 A^T)``."""
+    impl: Any = data._impl
     M = mjx.full_m(model, data)
     factor = jax.scipy.linalg.cho_factor(M)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(host.nv, dtype=M.dtype))
@@ -96,13 +100,13 @@ def _inverse_weights(host: Any, model: Any, data: Any) -> dict[str, Any]:
         "body_invweight0": jnp.where(simple[:, None], jnp.stack([1.0 / mass, 0.0 * mass], axis=1), weights),
     }
     if host.nu:
-        found["actuator_acc0"] = jnp.linalg.norm(data._impl.actuator_moment @ inverse, axis=1)
+        found["actuator_acc0"] = jnp.linalg.norm(impl.actuator_moment @ inverse, axis=1)
     if host.ntendon:
-        found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", data._impl.ten_J, inverse, data._impl.ten_J)
+        found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", impl.ten_J, inverse, impl.ten_J)
     return found
 
 
-def _radii(host: Any, model: Any) -> Any:
+def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
     """Return the radii of spheres around the geoms; those whose size says nothing, such as meshes, keep theirs."""
     size, kind, types = model.geom_size, np.asarray(host.geom_type), mj.mjtGeom
     radii = {
@@ -118,7 +122,7 @@ def _radii(host: Any, model: Any) -> Any:
     return found
 
 
-def _boxes(host: Any, model: Any) -> Any:
+def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
     """Return centres and half sizes of boxes around the geoms, shape ``(ngeom, 2, 3)``, which Warp looks at first."""
     x, y, z = model.geom_size.T
     kind, types = np.asarray(host.geom_type)[:, None], mj.mjtGeom
@@ -135,7 +139,7 @@ def _boxes(host: Any, model: Any) -> Any:
     return model.geom_aabb.at[:, 1].set(found)
 
 
-def _derived_equalities(host: Any) -> tuple[np.ndarray, np.ndarray]:
+def _derived_equalities(host: MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return which equalities connect, and which weld, bodies as they stand at the reference position, bool."""
     bodies = np.asarray(host.eq_objtype) == int(mj.mjtObj.mjOBJ_BODY)
     connects = bodies & (np.asarray(host.eq_type) == int(mj.mjtEq.mjEQ_CONNECT))
@@ -143,12 +147,12 @@ def _derived_equalities(host: Any) -> tuple[np.ndarray, np.ndarray]:
     return connects, welds & (host.eq_data[:, _IS_DERIVED] == 1)
 
 
-def _equalities(host: Any, model: Any, data: Any) -> Any:
+def _equalities(host: MjModel, model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Return the data of equalities, with anchors and poses of bodies as they are at the reference position."""
     connects, welds = (jnp.asarray(rows)[:, None] for rows in _derived_equalities(host))
     anchor, one, two = model.eq_data[:, :3], host.eq_obj1id, host.eq_obj2id
 
-    def seen(here: Any, there: Any) -> Any:  # the anchor in one body, in the axes of the other
+    def seen(here: np.ndarray, there: np.ndarray) -> jax.Array:  # the anchor in one body, in the axes of the other
         place = data.xpos[here] + jnp.einsum("eij,ej->ei", data.xmat[here], anchor)
         return jnp.einsum("eji,ej->ei", data.xmat[there], place - data.xpos[there])
 
@@ -158,7 +162,7 @@ def _equalities(host: Any, model: Any, data: Any) -> Any:
     return jnp.where(connects, connected, jnp.where(welds, welded, model.eq_data))
 
 
-def _cameras(host: Any, model: Any, data: Any) -> dict[str, Any]:
+def _cameras(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     """Return where cameras are seen from their bodies at the reference position, as if all were fixed to them."""
     body = host.cam_bodyid
     offset = jnp.einsum("cij,cj->ci", data.xmat[body], model.cam_pos)

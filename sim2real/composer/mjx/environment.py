@@ -6,7 +6,7 @@ import dataclasses
 import math
 import weakref
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +19,18 @@ from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjx import gate, stepping, views, warp
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
-from sim2real.composer.mjx.rings import make_rings
+from sim2real.composer.mjx.rings import Samples, make_rings
 from sim2real.composer.mjx.tracing import TracedHooks
 from sim2real.composer.models.translate import mj
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from dm_env import specs
+    from jax.typing import ArrayLike
+
+    from sim2real.composer.entity import Entity
+    from sim2real.composer.types import MjModel
 
 
 @struct.dataclass
@@ -47,20 +54,20 @@ class State:
         failed: Whether no acceptable initial state was found in ``max_reset_attempts`` attempts.
     """
 
-    data: Any
-    leaves: Any
-    variables: Any
-    key: Any
-    memory: Any
-    rings: Any
-    steps: Any
-    dirty: Any
-    observation: Any
-    reward: Any
-    discount: Any
-    done: Any
-    truncated: Any
-    failed: Any
+    data: mjx.Data
+    leaves: dict[str, jax.Array]
+    variables: dict[str, Any]
+    key: jax.Array
+    memory: dict[str, jax.Array]
+    rings: dict[str, Samples]
+    steps: jax.Array
+    dirty: jax.Array
+    observation: dict[str, jax.Array]
+    reward: jax.Array
+    discount: jax.Array
+    done: jax.Array
+    truncated: jax.Array
+    failed: jax.Array
 
 
 class MjxEnvironment:
@@ -108,7 +115,7 @@ class MjxEnvironment:
         impl: str = "jax",
         nconmax: int | None = None,
         njmax: int | None = None,
-        arena: Any = None,
+        arena: Entity | None = None,
     ) -> None:
         if arena is not None:
             task._root_entity = arena
@@ -137,17 +144,17 @@ class MjxEnvironment:
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
         self._steady = True
-        self._shapes: tuple[Any, Any] = ((), ())  # of rewards and discounts
+        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())  # of rewards and discounts
         self._discover()
 
     def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
         """Run ``after_compile`` on the host, and ask for the action's shape there."""
         physics = Physics(self.model, self._legacy)
-        view: Any = weakref.proxy(physics)
+        view: Physics = weakref.proxy(physics)
         self._hooks.run("after_compile", view, random_state)
         self._action_spec = self.task.action_spec(view)
 
-    def _physics(self, state: State | None = None, model: Any = None) -> tuple[MjxPhysics, JaxRandomState]:
+    def _physics(self, state: State | None = None, model: mjx.Model | None = None) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
         compiled = self.mjx_model if model is None else model
         data = self.initial if state is None else state.data
@@ -186,11 +193,13 @@ class MjxEnvironment:
             )
         _check_variables(state.variables, after.variables)
 
-    def _trace(self, key: Any, action: Any) -> tuple[State, State]:
+    def _trace(self, key: jax.Array, action: jax.Array) -> tuple[State, State]:
         state = jax.eval_shape(self.reset, key)
         return state, jax.eval_shape(self.step, state, action)
 
-    def reset(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None) -> State:
+    def reset(
+        self, key: jax.Array, model: mjx.Model | None = None, start: tuple[ArrayLike, ArrayLike] | None = None
+    ) -> State:
         """Return a copy at the start of an episode.
 
         Args:
@@ -220,7 +229,13 @@ class MjxEnvironment:
         outcome = (observation, reward, discount + 1, no, no, failed)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
-    def reset_apart(self, key: Any, model: Any = None, start: tuple[Any, Any] | None = None, data: Any = None) -> State:
+    def reset_apart(
+        self,
+        key: jax.Array,
+        model: mjx.Model | None = None,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+        data: mjx.Data | None = None,
+    ) -> State:
         """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
 
         Args:
@@ -236,7 +251,7 @@ class MjxEnvironment:
         finally:
             self._dry, self.initial = before
 
-    def step_apart(self, state: State, action: Any, model: Any = None) -> tuple[State, Any]:
+    def step_apart(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> tuple[State, jax.Array]:
         """Run the hooks of a control step without its physics.
 
         Args:
@@ -259,7 +274,7 @@ class MjxEnvironment:
         kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
         return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
 
-    def step(self, state: State, action: Any, model: Any = None) -> State:
+    def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
 
         Args:
@@ -291,13 +306,15 @@ class MjxEnvironment:
         outcome = (observation, reward, discount, ended | late, late & ~ended, state.failed)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
-    def _substeps(self, physics: MjxPhysics, random_state: JaxRandomState, state: State, action: Any) -> Any:
+    def _substeps(
+        self, physics: MjxPhysics, random_state: JaxRandomState, state: State, action: jax.Array
+    ) -> tuple[dict[str, Samples], jax.Array]:
         """Take all physics steps; return the rings, without the last samples, and whether a step diverged."""
         buffered = [r for r in self._rings if not r.direct]
 
         entry = physics.is_dirty
 
-        def substep(carry: Any, i: Any) -> tuple[Any, None]:
+        def substep(carry: Any, i: jax.Array) -> tuple[Any, None]:
             tree, rings, dirty, diverged = carry
             physics.load(tree, random_state)
             physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
@@ -331,11 +348,11 @@ class MjxEnvironment:
         """Have every copy keep fields of the model that it was reset with, for the steps, such as ``body_mass``."""
         self._changed = tuple(sorted({*self._changed, *names}))
 
-    def observation_spec(self) -> dict[str, Any]:
+    def observation_spec(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Return name -> shape and dtype."""
         return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
 
-    def select(self, condition: Any, a: State, b: State) -> State:
+    def select(self, condition: jax.Array, a: State, b: State) -> State:
         """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done.
 
         Args:
@@ -344,7 +361,7 @@ class MjxEnvironment:
             b: Another copy.
         """
 
-        def choose(x: Any, y: Any) -> Any:
+        def choose(x: jax.Array, y: jax.Array) -> jax.Array:
             if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):
                 return jnp.where(condition, x, y)
             data = jnp.where(condition, jax.random.key_data(x), jax.random.key_data(y))
@@ -353,19 +370,19 @@ class MjxEnvironment:
         return jax.tree_util.tree_map(choose, a, b)
 
 
-def _initial_data(model: Any) -> Any:
+def _initial_data(model: MjModel) -> mjx.Data:
     """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all that follows from it."""
     physics = Physics(model)  # which computes everything, without the actuators
     return mjx.put_data(model, physics.data.ptr, impl="jax")
 
 
-def is_unstable(data: Any) -> Any:
+def is_unstable(data: mjx.Data) -> jax.Array:
     """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
     return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
 
 
-def _zeros(spec: Any) -> Any:
+def _zeros(spec: specs.Array) -> jax.Array:
     return jnp.zeros(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))
 
 

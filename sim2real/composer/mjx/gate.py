@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mujoco import mjx
 
@@ -12,11 +12,14 @@ from sim2real.composer.observation.observable.base import MujocoCamera, Observab
 from sim2real.composer.observation.observable.mjcf import MJCFCamera
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel
+
 _INTEGRATORS = (mj.mjtIntegrator.mjINT_EULER, mj.mjtIntegrator.mjINT_RK4, mj.mjtIntegrator.mjINT_IMPLICITFAST)
 _PASSIVE = (mj.mjtDisableBit.mjDSBL_SPRING, mj.mjtDisableBit.mjDSBL_DAMPER)
 
 
-def check_model(model: Any) -> None:
+def check_model(model: MjModel) -> None:
     """Refuse a compiled model that MJX does not simulate as MuJoCo does.
 
     Raises:
@@ -49,7 +52,7 @@ def check_model(model: Any) -> None:
         )
 
 
-def settle_cone(model: Any) -> None:
+def settle_cone(model: MjModel) -> None:
     """Make friction cones pyramidal where nothing can touch, and cones mean nothing; refuse those that MJX lacks.
 
     With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.

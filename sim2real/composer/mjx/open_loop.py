@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
@@ -12,13 +12,16 @@ from sim2real.composer.mjx.dependence import origins
 from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from mujoco import mjx
+
 _GIVEN = ("qpos", "qvel")
 """What a start sets of the state, and what the physics then starts from."""
 
 
 def check(
     environment: MjxEnvironment,
-    entered: Callable[[State, Any], State],
+    entered: Callable[[State, jax.Array], State],
     output: Callable[[State], Any],
     name: str,
 ) -> None:
@@ -39,7 +42,7 @@ def check(
     plain = lambda spec: jax.ShapeDtypeStruct(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))  # noqa: E731
     action = jax.tree_util.tree_map(plain, environment.action_spec())
 
-    def tick(state: State, action: Any) -> tuple[State, Any]:
+    def tick(state: State, action: jax.Array) -> tuple[State, jax.Array]:
         return environment.step_apart(entered(state, action), action)
 
     unmoved = jax.tree_util.tree_map(lambda _: False, action)
@@ -86,7 +89,7 @@ def _check_start(environment: MjxEnvironment, name: str) -> State:
     return jax.eval_shape(reset, shapes, place)
 
 
-def _check_message(state: State, marked: Any, output: Callable[[State], Any], name: str) -> None:
+def _check_message(state: State, marked: State, output: Callable[[State], Any], name: str) -> None:
     """Check that a message says nothing but positions, velocities and accelerations."""
     known = _all_but(state.data, ("qpos", "qvel", "qacc"))
     everything = jax.tree_util.tree_map(lambda _: True, marked).replace(data=known)
@@ -94,7 +97,7 @@ def _check_message(state: State, marked: Any, output: Callable[[State], Any], na
         raise _closed(name, f"its message's {bad[0]} is more than positions, velocities and accelerations")
 
 
-def _all_but(tree: Any, names: tuple[str, ...]) -> Any:
+def _all_but(tree: mjx.Data, names: tuple[str, ...]) -> mjx.Data:
     """Return True for every leaf of a dataclass but those of some fields."""
     return jax.tree_util.tree_map(lambda _: True, tree).replace(**dict.fromkeys(names, False))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +21,24 @@ from sim2real.composer.models.element import as_elements
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from jax.typing import ArrayLike
+
+    from sim2real.composer.mjx.warp import WarpEngine
+    from sim2real.composer.models.element import Elements
+    from sim2real.composer.types import MjModel
+
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
 """What MJX leaves out of a program because it was 0 when the model was compiled; set, it has to be in."""
 _WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
 """The same on Warp."""
+
+
+Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, Any], jax.Array, dict[str, jax.Array]]
+"""All that changes: the state, fields of the model, variables of tasks, a key, what variations keep."""
 
 
 class MjxPhysics:
@@ -53,22 +66,23 @@ class MjxPhysics:
 
     def __init__(
         self,
-        host: Any,
-        model: Any,
-        data: Any,
+        host: MjModel,
+        model: mjx.Model,
+        data: mjx.Data | None,
         variables: dict[str, Any],
         legacy: bool = True,
-        engine: Any = stepping,
+        engine: ModuleType | WarpEngine = stepping,
     ) -> None:
         self._engine = engine
-        self.host, self.mjx_model, self.mjx_data = host, model, data
+        self.host, self.mjx_model = host, model
+        self.mjx_data: Any = data
         self.variables, self.start = variables, data
         self.legacy_step = legacy
         self.changed: set[str] = set()
-        self.failed: Any = jnp.zeros((), bool)
-        self.is_dirty: Any = False
+        self.failed = jnp.zeros((), bool)
+        self.is_dirty: bool | jax.Array = False
         self.dry = False
-        self._where: Any = None
+        self._where: jax.Array | None = None
         self._compiled = model
         self.data, self.model = MjxDataView(self), MjxModelView(self)
         self.named = Named(host, self.model, self.data)
@@ -107,7 +121,7 @@ class MjxPhysics:
         self.is_dirty = False if where is None else ~where & dirty
 
     @contextlib.contextmanager
-    def only_where(self, condition: Any) -> Iterator[None]:
+    def only_where(self, condition: jax.Array) -> Iterator[None]:
         """Let what is read inside a ``with`` block change nothing where a condition, a boolean array, does not hold."""
         self._where = condition
         try:
@@ -115,7 +129,7 @@ class MjxPhysics:
         finally:
             self._where = None
 
-    def check(self, struct: str, name: str, rows: Any = slice(None)) -> None:
+    def check(self, struct: str, name: str, rows: int | slice | np.ndarray = slice(None)) -> None:
         """Refuse to set rows of a field where MJX would not see it.
 
         Args:
@@ -139,7 +153,7 @@ class MjxPhysics:
                 hint="set it in initialize_episode_mjcf, or use the C engine",
             )
 
-    def replace(self, struct: str, name: str, value: Any) -> None:
+    def replace(self, struct: str, name: str, value: ArrayLike) -> None:
         """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
 
         Args:
@@ -154,7 +168,7 @@ class MjxPhysics:
         current = _get(holder, name)
         if not isinstance(current, jax.Array):
             raise constant(name)
-        if struct == "model" and warp_fields.is_warp(holder):
+        if struct == "model" and warp_fields.is_warp(self.mjx_model):
             warp_fields.check_field(name)
         try:
             value = jnp.broadcast_to(jnp.asarray(value, current.dtype), current.shape)
@@ -163,7 +177,7 @@ class MjxPhysics:
         if struct == "data":
             self.mjx_data = self.mjx_data.replace(**{name: value})
             return
-        self.mjx_model = self.mjx_model.tree_replace({name: value})
+        self.mjx_model = stepping.with_fields(self.mjx_model, {name: value})
         self.changed.add(name)
         self.switch_on()
 
@@ -173,7 +187,7 @@ class MjxPhysics:
         switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
         for path in {switches[name] for name in self.changed if name in switches}:
             if not _get(self.mjx_model, path):
-                self.mjx_model = self.mjx_model.tree_replace({path: True})
+                self.mjx_model = stepping.with_fields(self.mjx_model, {path: True})
         implicit = self.mjx_model.opt.integrator == mjx.IntegratorType.IMPLICITFAST
         if self.changed.intersection(_FLUID) and implicit and not on_warp:
             raise UsageError("MJX has no fluid forces with the integrator implicitfast", hint="use Euler or RK4")
@@ -184,11 +198,11 @@ class MjxPhysics:
             self.replace("model", name, value)
         self.mark_as_dirty()
 
-    def field(self, name: str) -> Any:
+    def field(self, name: str) -> jax.Array:
         """Return a field of this copy's model, such as ``dof_damping`` or ``opt.gravity``."""
         return _get(self.mjx_model, name)
 
-    def initial(self, elements: Any, name: str) -> Any:
+    def initial(self, elements: Elements, name: str) -> Any:
         """Return an attribute of elements as it was compiled."""
         field, index = self.bind(elements).place(name)
         holder = self._compiled if field.struct == "model" else self.mjx_data
@@ -196,19 +210,19 @@ class MjxPhysics:
 
     # -- the interface of the C engine's physics
 
-    def time(self) -> Any:
+    def time(self) -> jax.Array:
         """Return the simulated time [s]."""
         return self.mjx_data.time
 
-    def timestep(self) -> Any:
+    def timestep(self) -> jax.Array:
         """Return the time that a step takes [s]."""
         return self.mjx_model.opt.timestep
 
-    def control(self) -> Any:
+    def control(self) -> jax.Array:
         """Return the controls, shape ``(nu,)``."""
         return self.mjx_data.ctrl
 
-    def set_control(self, control: Any) -> None:
+    def set_control(self, control: ArrayLike) -> None:
         """Set the controls, shape ``(nu,)`` [the actuators' units].
 
         Raises:
@@ -223,26 +237,26 @@ class MjxPhysics:
         control = jnp.ravel(jnp.asarray(control, old.dtype))
         self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(control, old.shape))
 
-    def position(self) -> Any:
+    def position(self) -> jax.Array:
         """Return qpos, shape ``(nq,)``."""
         return self.mjx_data.qpos
 
-    def velocity(self) -> Any:
+    def velocity(self) -> jax.Array:
         """Return qvel, shape ``(nv,)``."""
         return self.mjx_data.qvel
 
-    def activation(self) -> Any:
+    def activation(self) -> jax.Array:
         """Return act, shape ``(na,)``."""
         return self.mjx_data.act
 
-    def get_state(self) -> Any:
+    def get_state(self) -> jax.Array:
         """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
         data = self.mjx_data
         return jnp.concatenate([data.qpos, data.qvel, data.act])
 
     state = get_state
 
-    def set_state(self, state: Any) -> None:
+    def set_state(self, state: ArrayLike) -> None:
         """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
 
         Raises:
@@ -284,11 +298,11 @@ class MjxPhysics:
             self.mjx_data = self._engine.forward(self.mjx_model, self.mjx_data, actuation)
         self.is_dirty = False
 
-    def suppress_physics_errors(self) -> Any:
+    def suppress_physics_errors(self) -> contextlib.nullcontext[None]:
         """MJX raises none."""
         return contextlib.nullcontext()
 
-    def bind(self, elements: Any) -> Any:
+    def bind(self, elements: Elements) -> Any:
         """Return the attributes of an element, or of several of one kind.
 
         Raises:
@@ -301,11 +315,11 @@ class MjxPhysics:
         ids = layout.resolve(self.host, found[0].kind, tuple(e.full_identifier for e in found))
         return MjxBinding(self, found[0].kind, ids, single)
 
-    def get(self, elements: Any, name: str) -> Any:
+    def get(self, elements: Elements, name: str) -> Any:
         """Return an attribute of elements; the same call on both engines."""
         return getattr(self.bind(elements), name)
 
-    def set(self, elements: Any, name: str, value: Any) -> MjxPhysics:
+    def set(self, elements: Elements, name: str, value: Any) -> MjxPhysics:
         """Set an attribute of elements and return the physics; the same call on both engines.
 
         Args:
@@ -316,7 +330,7 @@ class MjxPhysics:
         setattr(self.bind(elements), name, value)
         return self
 
-    def write(self, elements: Any, name: str, value: Any, index: Any) -> MjxPhysics:
+    def write(self, elements: Elements, name: str, value: Any, index: Any) -> MjxPhysics:
         """Set a part of an attribute of elements; the same call on both engines.
 
         Args:
@@ -328,29 +342,29 @@ class MjxPhysics:
         whole = jnp.asarray(self.get(elements, name))
         return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
 
-    def fail(self, condition: Any = True) -> None:
+    def fail(self, condition: bool | jax.Array = True) -> None:
         """Note that no acceptable initial state was found where the condition holds; another attempt follows."""
         self.failed = self.failed | condition
 
     # -- state as a tree
 
-    def tree(self, random_state: JaxRandomState) -> Any:
+    def tree(self, random_state: JaxRandomState) -> Carried:
         """Return all that changes, as a tree."""
         leaves = {name: _get(self.mjx_model, name) for name in sorted(self.changed)}
         variables = {name: jax.tree_util.tree_map(jnp.asarray, value) for name, value in self.variables.items()}
         return self.mjx_data, leaves, variables, random_state.key, dict(random_state.memory)
 
-    def load(self, tree: Any, random_state: JaxRandomState) -> None:
+    def load(self, tree: Carried, random_state: JaxRandomState) -> None:
         """Take over what ``tree`` returned."""
         self.mjx_data, leaves, variables, random_state.key, memory = tree
         if leaves:
-            self.mjx_model = self.mjx_model.tree_replace(leaves)
+            self.mjx_model = stepping.with_fields(self.mjx_model, leaves)
         self.changed |= set(leaves)
         for mine, theirs in ((self.variables, variables), (random_state.memory, memory)):
             mine.clear()
             mine.update(theirs)
 
-    def retry(self, attempt: Callable[[], None], random_state: JaxRandomState, attempts: int) -> Any:
+    def retry(self, attempt: Callable[[], None], random_state: JaxRandomState, attempts: int) -> jax.Array:
         """Run a function until it no longer calls ``fail``, at most so many times; return whether the last one failed.
 
         Every attempt starts from the same state, with new random numbers.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from mujoco import mjx
@@ -14,15 +14,21 @@ from sim2real.composer.mjx.warp_fields import is_warp
 from sim2real.composer.variation.base import evaluate
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    import jax
+
+    from sim2real.composer.entity import Entity
+    from sim2real.composer.types import Array, Varying
+
 
 def place(
     physics: MjxPhysics,
     random_state: JaxRandomState,
-    props: Sequence[Any],
-    pose: tuple[Any, Any],
+    props: Sequence[Entity],
+    pose: tuple[Varying, Varying],
     attempts: int,
     ignore_collisions: bool,
-    ignored: Sequence[Any],
+    ignored: Sequence[Entity],
 ) -> None:
     """Place one prop after the other where it touches neither the world nor the props before it.
 
@@ -52,7 +58,9 @@ def place(
         own = jnp.array(numbers[i], int)
         initial = prop.get_pose(physics)
 
-        def attempt(prop: Any = prop, own: Any = own, later: Any = later, initial: Any = initial) -> None:
+        def attempt(
+            prop: Entity = prop, own: jax.Array = own, later: jax.Array = later, initial: tuple[Array, Array] = initial
+        ) -> None:
             drawn = [evaluate(p, x, x, random_state) for p, x in zip(pose, initial, strict=True)]
             prop.set_pose(physics, *drawn)
             if not ignore_collisions:
@@ -61,11 +69,11 @@ def place(
         physics.fail(physics.retry(attempt, random_state, attempts))
 
 
-def _geoms(physics: MjxPhysics, prop: Any) -> list[int]:
+def _geoms(physics: MjxPhysics, prop: Entity) -> list[int]:
     return [int(i) for i in physics.bind(prop.mjcf_model.find_all("geom")).element_id]
 
 
-def _touches(physics: MjxPhysics, own: Any, later: Any) -> Any:
+def _touches(physics: MjxPhysics, own: jax.Array, later: jax.Array) -> jax.Array:
     """Return whether a geom of a prop touches one that counts."""
     if physics.dry:
         return jnp.zeros((), bool)

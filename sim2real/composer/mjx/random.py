@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
+
+    from sim2real.composer.variation.base import Variation
+
+
+Size = int | Sequence[int] | None
+"""The shape of what is drawn; None: that of the parameters."""
 
 
 class Registry:
@@ -19,10 +29,10 @@ class Registry:
     """
 
     def __init__(self) -> None:
-        self.initial: dict[str, Any] = {}
-        self._owners: list[Any] = []
+        self.initial: dict[str, ArrayLike] = {}
+        self._owners: list[Variation] = []
 
-    def name(self, owner: Any, initial: Any) -> str:
+    def name(self, owner: Variation, initial: ArrayLike) -> str:
         """Return the name of what an owner keeps."""
         number = next((i for i, known in enumerate(self._owners) if known is owner), None)
         if number is None:
@@ -46,27 +56,29 @@ class JaxRandomState:
         memory: The same dictionary, with new values.
     """
 
-    def __init__(self, key: Any, memory: dict[str, Any] | None = None, registry: Registry | None = None) -> None:
-        self.key = key
+    def __init__(
+        self, key: jax.Array | None, memory: dict[str, jax.Array] | None = None, registry: Registry | None = None
+    ) -> None:
+        self.key: Any = key
         self.memory = {} if memory is None else memory
         self._registry = registry or Registry()
 
-    def recall(self, owner: Any, initial: Any) -> Any:
+    def recall(self, owner: Variation, initial: ArrayLike) -> jax.Array:
         """Return what a variation kept at its last draw, or its initial value."""
         name = self._registry.name(owner, initial)
         return self.memory[name] if name in self.memory else jnp.asarray(initial)
 
-    def keep(self, owner: Any, value: Any) -> None:
+    def keep(self, owner: Variation, value: ArrayLike) -> None:
         """Keep a value for the next draw of a variation."""
         name = self._registry.name(owner, value)
         self.memory[name] = jnp.asarray(value, jnp.asarray(self._registry.initial[name]).dtype)
 
-    def next_key(self) -> Any:
+    def next_key(self) -> jax.Array:
         """Return a key that was not used before."""
         self.key, key = jax.random.split(self.key)
         return key
 
-    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+    def uniform(self, low: ArrayLike = 0.0, high: ArrayLike = 1.0, size: Size = None) -> jax.Array:
         """Return floats in ``[low, high)``.
 
         Args:
@@ -77,7 +89,7 @@ class JaxRandomState:
         low, high = jnp.asarray(low, float), jnp.asarray(high, float)
         return low + (high - low) * jax.random.uniform(self.next_key(), _shape(size, low, high))
 
-    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+    def normal(self, loc: ArrayLike = 0.0, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
         """Return normally distributed floats.
 
         Args:
@@ -88,7 +100,7 @@ class JaxRandomState:
         loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
         return loc + scale * jax.random.normal(self.next_key(), _shape(size, loc, scale))
 
-    def lognormal(self, mean: Any = 0.0, sigma: Any = 1.0, size: Any = None) -> Any:
+    def lognormal(self, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0, size: Size = None) -> jax.Array:
         """Return exponentials of normally distributed floats.
 
         Args:
@@ -98,17 +110,17 @@ class JaxRandomState:
         """
         return jnp.exp(self.normal(mean, sigma, size))
 
-    def exponential(self, scale: Any = 1.0, size: Any = None) -> Any:
+    def exponential(self, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
         """Return exponentially distributed floats."""
         return jnp.asarray(scale, float) * jax.random.exponential(self.next_key(), _shape(size, scale))
 
-    def poisson(self, lam: Any = 1.0, size: Any = None) -> Any:
+    def poisson(self, lam: ArrayLike = 1.0, size: Size = None) -> jax.Array:
         """Return Poisson distributed integers."""
         # JAX draws Poisson numbers with threefry keys only.
         key = jax.random.wrap_key_data(jax.random.key_data(self.next_key()), impl="threefry2x32")
         return jax.random.poisson(key, lam, _shape(size, lam))
 
-    def binomial(self, n: Any, p: Any, size: Any = None) -> Any:
+    def binomial(self, n: ArrayLike, p: ArrayLike, size: Size = None) -> jax.Array:
         """Return binomially distributed integers.
 
         Args:
@@ -118,7 +130,7 @@ class JaxRandomState:
         """
         return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
 
-    def randint(self, low: Any, high: Any = None, size: Any = None) -> Any:
+    def randint(self, low: ArrayLike, high: ArrayLike | None = None, size: Size = None) -> jax.Array:
         """Return integers in ``[low, high)``, or in ``[0, low)``.
 
         Args:
@@ -129,7 +141,7 @@ class JaxRandomState:
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
 
-    def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
+    def choice(self, a: ArrayLike, size: Size = None, replace: bool = True, p: ArrayLike | None = None) -> jax.Array:
         """Return items of ``a``, or integers below it, with probabilities ``p``.
 
         Args:
@@ -141,19 +153,19 @@ class JaxRandomState:
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
         return jax.random.choice(self.next_key(), values, _shape(size), replace, None if p is None else jnp.asarray(p))
 
-    def permutation(self, x: Any) -> Any:
+    def permutation(self, x: ArrayLike) -> jax.Array:
         """Return ``x``, or the integers below it, in random order."""
         return jax.random.permutation(self.next_key(), x)
 
-    def random_sample(self, size: Any = None) -> Any:
+    def random_sample(self, size: Size = None) -> jax.Array:
         """Return floats in [0, 1)."""
         return self.uniform(size=size)
 
-    def standard_normal(self, size: Any = None) -> Any:
+    def standard_normal(self, size: Size = None) -> jax.Array:
         """Return floats of mean 0 and standard deviation 1."""
         return self.normal(size=size)
 
-    def beta(self, a: Any, b: Any, size: Any = None) -> Any:
+    def beta(self, a: ArrayLike, b: ArrayLike, size: Size = None) -> jax.Array:
         """Return Beta distributed floats.
 
         Args:
@@ -163,7 +175,7 @@ class JaxRandomState:
         """
         return jax.random.beta(self.next_key(), a, b, _shape(size, a, b))
 
-    def gamma(self, shape: Any, scale: Any = 1.0, size: Any = None) -> Any:
+    def gamma(self, shape: ArrayLike, scale: ArrayLike = 1.0, size: Size = None) -> Any:
         """Return Gamma distributed floats.
 
         Args:
@@ -173,7 +185,7 @@ class JaxRandomState:
         """
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
-    def shuffle(self, x: Any) -> None:
+    def shuffle(self, x: ArrayLike) -> None:
         """Refuse to work in place.
 
         Raises:
@@ -187,16 +199,16 @@ class JaxRandomState:
         known = ", ".join(n for n in dir(type(self)) if not n.startswith("_"))
         raise AttributeError(f"on MJX random_state has no {name!r}. Available: {known}")
 
-    def rand(self, *shape: int) -> Any:
+    def rand(self, *shape: int) -> jax.Array:
         """Return floats in [0, 1)."""
         return self.uniform(size=shape)
 
-    def randn(self, *shape: int) -> Any:
+    def randn(self, *shape: int) -> jax.Array:
         """Return normally distributed floats."""
         return self.normal(size=shape)
 
 
-def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
+def _shape(size: Any, *parameters: ArrayLike) -> tuple[int, ...]:
     if size is None:
         return jnp.broadcast_shapes(*(jnp.shape(p) for p in parameters)) if parameters else ()
     return (int(size),) if np.ndim(size) == 0 else tuple(int(s) for s in size)

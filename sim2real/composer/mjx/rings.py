@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,12 @@ from sim2real.composer.variation import deterministic, distributions
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.types import Steps
+
 Call = Callable[..., Any]
+Samples: TypeAlias = dict[str, jax.Array]
+"""The samples of an observable that may still be read, when they arrive, and when the next one is taken."""
 
 
 def _call(label: str, function: Call, *args: Any) -> Any:
@@ -47,13 +52,13 @@ class Ring:
     ) -> None:
         self.name, self.observable, self.steps, self.pad_initial = name, observable, steps, pad_initial
         self._call = call
-        size: Any = observable.buffer_size or 1
+        size = observable.buffer_size or 1
         if callable(size):
             raise UsageError(f"observable {name!r}: on MJX the buffer size is a number, got {size!r}")
         self.size = int(size)
         self.strip = strip and self.size == 1
-        self._interval: Any = observable.update_interval or 1
-        self._delay: Any = observable.delay or 0
+        self._interval = observable.update_interval or 1
+        self._delay = observable.delay or 0
         shortest = self._bound(self._interval, observable.min_interval, "min_interval", 0)
         longest = self._bound(self._delay, observable.max_delay, "max_delay", 1)
         if shortest < 1 or (not callable(self._delay) and self._delay < 0):
@@ -63,7 +68,7 @@ class Ring:
         self.direct = aligned and longest == 0 and self.size == 1
         """Whether every read falls on a sample and shows nothing but it: then there is no ring at all."""
 
-    def _bound(self, value: Any, declared: int | None, attribute: str, which: int) -> int:
+    def _bound(self, value: Steps, declared: int | None, attribute: str, which: int) -> int:
         if not callable(value):
             return int(value)
         if declared is not None:
@@ -76,11 +81,11 @@ class Ring:
             )
         return bounds[which]
 
-    def sample(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+    def sample(self, physics: MjxPhysics, random_state: JaxRandomState) -> jax.Array:
         """Return the corrupted value as it is now."""
         return jnp.asarray(self._call(f"observable {self.name!r}", self.observable, physics, random_state))
 
-    def reset(self, physics: MjxPhysics, random_state: JaxRandomState) -> Any:
+    def reset(self, physics: MjxPhysics, random_state: JaxRandomState) -> Samples:
         """Return the ring at the start of an episode: the first sample is in it."""
         value = self.sample(physics, random_state)
         if self.direct:
@@ -95,7 +100,9 @@ class Ring:
             ring["first"] = value
         return self._insert(ring, jnp.zeros((), jnp.int32), value, random_state)
 
-    def update(self, ring: Any, now: Any, physics: MjxPhysics, random_state: JaxRandomState, counts: Any) -> Any:
+    def update(
+        self, ring: Samples, now: jax.Array, physics: MjxPhysics, random_state: JaxRandomState, counts: bool | jax.Array
+    ) -> Samples:
         """Return the ring after a physics step, with a new sample in it when one is due.
 
         Args:
@@ -118,7 +125,7 @@ class Ring:
             random_state.memory[name] = jnp.where(taken, random_state.memory[name], kept)
         return jax.tree_util.tree_map(lambda a, b: jnp.where(due, a, b), new, ring)
 
-    def _can_be_read(self, now: Any) -> Any:
+    def _can_be_read(self, now: jax.Array) -> bool | jax.Array:
         """Return whether an observation can hold a sample taken now; the C engine does not take others either."""
         if callable(self._interval) or callable(self._delay):
             return True
@@ -126,7 +133,7 @@ class Ring:
         read = -(-arrival // self.steps) * self.steps
         return (read - arrival) // int(self._interval) < self.size
 
-    def _insert(self, ring: Any, now: Any, value: Any, random_state: JaxRandomState) -> Any:
+    def _insert(self, ring: Samples, now: jax.Array, value: jax.Array, random_state: JaxRandomState) -> Samples:
         # Selected against an index: a scatter for each copy takes several kernels on a GPU, and copies the samples.
         slot = jnp.arange(self.capacity) == ring["count"] % self.capacity
         rows = jnp.reshape(slot, (self.capacity, *(1,) * value.ndim))
@@ -138,7 +145,7 @@ class Ring:
             "next": now + _draw(self._interval, random_state),
         }
 
-    def read(self, ring: Any, now: Any) -> Any:
+    def read(self, ring: Samples, now: jax.Array) -> jax.Array:
         """Return the last samples that have arrived, in the order of arrival, or what the aggregator makes of them."""
         if self.direct:
             return self._shaped(ring["value"][None])
@@ -152,7 +159,7 @@ class Ring:
         shown = jnp.reshape(there[last], (self.size, *(1,) * (values.ndim - 1)))
         return self._shaped(jnp.where(shown, values, pad))
 
-    def _shaped(self, buffer: Any) -> Any:
+    def _shaped(self, buffer: jax.Array) -> jax.Array:
         values = buffer[0] if self.strip else buffer
         return values if self.observable.aggregator is None else self.observable.aggregator(values)
 
@@ -172,7 +179,7 @@ def make_rings(
     return [Ring(name, o, steps, strip, pad_initial, call) for name, o in observables.items() if o.enabled]
 
 
-def _draw(value: Any, random_state: JaxRandomState) -> Any:
+def _draw(value: Steps, random_state: JaxRandomState) -> jax.Array:
     if isinstance(value, Variation):
         value = value(random_state=random_state)
     elif callable(value):
@@ -180,7 +187,7 @@ def _draw(value: Any, random_state: JaxRandomState) -> Any:
     return jnp.asarray(value).astype(jnp.int32)
 
 
-def _bounds(value: Any) -> tuple[int, int] | None:
+def _bounds(value: object) -> tuple[int, int] | None:
     """Return the least and the greatest value of a variation of integers, or None where it tells none."""
     if isinstance(value, deterministic.Constant):
         return int(value.value), int(value.value)

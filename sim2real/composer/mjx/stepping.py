@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax.numpy as jnp
 from mujoco import mjx
 
+T = TypeVar("T", mjx.Model, mjx.Data)
 
-def advance(model: Any, data: Any, legacy: bool) -> Any:
+
+def with_fields(tree: T, values: dict[str, Any]) -> T:
+    """Return a model or a state with other values of some fields, by their paths, such as ``opt.gravity``."""
+    return cast("T", tree.tree_replace(values))
+
+
+def advance(model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
     """Return the data a time step later.
 
     With ``legacy`` the data must be consistent, what ``forward`` or an earlier step returned, and that is no dearer:
@@ -27,14 +34,14 @@ def advance(model: Any, data: Any, legacy: bool) -> Any:
     return _positions(model, _integrate(model, _accelerate(model, data)))
 
 
-def _integrate(model: Any, data: Any) -> Any:
+def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.opt.integrator == mjx.IntegratorType.RK4:
         # MuJoCo leaves sensors as they were before the step, mjx.rungekutta4 as in its last stage
         return mjx.rungekutta4(model, data).replace(sensordata=data.sensordata)
     return mjx.euler(model, data) if model.opt.integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
 
 
-def forward(model: Any, data: Any, actuation: bool = True) -> Any:
+def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
     """Compute everything that follows from the state; without actuation, as at the start of an episode.
 
     ``mjx.forward`` leaves accelerometers and force sensors at 0 in models without constraints; this does not.
@@ -46,12 +53,12 @@ def forward(model: Any, data: Any, actuation: bool = True) -> Any:
     """
     if not actuation:
         flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
-        model = model.tree_replace({"opt.disableflags": flags})
+        model = with_fields(model, {"opt.disableflags": flags})
     data = _positions(model, data)
     return _accelerate(model, mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data)))
 
 
-def _positions(model: Any, data: Any) -> Any:
+def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute what follows from positions and velocities, and leave the state as MuJoCo does.
 
     MJX writes quaternions back normalized, and has velocities of actuators that are switched off; MuJoCo has zeros.
@@ -60,10 +67,12 @@ def _positions(model: Any, data: Any) -> Any:
     data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
     data = mjx.fwd_velocity(model, data)
     if model.opt.disableflags & mjx.DisableBit.ACTUATION:
-        data = data.tree_replace({"_impl.actuator_velocity": jnp.zeros_like(data._impl.actuator_velocity)})
+        impl: Any = data._impl
+        data = with_fields(data, {"_impl.actuator_velocity": jnp.zeros_like(impl.actuator_velocity)})
     return mjx.sensor_vel(model, data).replace(qpos=qpos)
 
 
-def _accelerate(model: Any, data: Any) -> Any:
-    data = data.replace(qacc=data.qacc_smooth) if data._impl.efc_J.size == 0 else mjx.solve(model, data)
+def _accelerate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    impl: Any = data._impl
+    data = data.replace(qacc=data.qacc_smooth) if impl.efc_J.size == 0 else mjx.solve(model, data)
     return mjx.sensor_acc(model, data)

@@ -9,7 +9,7 @@ import functools
 import random
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.errors
@@ -19,6 +19,8 @@ from jax.core import Tracer
 from sim2real.composer.define import cached_property
 from sim2real.composer.hooks import Hooks
 from sim2real.errors import UsageError
+
+T = TypeVar("T")
 
 _KEEP = "keep what changes in physics.variables[{name!r}], which belongs to each copy; set what does not in __init__"
 _DEPTH = 6
@@ -100,9 +102,9 @@ class TracedHooks(Hooks):
         watched: The objects whose attributes hooks must not change; empty: none is looked at.
     """
 
-    watched: tuple[Any, ...] = ()
+    watched: tuple[object, ...] = ()
 
-    def call(self, label: str, function: Callable[..., Any], *args: Any) -> Any:
+    def call(self, label: str, function: Callable[..., T], *args: Any) -> T:
         """Return what a function returns.
 
         Raises:
@@ -122,7 +124,7 @@ class TracedHooks(Hooks):
         return result
 
     @contextlib.contextmanager
-    def watching(self, owners: Iterable[Any]) -> Iterator[None]:
+    def watching(self, owners: Iterable[object]) -> Iterator[None]:
         """Refuse changes of some objects' attributes inside a ``with`` block; if it fails, put them back."""
         self.watched = tuple(owners)
         before = [dict(vars(owner)) for owner in self.watched]
@@ -137,7 +139,7 @@ class TracedHooks(Hooks):
             self.watched = ()
 
 
-def _compare(label: str, owner: Any, before: dict[str, Any], after: dict[str, Any]) -> None:
+def _compare(label: str, owner: object, before: dict[str, object], after: dict[str, object]) -> None:
     """Refuse changes: only what was absent or None may be filled in, with what is no value of the simulation."""
     for name in sorted({*before, *after}):
         old, new = before.get(name, _print(None)), after.get(name, _print(None))
@@ -157,7 +159,7 @@ def _compare(label: str, owner: Any, before: dict[str, Any], after: dict[str, An
             )
 
 
-def _attributes(owner: Any) -> dict[str, Any]:
+def _attributes(owner: object) -> dict[str, object]:
     seen: set[int] = {id(owner)}
     return {k: _print(v, seen) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
 
@@ -169,14 +171,14 @@ def _is_cache(owner: type, name: str) -> bool:
 class _Same:
     """An object as such, whatever is in it."""
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: object) -> None:
         self.value = value
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Same) and self.value is other.value
 
 
-def _print(value: Any, seen: set[int] | None = None, depth: int = 0) -> Any:
+def _print(value: object, seen: set[int] | None = None, depth: int = 0) -> object:
     """Return what tells whether a value has changed: its contents, of containers and of a program's own objects."""
     seen = set() if seen is None else seen
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | enum.Enum | np.generic):
@@ -201,14 +203,14 @@ def _print(value: Any, seen: set[int] | None = None, depth: int = 0) -> Any:
     return [_Same(value), *((k, _print(v, seen, depth + 1)) for k, v in getattr(value, "__dict__", {}).items())]
 
 
-def _has_tracer(value: Any) -> bool:
+def _has_tracer(value: object) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(value))
 
 
-def _drawn() -> Any:
+def _drawn() -> object:
     return _numbers(np.random.get_state()), random.getstate()
 
 
-def _numbers(state: Any) -> Any:
+def _numbers(state: Any) -> tuple[bytes, int, list[Any]]:
     _, keys, position, *rest = state
     return keys.tobytes(), position, rest

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,12 @@ from sim2real.composer.c.binding import columns
 from sim2real.composer.models import layout
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
+    from mujoco import mjx
+
+    from sim2real.composer.types import MjModel
+
 _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
 """MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
 
@@ -19,15 +25,15 @@ _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
 class Traced(Protocol):
     """What is shown here: an ``MjxPhysics``, whose state and model are replaced when something is set."""
 
-    host: Any
-    mjx_model: Any
-    mjx_data: Any
+    host: MjModel
+    mjx_model: mjx.Model
+    mjx_data: mjx.Data
 
     def read(self, field: layout.Field) -> Any:
         """Return a whole field."""
         ...
 
-    def check(self, struct: str, name: str, rows: Any) -> None:
+    def check(self, struct: str, name: str, rows: int | slice | np.ndarray) -> None:
         """Refuse what cannot be set.
 
         Args:
@@ -36,7 +42,7 @@ class Traced(Protocol):
             rows: Which rows of it.
         """
 
-    def replace(self, struct: str, name: str, value: Any) -> None:
+    def replace(self, struct: str, name: str, value: ArrayLike) -> None:
         """Set a whole field.
 
         Args:
@@ -62,7 +68,7 @@ class ConstantView(np.ndarray):
 
     name: str = ""
 
-    def __array_finalize__(self, obj: Any) -> None:
+    def __array_finalize__(self, obj: np.ndarray | None) -> None:
         """Let arrays that are computed from this one be plain."""
         self.name = ""
 
@@ -88,7 +94,7 @@ class Struct:
     def __getattr__(self, name: str) -> Any:
         return shown(getattr(self._native, name), f"{self._name}.{name}")
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: ArrayLike) -> None:
         raise constant(f"{self._name}.{name}")
 
 
@@ -112,7 +118,7 @@ class OptionView:
         value = getattr(self._physics.mjx_model.opt, name, None)
         return value if isinstance(value, jax.Array) else shown(getattr(self._physics.host.opt, name), f"opt.{name}")
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: ArrayLike) -> None:
         self._physics.replace("model", f"opt.{name}", value)
 
 
@@ -124,7 +130,7 @@ class MjxModelView:
         object.__setattr__(self, "opt", OptionView(physics))
 
     @property
-    def ptr(self) -> Any:
+    def ptr(self) -> MjModel:
         """The compiled ``mujoco.MjModel``; its arrays are read-only."""
         return self._physics.host
 
@@ -143,7 +149,7 @@ class MjxModelView:
         value = getattr(model, name) if name in model.__dataclass_fields__ else None
         return value if isinstance(value, jax.Array) else shown(getattr(self.ptr, name), name)
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: ArrayLike) -> None:
         self._physics.replace("model", name, value)
 
 
@@ -162,7 +168,7 @@ class MjxDataView:
             raise AttributeError(f"a copy has no {name!r} of its own")
         return jnp.reshape(value, (-1, 9)) if name in _MATRICES else value
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: ArrayLike) -> None:
         self._physics.replace("data", name, value)
 
 
@@ -198,7 +204,7 @@ class MjxBinding:
         field, index = self.place(name)
         return self._physics.read(field)[index]
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: ArrayLike) -> None:
         field, index = self.place(name)
         array = jnp.asarray(self._physics.read(field))
         self._physics.check(field.struct, field.name, index)
@@ -219,7 +225,7 @@ class MjxBinding:
         setattr(self, name, value)
 
 
-def freeze(model: Any) -> None:
+def freeze(model: MjModel) -> None:
     """Make the arrays of a compiled ``MjModel`` read-only: programs no longer look at them."""
     for name in layout.array_fields("model"):
         array = getattr(model, name)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from sim2real.composer.mjx.stepping import with_fields
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel
 
 
 class WarpEngine:
@@ -31,7 +35,7 @@ class WarpEngine:
         start: The ``mjx.Data`` of the model's initial state, nothing computed.
     """
 
-    def __init__(self, host: Any, nconmax: int | None = None, njmax: int | None = None) -> None:
+    def __init__(self, host: MjModel, nconmax: int | None = None, njmax: int | None = None) -> None:
         for name, size in (("nconmax", nconmax), ("njmax", njmax)):
             if size is not None and size < 1:  # 0 contacts would be no collisions at all, without a word
                 raise UsageError(f"{name} is a number of at least 1, got {size}", hint="leave it out for a guess")
@@ -49,7 +53,7 @@ class WarpEngine:
         self._shared = {f"_impl.{k}": np.asarray(getattr(data._impl, k)) for k in _shared(data)}
         self.start = self._pack(data)
 
-    def advance(self, model: Any, data: Any, legacy: bool) -> Any:
+    def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
         """Return the data a time step later.
 
         Args:
@@ -60,7 +64,7 @@ class WarpEngine:
         step = self._stages.legacy_step if legacy else self._stages.step
         return self._pack(step(model, self._unpack(data)))
 
-    def forward(self, model: Any, data: Any, actuation: bool = True) -> Any:
+    def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
         """Compute everything that follows from the state; without actuation, as at the start of an episode.
 
         Args:
@@ -70,19 +74,19 @@ class WarpEngine:
         """
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
-            model = model.tree_replace({"opt.disableflags": flags})
+            model = with_fields(model, {"opt.disableflags": flags})
         return self._pack(self._stages.forward(model, self._unpack(data)))
 
-    def _pack(self, data: Any) -> Any:
-        return data.tree_replace(dict.fromkeys(self._shared))
+    def _pack(self, data: mjx.Data) -> mjx.Data:
+        return with_fields(data, dict.fromkeys(self._shared))
 
-    def _unpack(self, data: Any) -> Any:
+    def _unpack(self, data: mjx.Data) -> mjx.Data:
         # Contacts are where Warp has them, in arrays that JAX has no part in.
         new = {k: v[:0] if k.startswith("_impl.contact__") else v for k, v in self._shared.items()}
-        return data.tree_replace({k: jnp.asarray(v) for k, v in new.items()})
+        return with_fields(data, {k: jnp.asarray(v) for k, v in new.items()})
 
 
-def make_engine(host: Any, impl: str, nconmax: int | None, njmax: int | None) -> WarpEngine | None:
+def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None) -> WarpEngine | None:
     """Return what steps a model with Warp; None with ``impl="jax"``.
 
     Args:
@@ -103,9 +107,10 @@ def make_engine(host: Any, impl: str, nconmax: int | None, njmax: int | None) ->
     return None
 
 
-def overflowed(data: Any) -> Any:
+def overflowed(data: mjx.Data) -> jax.Array:
     """Return whether contacts or constraints of a copy were left out for want of room, since its reset."""
-    return (data._impl.overflow & _short()) != 0
+    impl: Any = data._impl
+    return (impl.overflow & _short()) != 0
 
 
 def _short() -> int:
@@ -144,7 +149,7 @@ def _is_cuda(device: Any, warp: Any) -> bool:
         return False
 
 
-def _shared(data: Any) -> list[str]:
+def _shared(data: mjx.Data) -> list[str]:
     """Return the names of the arrays that all copies have in common."""
     from mujoco.mjx.warp import types
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mujoco import mjx
 
 from sim2real.errors import UsageError
@@ -29,6 +27,6 @@ def check_field(path: str) -> None:
         )
 
 
-def is_warp(model: Any) -> bool:
+def is_warp(model: mjx.Model) -> bool:
     """Return whether an ``mjx.Model`` is MuJoCo Warp's."""
     return model.impl == mjx.Impl.WARP

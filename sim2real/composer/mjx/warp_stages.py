@@ -13,11 +13,11 @@ import functools
 import importlib
 from collections.abc import Callable
 from types import FunctionType, SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, constraint, sensor, smooth, solver
+from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, constraint, sensor, smooth, solver, types
 from mujoco.mjx.third_party.mujoco_warp._src import forward as stages
 from mujoco.mjx.third_party.mujoco_warp._src.types import Contact, DisableBit, EnableBit
 from mujoco.mjx.warp import ffi
@@ -26,8 +26,11 @@ from mujoco.mjx.warp import forward as generated
 from sim2real.composer.mjx.warp_fields import varies
 from sim2real.composer.models.translate import mj
 
+if TYPE_CHECKING:
+    from mujoco import mjx
+
 wp: Any = importlib.import_module("warp")  # an extra, which type checkers may not find
-Order = Callable[[Any, Any], None]
+Order = Callable[[types.Model, types.Data], None]
 """A function of ``mujoco_warp``'s model and data, which it changes."""
 
 
@@ -38,7 +41,7 @@ def _clear(sensors: wp.array[int], addresses: wp.array[int], values: wp.array2d[
     values[copy, addresses[sensors[i]]] = 0.0
 
 
-def _legacy(m: Any, d: Any) -> None:
+def _legacy(m: types.Model, d: types.Data) -> None:
     """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
 
     The data hold positions and velocities of the state before. As contacts are not kept from step to step, they are
@@ -65,7 +68,7 @@ def _legacy(m: Any, d: Any) -> None:
     d.cacc, d.cfrc_int = kept
 
 
-def _accelerations(m: Any, d: Any) -> None:
+def _accelerations(m: types.Model, d: types.Data) -> None:
     """Compute what follows from positions, velocities and controls."""
     stages.fwd_actuation(m, d)
     stages.fwd_acceleration(m, d, factorize=True)
@@ -75,7 +78,7 @@ def _accelerations(m: Any, d: Any) -> None:
     sensor.sensor_acc(m, d, skip_rne_postconstraint=True)
 
 
-def _positions_and_velocities(m: Any, d: Any) -> None:
+def _positions_and_velocities(m: types.Model, d: types.Data) -> None:
     """Compute what follows from positions and velocities, with contacts only where sensors ask for them."""
     limits = (m.sensor_limitpos_adr, m.sensor_limitvel_adr)
     for sensors in limits:  # they are only written where a limit is near
@@ -94,17 +97,17 @@ def _positions_and_velocities(m: Any, d: Any) -> None:
     stages._energy_vel(m, d)
 
 
-def _can_sleep(m: Any) -> bool:
+def _can_sleep(m: types.Model) -> bool:
     return bool(m.opt.enableflags & EnableBit.SLEEP) and not bool(m.opt.disableflags & DisableBit.ISLAND)
 
 
-def _asks_for_accelerations(m: Any) -> bool:
+def _asks_for_accelerations(m: types.Model) -> bool:
     """Return whether accelerations and forces of bodies are computed."""
     sensors = not m.opt.disableflags & DisableBit.SENSOR and m.sensor_rne_postconstraint
     return bool(m.opt.run_rne_postconstraint or sensors)
 
 
-def _with_room(order: Order, m: Any, d: Any) -> None:
+def _with_room(order: Order, m: types.Model, d: types.Data) -> None:
     """Run a function with room for the contacts of all copies, in memory that Warp takes for the time of the call."""
     kept = d.contact, d.naconmax, d.naccdmax
     d.naconmax, d.naccdmax = d.naconmax * d.nworld, d.naccdmax * d.nworld
@@ -118,7 +121,7 @@ def _with_room(order: Order, m: Any, d: Any) -> None:
     d.contact, d.naconmax, d.naccdmax = kept
 
 
-def _function(name: str, order: Order) -> Callable[[Any, Any], Any]:
+def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
     """Return MJX's function of a model and of data, for ``vmap`` and ``jit``, with another of Warp in its place.
 
     Sizes of contacts in the data are those of one copy; the arrays that hold contacts are empty.
@@ -137,10 +140,10 @@ def _function(name: str, order: Order) -> Callable[[Any, Any], Any]:
     return call
 
 
-def _once(model: Any, is_batched: Any) -> Any:
+def _once(model: mjx.Model, is_batched: mjx.Model) -> mjx.Model:
     """Return a model of many copies that has once what Warp takes once, though ``vmap`` gave it to every copy."""
 
-    def of_first(path: Any, leaf: Any, is_many: bool) -> Any:
+    def of_first(path: tuple[object, ...], leaf: jax.Array, is_many: bool) -> jax.Array:
         names = [getattr(step, "name", "") for step in path]  # '' where a tuple of arrays, in common, has its parts
         varied = all(names) and varies(".".join(name for name in names if name != "_impl"))
         return leaf if varied or not is_many else leaf[0]
@@ -148,7 +151,7 @@ def _once(model: Any, is_batched: Any) -> Any:
     return jax.tree_util.tree_map_with_path(of_first, model, is_batched)
 
 
-def _in(source: Any, **names: Any) -> Any:
+def _in(source: FunctionType, **names: object) -> FunctionType:
     """Return a copy of a function for which global names stand for something else."""
     new = FunctionType(source.__code__, {**source.__globals__, **names}, source.__name__, source.__defaults__)
     new.__annotations__ = source.__annotations__

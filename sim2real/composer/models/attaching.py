@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.models import builder, merge
 from sim2real.composer.models.scope import Attachment
 from sim2real.composer.models.translate import mj
 from sim2real.composer.models.tree import H, Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.tree import Handle
 
 _log = logging.getLogger(__name__)
 _POSE = ("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis")
@@ -52,7 +55,7 @@ def _free_name(parent: Tree[Any], name: str) -> str:
     return next(n for n in itertools.chain([name], numbered) if n not in parent.attachments)
 
 
-def _warn_of_degrees(parent: Tree[Any], model: Tree[Any]) -> None:
+def _warn_of_degrees(parent: Tree[Any], model: Tree[Handle]) -> None:
     """Warn where dm_control would read a document's angles in another unit than MuJoCo, which reads degrees."""
     if parent._spec.compiler.degree or not model.records.is_silent_on_angles:
         return
@@ -71,7 +74,7 @@ def _warn_of_degrees(parent: Tree[Any], model: Tree[Any]) -> None:
 _TURNING = (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_BALL)
 
 
-def detach(model: Tree[Any]) -> None:
+def detach(model: Tree[Handle]) -> None:
     """Take a model off the one that it is attached to.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.composer.models.tree import H, Handle, Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import NativeDefault
 
 _OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
 """What every actuator but ``<general>`` sets by itself."""
@@ -90,7 +93,7 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -
     return element
 
 
-def _lay_down(model: Tree[Any], element: Handle) -> None:
+def _lay_down(model: Tree[Handle], element: Handle) -> None:
     """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
     native, kind, said = element._native, element.kind, element.recorded()
     values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
@@ -116,7 +119,7 @@ def _inherited(element: Handle) -> dict[str, Any]:
     return found
 
 
-def _fill(model: Tree[Any], element: Handle, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
+def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
     """Set what MuJoCo's parser read: plain attributes, and those that name elements."""
     native = element._native
     for key, value in fixed.items():
@@ -134,7 +137,7 @@ def _fill(model: Tree[Any], element: Handle, fixed: Mapping[str, Any], named: di
     model.touch()
 
 
-def rebuild(model: Tree[Any], element: Handle, key: str | None = None) -> None:
+def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> None:
     """Lay an element down anew: the defaults of its class, then the attributes given, as MuJoCo's parser reads them.
 
     For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
@@ -183,7 +186,7 @@ def _catch_up(element: Handle, said: dict[str, Any]) -> None:
             said[name] = np.array(given.show(value, said[name]))
 
 
-def reclass(model: Tree[Any], element: Handle, name: str, value: Any) -> None:
+def reclass(model: Tree[Handle], element: Handle, name: str, value: Any) -> None:
     """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``.
 
     Args:
@@ -215,7 +218,7 @@ def class_of(element: Handle) -> str:
 
 def said_by_classes(element: Handle) -> Iterator[given.Given]:
     """Yield what the classes of an element say of elements of its kind, the nearest class first."""
-    model: Tree[Any] = element.root
+    model: Tree[Handle] = element.root
     name: str | None = class_of(element)
     while name is not None:
         native = getattr(model._spec.find_default(name), element.kind, None)
@@ -249,7 +252,7 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
     return tendon
 
 
-def remove(model: Tree[Any], element: Handle) -> None:
+def remove(model: Tree[Handle], element: Handle) -> None:
     """Delete an element with what stands in it and what refers to it; its handles are of no use afterwards."""
     native = element._native
     gone = [native]
@@ -272,12 +275,12 @@ def _given(attrs: dict[str, Any]) -> dict[str, Any]:
     return attrs
 
 
-def _foreign(model: Tree[Any], dclass: Any) -> Any:
+def _foreign(model: Tree[Handle], dclass: Any) -> Any:
     """Return a class of defaults that belongs to another model, such as that of a frame's joint; else None."""
     return dclass if getattr(dclass, "root", model) is not model else None
 
 
-def _defaults(model: Tree[Any], attrs: dict[str, Any]) -> Any:
+def _defaults(model: Tree[Handle], attrs: dict[str, Any]) -> NativeDefault | None:
     name = attrs.get("dclass", attrs.get("class_"))
     if name is None:
         return None

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models import files, keyframes, layout, merge, translate
 from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sim2real.composer.models.tree import Handle
+    from sim2real.composer.types import MjModel, MjSpec, Native
 
 NAMED_KINDS = (
     *TREE_KINDS,
@@ -19,7 +25,7 @@ _MAY_DANGLE = ("actuator", "sensor", "equality", "pair", "exclude")
 """Elements that name others; MuJoCo's copy drops them silently when what they name is in another model."""
 
 
-def compile_model(model: Tree[Any]) -> Any:
+def compile_model(model: Tree[Handle]) -> MjModel:
     """Return the ``mujoco.MjModel`` of a model and all that is attached to it.
 
     Raises:
@@ -28,7 +34,7 @@ def compile_model(model: Tree[Any]) -> Any:
     return compose(model).compile()
 
 
-def compose(model: Tree[Any]) -> Any:
+def compose(model: Tree[Handle]) -> MjSpec:
     """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options."""
     models = list(model.all_models())
     with files.renamed(model) if any(map(files.is_mixed, models)) else contextlib.nullcontext():
@@ -40,7 +46,7 @@ def compose(model: Tree[Any]) -> Any:
     return out
 
 
-def _compose(model: Tree[Any]) -> Any:
+def _compose(model: Tree[Handle]) -> MjSpec:
     """Return a new ``MjSpec`` that holds copies of a model and of all that is attached to it, with default options.
 
     Names of attached elements are prefixed with ``model/``; each attached model stands in a body of that name.
@@ -64,7 +70,7 @@ def _compose(model: Tree[Any]) -> Any:
     return out
 
 
-def free_body(model: Tree[Any]) -> Any:
+def free_body(model: Tree[Handle]) -> Native | None:
     """Return the first body of a model's own world that has a free joint, or None."""
     for body in model._spec.worldbody.bodies:
         if not body.name.endswith("/") and any(j.type == mj.mjtJoint.mjJNT_FREE for j in body.joints):
@@ -72,7 +78,7 @@ def free_body(model: Tree[Any]) -> Any:
     return None
 
 
-def copy_spec(model: Tree[Any]) -> Any:
+def copy_spec(model: Tree[Handle]) -> MjSpec:
     """Return a copy of a model's own spec in which every element has a name and names what it should."""
     spec = model._spec
     unnamed = list(_unnamed(model))
@@ -91,7 +97,7 @@ def copy_spec(model: Tree[Any]) -> Any:
     return out
 
 
-def _copy(model: Tree[Any]) -> Any:
+def _copy(model: Tree[Handle]) -> MjSpec:
     """Return a copy of a model's own spec that can become a part of another one."""
     out = copy_spec(model)
     merge.clear(out, model.settings())
@@ -106,7 +112,7 @@ def _copy(model: Tree[Any]) -> Any:
     return out
 
 
-def _unnamed(model: Tree[Any]) -> Any:
+def _unnamed(model: Tree[Handle]) -> Iterator[tuple[Native, str]]:
     """Yield elements without a name, with the one they get: ``/unnamed_geom_0``, ``//unnamed_geom_0`` at the top."""
     lead = "/" if model.parent_model is None else ""
     for kind in NAMED_KINDS:
@@ -120,7 +126,7 @@ def _unnamed(model: Tree[Any]) -> Any:
                 yield element._native, f"{lead}/unnamed_{kind}_{number}"
 
 
-def _name_seen_from(model: Tree[Any], target: Any) -> str:
+def _name_seen_from(model: Tree[Handle], target: Handle) -> str:
     if target.root is model:
         return target._native.name
     if _is_aside(model, target):  # any element of its kind does for now: what names nothing is dropped
@@ -130,13 +136,13 @@ def _name_seen_from(model: Tree[Any], target: Any) -> str:
     return model_name(target, model)
 
 
-def _is_aside(model: Tree[Any], target: Any) -> bool:
+def _is_aside(model: Tree[Handle], target: Handle) -> bool:
     """Return whether an element is in the same world as a model, but neither in it nor below it."""
     above = _above(target.root)
     return target.root is not model and model not in above and target.root.root_model is model.root_model
 
 
-def _point_aside(out: Any, models: list[Tree[Any]]) -> None:
+def _point_aside(out: MjSpec, models: list[Tree[Handle]]) -> None:
     """Let elements name what is beside or above their own model, now that all models are in one spec."""
     for model in models:
         for (native, key), target in model.references.items():
@@ -145,7 +151,7 @@ def _point_aside(out: Any, models: list[Tree[Any]]) -> None:
                 translate.point(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
 
 
-def model_name(target: Any, model: Tree[Any]) -> str:
+def model_name(target: Handle, model: Tree[Handle]) -> str:
     """Return an element's name as seen from a model above the element's own."""
     if target.root is not model and model not in _above(target.root):
         raise UsageError(
@@ -155,7 +161,7 @@ def model_name(target: Any, model: Tree[Any]) -> str:
     return target.root.identify(target, relative_to=model)
 
 
-def _above(model: Tree[Any]) -> list[Any]:
+def _above(model: Tree[Handle]) -> list[Tree[Handle]]:
     found, current = [], model.parent_model
     while current is not None:
         found.append(current)
@@ -163,11 +169,11 @@ def _above(model: Tree[Any]) -> list[Any]:
     return found
 
 
-def _count(spec: Any, kind: str) -> int:
+def _count(spec: MjSpec, kind: str) -> int:
     return len(getattr(spec, translate.plural(kind)))
 
 
-def _copy_all(model: Tree[Any], lost: list[str]) -> Any:
+def _copy_all(model: Tree[Handle], lost: list[str]) -> MjSpec:
     """Return a copy of a spec with what a plain copy drops of some kinds: elements that name others elsewhere.
 
     They are added anew, in the source's order; done before anything is attached, so that they resolve.
@@ -208,7 +214,7 @@ _TRANSMISSIONS = {
 }
 
 
-def _targets(kind: str, native: Any) -> list[tuple[Any, str]]:
+def _targets(kind: str, native: Native) -> list[tuple[str | None, str]]:
     """Return kind and name of the elements that one names."""
     if kind == "actuator":
         return [
@@ -224,7 +230,7 @@ def _targets(kind: str, native: Any) -> list[tuple[Any, str]]:
     return [("geom" if kind == "pair" else "body", getattr(native, name)) for name in names]
 
 
-def _check_targets(model: Tree[Any], kind: str, native: Any) -> None:
+def _check_targets(model: Tree[Handle], kind: str, native: Native) -> None:
     for target, name in _targets(kind, native):
         if target and name and model.find(target, name) is None:
             known = ", ".join(filter(None, (e.name for e in model.find_all(target, exclude_attachments=True))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,12 @@ from sim2real.composer.models.element import Element
 from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sim2real.composer.models.tree import Handle
+    from sim2real.composer.types import Native, NativeDefault
 
 
 class Defaults:
@@ -25,7 +31,7 @@ class Defaults:
     __slots__ = ("_model", "name")
     tag = "default"
 
-    def __init__(self, model: Tree[Any], name: str) -> None:
+    def __init__(self, model: Tree[Handle], name: str) -> None:
         self._model, self.name = model, name
 
     def __eq__(self, other: object) -> bool:
@@ -38,7 +44,7 @@ class Defaults:
         return f"<default class {self.name!r} of model {self._model.model!r}>"
 
     @property
-    def native(self) -> Any:
+    def native(self) -> NativeDefault:
         """The ``MjsDefault``."""
         return self._model._spec.find_default(self.name)
 
@@ -48,12 +54,12 @@ class Defaults:
         return None if self.name == "main" else self.name
 
     @property
-    def root(self) -> Tree[Any]:
+    def root(self) -> Tree[Handle]:
         """The model."""
         return self._model
 
     @property
-    def parent(self) -> Any:
+    def parent(self) -> Tree[Handle] | Defaults:
         """The class that this one takes its values from; the model for the one that holds for everything."""
         above = self._model.records.class_parent(self.name)
         return self._model if above is None else Defaults(self._model, above)
@@ -63,7 +69,7 @@ class Defaults:
         """The classes that take their values from this one."""
         return [Defaults(self._model, name) for name in self._model.records.classes_below(self.name)]
 
-    def all_children(self) -> list[Any]:
+    def all_children(self) -> list[Defaults]:
         """Return the classes below."""
         return list(self.default)
 
@@ -96,7 +102,7 @@ class _Shown(np.ndarray):
 
     _write: Callable[[np.ndarray], None] | None = None
 
-    def __array_finalize__(self, obj: Any) -> None:
+    def __array_finalize__(self, obj: np.ndarray | None) -> None:
         """Let arrays that are computed from this one be plain."""
         self._write = None
 
@@ -125,7 +131,7 @@ class DefaultElement(Element):
     _owner: Defaults
     _tag: str
 
-    def __init__(self, owner: Defaults, kind: str, native: Any, tag: str) -> None:
+    def __init__(self, owner: Defaults, kind: str, native: Native, tag: str) -> None:
         super().__init__(owner.root, kind, native)
         object.__setattr__(self, "_owner", owner)
         object.__setattr__(self, "_tag", tag)
@@ -150,7 +156,7 @@ class DefaultElement(Element):
         return self._owner
 
     @property
-    def class_defaults(self) -> Any:
+    def class_defaults(self) -> Native:
         """MuJoCo's own defaults; asking a class for its class ends the process."""
         return translate.blank(self.kind)
 
@@ -177,7 +183,7 @@ class DefaultElement(Element):
                 f"{name} of {self!r} cannot be taken back", hint="set it to the value that is to hold instead"
             )
         value = value.name if isinstance(value, Element) else value
-        fixed: Any = None
+        fixed: Mapping[str, Any] | None = None
         if not translate.is_plain(self._native, self.kind, name, value):
             known = schema.attributes(self.kind, self._tag)
             if name not in known:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sim2real.composer.models import compose, translate
 from sim2real.composer.models.tree import Tree
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Native
 
 T = TypeVar("T", bound=Tree[Any])
 
@@ -14,7 +17,7 @@ T = TypeVar("T", bound=Tree[Any])
 def duplicate(model: T) -> T:
     """Return an independent copy of a model and of all that is attached to it; it is attached to nothing."""
     twins: dict[T, T] = {}
-    natives: dict[Any, Any] = {}
+    natives: dict[Native, Native] = {}
     made = _copy(model, twins, natives)
     for old, new in twins.items():
         new.overrides = old.overrides.among(twins)
@@ -23,7 +26,7 @@ def duplicate(model: T) -> T:
     return made
 
 
-def _copy(model: T, twins: dict[T, T], natives: dict[Any, Any]) -> T:
+def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
     spec = compose.copy_spec(model)
     made = twins[model] = type(model).owning(spec)
     made.inherits_angle = model.inherits_angle

@@ -174,7 +174,11 @@ class Element(Handle):
         setattr(self, name, None)
 
 
-def as_elements(elements: Any) -> tuple[tuple[Element, ...], bool]:
+Elements = Element | Iterable[Element]
+"""An element, or several of one kind."""
+
+
+def as_elements(elements: Elements) -> tuple[tuple[Element, ...], bool]:
     """Return what was given as a tuple, and whether it was a single element.
 
     Raises:
@@ -183,7 +187,7 @@ def as_elements(elements: Any) -> tuple[tuple[Element, ...], bool]:
     if elements is None:
         raise UsageError("nothing to bind: the element is None", hint="find() returns None where it finds nothing")
     if isinstance(elements, Element) or not isinstance(elements, Iterable):
-        found: tuple[Any, ...] = (elements,)
+        found: tuple[Element, ...] = (elements,)
     else:
         found = tuple(elements)
     for element in found:

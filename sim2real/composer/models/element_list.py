@@ -3,10 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 
-class ElementList(Sequence[Any]):
+class Listed(Protocol):
+    """What is in a list: an ``Element``."""
+
+    @property
+    def name(self) -> str | None:
+        """Its name."""
+        ...
+
+    def remove(self) -> None:
+        """Delete it."""
+
+
+E = TypeVar("E", bound=Listed, covariant=True)
+
+
+class ElementList(Sequence[E], Generic[E]):
     """Elements of one kind or tag in a body or a section; always those that are there now.
 
     Args:
@@ -14,7 +29,7 @@ class ElementList(Sequence[Any]):
         tag: What they are.
     """
 
-    def __init__(self, find: Callable[[], Sequence[Any]], tag: str) -> None:
+    def __init__(self, find: Callable[[], Sequence[E]], tag: str) -> None:
         self._find, self._tag = find, tag
 
     def __len__(self) -> int:
@@ -32,17 +47,17 @@ class ElementList(Sequence[Any]):
             )
         return named[0]
 
-    def __delitem__(self, key: Any) -> None:
+    def __delitem__(self, key: int | str | slice) -> None:
         for element in self[key] if isinstance(key, slice) else [self[key]]:
             element.remove()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
 
-    def __add__(self, other: Iterable[Any]) -> list[Any]:
+    def __add__(self, other: Iterable[E]) -> list[E]:
         return [*self, *other]
 
-    def __radd__(self, other: Iterable[Any]) -> list[Any]:
+    def __radd__(self, other: Iterable[E]) -> list[E]:
         return [*other, *self]
 
     def __repr__(self) -> str:

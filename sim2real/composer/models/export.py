@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models import files
 from sim2real.composer.models.model import Model
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    import os
 
-def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | None = None) -> None:
+
+def export_with_assets(mjcf_model: Model, out_dir: str | os.PathLike[str], out_file_name: str | None = None) -> None:
     """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
 
     Args:
@@ -32,7 +35,7 @@ def export_with_assets(mjcf_model: Model, out_dir: Any, out_file_name: str | Non
     (folder / name).write_text(mjcf_model.to_xml_string(), encoding="utf-8")
 
 
-def export_with_assets_as_zip(mjcf_model: Model, out_dir: Any, model_name: str | None = None) -> str:
+def export_with_assets_as_zip(mjcf_model: Model, out_dir: str | os.PathLike[str], model_name: str | None = None) -> str:
     """Write a model, composed, as MJCF with all its files into an archive; return its path.
 
     Args:

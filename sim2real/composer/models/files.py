@@ -7,10 +7,14 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.tree import Handle
+    from sim2real.composer.types import MjSpec, Native
 
 KINDS = ("mesh", "hfield", "texture", "skin")
 """Elements that may come from files."""
@@ -37,14 +41,14 @@ class Asset:
         return "-".join(filter(None, (self.prefix, digest))) + self.extension
 
 
-def adopt(model: Tree[Any], asset: Asset) -> str:
+def adopt(model: Tree[Handle], asset: Asset) -> str:
     """Give a model the contents of a file; return the name under which it has them."""
     name = asset.get_vfs_filename()
     model._spec.assets[name] = asset.contents
     return name
 
 
-def asset_of(model: Tree[Any], kind: str, file: Asset | str) -> Asset:
+def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
     """Return a file that a model names.
 
     Args:
@@ -69,7 +73,7 @@ def asset_of(model: Tree[Any], kind: str, file: Asset | str) -> Asset:
     return Asset(full.read_bytes(), path.suffix, path.stem)
 
 
-def collect(model: Tree[Any]) -> dict[str, bytes]:
+def collect(model: Tree[Handle]) -> dict[str, bytes]:
     """Return the contents of all files of a model and of what is attached to it, by the names in its MJCF."""
     found = {}
     for one in model.all_models():
@@ -78,7 +82,7 @@ def collect(model: Tree[Any]) -> dict[str, bytes]:
     return found
 
 
-def _named(model: Tree[Any]) -> Iterator[tuple[Any, Asset]]:
+def _named(model: Tree[Handle]) -> Iterator[tuple[Native, Asset]]:
     for plural in _LISTS:
         for native in getattr(model._spec, plural):
             if native.file:
@@ -86,10 +90,10 @@ def _named(model: Tree[Any]) -> Iterator[tuple[Any, Asset]]:
 
 
 @contextlib.contextmanager
-def renamed(model: Tree[Any]) -> Iterator[None]:
+def renamed(model: Tree[Handle]) -> Iterator[None]:
     """Call every file of a model, and of what is attached to it, as ``collect`` does, in a ``with`` block."""
-    undo: list[tuple[Any, str, str]] = []
-    added: list[tuple[Any, str]] = []
+    undo: list[tuple[Native | MjSpec, str, str]] = []
+    added: list[tuple[MjSpec, str]] = []
     try:
         for one in model.all_models():
             for native, asset in list(_named(one)):
@@ -110,7 +114,7 @@ def renamed(model: Tree[Any]) -> Iterator[None]:
             del spec.assets[name]
 
 
-def is_mixed(model: Tree[Any]) -> bool:
+def is_mixed(model: Tree[Handle]) -> bool:
     """Return whether a model has files in memory and others on disk: attached, MuJoCo looks for all in one place."""
     assets = model._spec.assets
     if not assets:
@@ -118,7 +122,7 @@ def is_mixed(model: Tree[Any]) -> bool:
     return any(n.file and n.file not in assets for plural in _LISTS for n in getattr(model._spec, plural))
 
 
-def flatten(spec: Any) -> None:
+def flatten(spec: MjSpec) -> None:
     """Take the folders off the names of a composed spec's files: MuJoCo puts those of attached models into some."""
     for plural in _LISTS:
         for native in getattr(spec, plural):

@@ -6,7 +6,7 @@ import functools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import unescape
 
@@ -14,6 +14,9 @@ import numpy as np
 
 from sim2real.composer.models import schema, translate
 from sim2real.composer.models.translate import mj
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Native
 
 _ATTRIBUTES = r"""(?:\s+[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*'))*"""
 _TAG = re.compile(rf"<!--.*?-->|<([A-Za-z]\w*)({_ATTRIBUTES})|\n", re.DOTALL)
@@ -94,14 +97,14 @@ class Records:
     def __init__(self, document: Document | None = None, is_blank: bool = False) -> None:
         self._document, self.is_blank = document, is_blank
         self._has_defaults = False
-        self._of: dict[Any, Given] = {}
+        self._of: dict[Native | tuple[Native, str], Given] = {}
 
     @property
     def has_defaults(self) -> bool:
         """Whether there may be a class of defaults that says something."""
         return self._has_defaults or not self.is_blank
 
-    def note_default(self, native: Any, kind: str, tag: str, name: str, value: Any) -> None:
+    def note_default(self, native: Native, kind: str, tag: str, name: str, value: Any) -> None:
         """Note that an attribute of a class of defaults was set.
 
         Args:
@@ -126,7 +129,7 @@ class Records:
         if self._document is not None:
             self._document.says_angle = True
 
-    def note(self, native: Any, tag: str, values: dict[str, Any]) -> None:
+    def note(self, native: Native, tag: str, values: dict[str, Any]) -> None:
         """Note that an element was added.
 
         Args:
@@ -152,18 +155,18 @@ class Records:
     def _classes(self) -> dict[str, str | None]:
         return {} if self._document is None else dict(self._document.classes)
 
-    def forget(self, native: Any) -> None:
+    def forget(self, native: Native) -> None:
         """Note that an element was deleted."""
         self._of.pop(native, None)
 
-    def among(self, natives: Mapping[Any, Any]) -> Records:
+    def among(self, natives: Mapping[Native, Native]) -> Records:
         """Return the same of a copied model: element -> its copy."""
         made = Records(self._document, self.is_blank)
         made._has_defaults = self._has_defaults
         made._of = {natives[n]: Given(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
         return made
 
-    def of(self, native: Any, kind: str) -> Given:
+    def of(self, native: Native, kind: str) -> Given:
         """Return what was given of an element."""
         key = (native, kind) if kind == "inertial" else native
         found = self._of.get(key)
@@ -171,26 +174,26 @@ class Records:
             found = self._of[key] = self._found(native, kind, translate.class_defaults)
         return found
 
-    def of_class(self, native: Any, kind: str) -> Given:
+    def of_class(self, native: Native, kind: str) -> Given:
         """Return what a class of defaults says of the elements of a kind."""
         found = self._of.get(native)
         if found is None:  # asking a class for its class ends the process
             found = self._of[native] = self._found(native, kind, lambda native, kind: translate.blank(kind))
         return found
 
-    def _found(self, native: Any, kind: str, defaults: Callable[[Any, str], Any]) -> Given:
+    def _found(self, native: Native, kind: str, defaults: Callable[[Native, str], Native]) -> Given:
         if self.is_blank and kind != "inertial":
             return Given(_tag(native, kind))
         return self._written(native, kind) or read(native, kind, defaults(native, kind))
 
-    def _written(self, native: Any, kind: str) -> Given | None:
+    def _written(self, native: Native, kind: str) -> Given | None:
         words = native.info.split()
         if self._document is None or kind == "inertial" or len(words) != 2 or not words[1].isdigit():
             return None
         return self._document.lines.get(int(words[1]))
 
 
-def read(native: Any, kind: str, blank: Any) -> Given:
+def read(native: Native, kind: str, blank: Native) -> Given:
     """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``.
 
     Args:
@@ -209,7 +212,7 @@ def read(native: Any, kind: str, blank: Any) -> Given:
     return found
 
 
-def _tag(native: Any, kind: str) -> str:
+def _tag(native: Native, kind: str) -> str:
     """Return the tag of an element of an ``MjSpec`` that nobody wrote down: MuJoCo forgets some of it."""
     if kind == "sensor":
         return _SENSORS.get(native.type, "user")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,8 +10,12 @@ from sim2real.composer.models import layout
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.models.tree import Handle
+    from sim2real.composer.types import MjModel, MjSpec
 
-def restore(out: Any, models: list[Tree[Any]]) -> None:
+
+def restore(out: MjSpec, models: list[Tree[Handle]]) -> None:
     """Add the keyframes of all models to a composed spec, under their full names.
 
     Raises:
@@ -28,7 +32,7 @@ def restore(out: Any, models: list[Tree[Any]]) -> None:
                     setattr(key, part, _spread(compiled, model, element.full_identifier, part, values))
 
 
-def _spread(compiled: Any, model: Tree[Any], name: str, part: str, values: np.ndarray) -> np.ndarray:
+def _spread(compiled: MjModel, model: Tree[Handle], name: str, part: str, values: np.ndarray) -> np.ndarray:
     """Return a part of the state of the whole world that holds a model's values at the model's own places."""
     if part in ("mpos", "mquat"):
         whole = np.array(compiled.body_pos if part == "mpos" else compiled.body_quat)
@@ -42,7 +46,7 @@ def _spread(compiled: Any, model: Tree[Any], name: str, part: str, values: np.nd
     whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
     own = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
     frames = [e for e in own if e.kind == "joint" and e.parent.is_frame]  # their joints came later
-    rows: Any = np.zeros(0)
+    rows = np.zeros(0)
     for elements in (own, [e for e in own if e not in frames]):
         ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))
         rows = np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mujoco.introspect.ast_nodes import StructFieldDecl
@@ -13,6 +13,9 @@ from mujoco.introspect.structs import STRUCTS
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel
 
 TRIGGERS = {"qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"}
 """Fields of the data whose change makes everything computed from them out of date."""
@@ -35,7 +38,7 @@ DISABLED_BY = {
 class ElementKind:
     """How elements of a kind are stored: object type, first dimensions of their fields, prefixes of field names."""
 
-    object_type: Any
+    object_type: int
     sizes: tuple[str, ...]
     prefixes: tuple[str, ...]
 
@@ -111,7 +114,7 @@ _JOINT_WIDTH = {"nq": (7, 4, 1, 1), "nv": (6, 3, 1, 1)}
 _ALWAYS_RANGES = ("nq", "nv", "nsensordata", "nnumericdata")
 
 
-def _range(model: Any, size: str, number: int) -> range:
+def _range(model: MjModel, size: str, number: int) -> range:
     start_field, count_field = _RANGES[size]
     start = int(getattr(model, start_field)[number])
     if count_field is None:
@@ -119,7 +122,7 @@ def _range(model: Any, size: str, number: int) -> range:
     return range(start, start + int(getattr(model, count_field)[number])) if start >= 0 else range(0)
 
 
-def index(model: Any, field: Field, ids: tuple[int, ...], single: bool) -> Any:
+def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> Any:
     """Return what indexes the rows of a field: an int, a slice, or an int array of shape ``(n,)``.
 
     Args:
@@ -140,7 +143,7 @@ def index(model: Any, field: Field, ids: tuple[int, ...], single: bool) -> Any:
     return rows[0] if single else np.array(rows, dtype=int)
 
 
-def resolve(model: Any, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
+def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
     """Return the numbers of elements in a compiled model.
 
     Args:
@@ -162,7 +165,7 @@ def resolve(model: Any, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
     return found
 
 
-def names_of(model: Any, kind: str) -> list[str]:
+def names_of(model: MjModel, kind: str) -> list[str]:
     """Return the names of all elements of a kind in a compiled model, '' for those without one."""
     object_type = OBJECT_TYPES[kind]
     count = {"camera": "ncam", "joint": "njnt", "material": "nmat", "texture": "ntex", "equality": "neq"}.get(kind)

@@ -11,13 +11,18 @@ import functools
 import itertools
 import weakref
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from mujoco.introspect.structs import STRUCTS
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sim2real.composer.types import MjSpec
 
 Settings = dict[tuple[str, str], Any]
 
@@ -44,7 +49,7 @@ FLAGS: dict[str, tuple[str, int]] = {
 _clock = itertools.count()
 
 
-def _part(spec: Any, path: str) -> Any:
+def _part(spec: MjSpec, path: str) -> Any:
     for step in path.split(".") if path else ():
         spec = getattr(spec, step)
     return spec
@@ -81,7 +86,7 @@ def _bits() -> dict[str, tuple[str, dict[str, int]]]:
     return found
 
 
-def _author(spec: Any, path: str, name: str) -> None:
+def _author(spec: MjSpec, path: str, name: str) -> None:
     """Note that a field was written, whatever its value."""
     if path == FLAG:
         where, bit = FLAGS[name]
@@ -96,7 +101,7 @@ def _differ(a: Any, b: Any) -> bool:
     return a.tobytes() != b.tobytes() if isinstance(a, np.ndarray) else a != b
 
 
-def settings(spec: Any) -> Settings:
+def settings(spec: MjSpec) -> Settings:
     """Return what a spec sets: (part, field) -> value; flags are ``enable`` or ``disable``."""
     found: Settings = {}
     written = {path: (getattr(spec.authored, where), bits) for path, (where, bits) in _bits().items()}
@@ -114,7 +119,7 @@ def settings(spec: Any) -> Settings:
     return found
 
 
-def _add_flags(spec: Any, found: Settings) -> None:
+def _add_flags(spec: MjSpec, found: Settings) -> None:
     masks = {f: getattr(spec.authored, f) | getattr(spec.option, f) for f in ("disableflags", "enableflags")}
     if any(masks.values()):
         for name, (field, bit) in FLAGS.items():
@@ -123,13 +128,53 @@ def _add_flags(spec: Any, found: Settings) -> None:
                 found[FLAG, name] = "enable" if raised == (field == "enableflags") else "disable"
 
 
+class Member(Protocol):
+    """A model among others: a ``Scope``."""
+
+    overrides: Overrides
+
+    @property
+    def _spec(self) -> MjSpec: ...
+
+    @property
+    def model(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def parent_model(self) -> Member | None:
+        """The model that it is attached to."""
+        ...
+
+    @property
+    def attachments(self) -> Mapping[str, Any]:
+        """What is attached to it."""
+        ...
+
+    @property
+    def root_model(self) -> Member:
+        """The model at the top."""
+        ...
+
+    def all_models(self) -> Iterator[Member]:
+        """Yield it and all attached to it."""
+        ...
+
+    def settings(self) -> Settings:
+        """Return what it sets."""
+        ...
+
+    def touch_settings(self) -> None:
+        """Note a change of the options."""
+
+
 class Overrides:
     """Which settings of a model were written while others were attached: they hold over what those had set."""
 
     def __init__(self) -> None:
-        self._noted: dict[tuple[str, str], tuple[int, weakref.WeakSet[Any]]] = {}
+        self._noted: dict[tuple[str, str], tuple[int, weakref.WeakSet[Member]]] = {}
 
-    def note(self, key: tuple[str, str], others: Iterable[Any]) -> None:
+    def note(self, key: tuple[str, str], others: Iterable[Member]) -> None:
         """Note that a setting was written in a world of other models."""
         covered = weakref.WeakSet(others)
         if covered:
@@ -139,7 +184,7 @@ class Overrides:
         """Return when a setting was written last in a world; -1: never."""
         return self._noted[key][0] if key in self._noted else -1
 
-    def beats(self, key: tuple[str, str], model: Any) -> bool:
+    def beats(self, key: tuple[str, str], model: Member) -> bool:
         """Return whether a setting holds over that of another model."""
         when, covered = self._noted.get(key, (-1, ()))
         return model in covered and when > model.overrides.since(key)
@@ -155,7 +200,7 @@ class Overrides:
         return bool(self._noted)
 
 
-def merged(models: Iterable[Any]) -> Settings:
+def merged(models: Iterable[Member]) -> Settings:
     """Return what holds in a world of these models.
 
     Raises:
@@ -187,7 +232,7 @@ def merged(models: Iterable[Any]) -> Settings:
     return found
 
 
-def note(model: Any, path: str, name: str) -> None:
+def note(model: Member, path: str, name: str) -> None:
     """Note that a program wrote a setting of a model: it counts as set, and holds over what attached models had set.
 
     Args:
@@ -200,7 +245,7 @@ def note(model: Any, path: str, name: str) -> None:
     model.touch_settings()
 
 
-def in_world(model: Any, path: str, name: str, own: Any) -> Any:
+def in_world(model: Member, path: str, name: str, own: Any) -> Any:
     """Return the value of a setting in the world that a model is a part of, given the model's own.
 
     Args:
@@ -220,7 +265,7 @@ def in_world(model: Any, path: str, name: str, own: Any) -> Any:
     return value
 
 
-def clear(spec: Any, found: Settings) -> None:
+def clear(spec: MjSpec, found: Settings) -> None:
     """Put settings back to MuJoCo's defaults, in a copy that is about to become a part of another spec."""
     for path, name in found:
         if path == FLAG:
@@ -231,7 +276,7 @@ def clear(spec: Any, found: Settings) -> None:
         setattr(spec.authored, where, 0)
 
 
-def apply(spec: Any, found: Settings) -> None:
+def apply(spec: MjSpec, found: Settings) -> None:
     """Set settings."""
     for (path, name), value in found.items():
         if path == FLAG:
@@ -240,7 +285,7 @@ def apply(spec: Any, found: Settings) -> None:
             setattr(_part(spec, path), name, value)
 
 
-def set_flag(spec: Any, name: str, value: str) -> None:
+def set_flag(spec: MjSpec, name: str, value: str) -> None:
     """Switch a flag: ``enable`` or ``disable``.
 
     Args:
@@ -258,7 +303,7 @@ _INHERITED = ("boundmass", "boundinertia", "balanceinertia", "inertiafromgeom", 
 """Settings of the compiler that hold for attached models too, unless they have their own."""
 
 
-def inherit_compiler(spec: Any, model: Any) -> None:
+def inherit_compiler(spec: MjSpec, model: Member) -> None:
     """Give a copy of a model's spec the settings of the compiler that the models above have and it has not."""
     default = _blank().compiler
     for name in _INHERITED:
@@ -269,5 +314,5 @@ def inherit_compiler(spec: Any, model: Any) -> None:
 
 
 @functools.cache
-def _blank() -> Any:
+def _blank() -> MjSpec:
     return mj.MjSpec()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.models import attaching, compose, duplicate, files, parse
 from sim2real.composer.models.element import Element
@@ -10,6 +10,12 @@ from sim2real.composer.models.given import Document
 from sim2real.composer.models.schema import SECTION_OF
 from sim2real.composer.models.sections import Section, make_sections
 from sim2real.composer.models.tree import Tree
+
+if TYPE_CHECKING:
+    import os
+    from typing import IO
+
+    from sim2real.composer.types import MjModel, MjSpec
 
 
 class Model(Tree[Element]):
@@ -25,7 +31,7 @@ class Model(Tree[Element]):
 
     handle_type = Element
 
-    def __init__(self, model: str | None = None, spec: Any = None, document: Document | None = None) -> None:
+    def __init__(self, model: str | None = None, spec: MjSpec | None = None, document: Document | None = None) -> None:
         super().__init__(model, spec, document)
         self._sections = make_sections(self)
 
@@ -35,7 +41,7 @@ class Model(Tree[Element]):
         return cls.owning(*parse.from_string(xml_string, assets))
 
     @classmethod
-    def from_path(cls, path: Any, assets: dict[str, bytes] | None = None) -> Model:
+    def from_path(cls, path: str | os.PathLike[str], assets: dict[str, bytes] | None = None) -> Model:
         """Return a model from an MJCF file.
 
         Raises:
@@ -44,18 +50,18 @@ class Model(Tree[Element]):
         return cls.owning(*parse.from_path(path, assets))
 
     @classmethod
-    def from_file(cls, file: Any, assets: dict[str, bytes] | None = None) -> Model:
+    def from_file(cls, file: IO[str] | IO[bytes], assets: dict[str, bytes] | None = None) -> Model:
         """Return a model from an open MJCF file."""
         return cls.from_xml_string(file.read(), assets)
 
     def __copy__(self) -> Model:
         return duplicate.duplicate(self)
 
-    def __deepcopy__(self, memo: Any) -> Model:
+    def __deepcopy__(self, memo: dict[int, Any]) -> Model:
         return duplicate.duplicate(self)
 
     @property
-    def spec(self) -> Any:
+    def spec(self) -> MjSpec:
         """The ``MjSpec``, without what is attached. Once it was handed out, every compilation starts from scratch."""
         self.expose()
         return self._spec
@@ -72,7 +78,7 @@ class Model(Tree[Element]):
         """The name."""
         return self.model
 
-    def all_children(self) -> list[Any]:
+    def all_children(self) -> list[Section | Element]:
         """Return the sections that hold elements, and the world."""
         return [self._sections[name] for name in dict.fromkeys(SECTION_OF.values())] + [self.worldbody]
 
@@ -92,7 +98,7 @@ class Model(Tree[Element]):
 
     # -- compiling
 
-    def compile(self) -> Any:
+    def compile(self) -> MjModel:
         """Return the ``mujoco.MjModel`` of this model with all that is attached to it."""
         return compose.compile_model(self)
 

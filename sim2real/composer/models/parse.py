@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models.given import Document
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    import os
+
+    from sim2real.composer.types import MjSpec
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _INCLUDE = re.compile(r"""<include\s+file\s*=\s*["']([^"']*)["']\s*(?:/>|>\s*</include>)""")
@@ -16,7 +21,7 @@ _ROOT = re.compile(r"<(mujoco\w*)[^>]*>(.*)</\1\s*>", re.DOTALL)
 _BETWEEN = re.compile(r">\s*<(?!!)")
 
 
-def from_string(text: str | bytes, assets: dict[str, bytes] | None = None) -> tuple[Any, Document]:
+def from_string(text: str | bytes, assets: dict[str, bytes] | None = None) -> tuple[MjSpec, Document]:
     """Return the ``MjSpec`` of an MJCF document, and the document as it was read.
 
     Every element is put on a line of its own: the line that MuJoCo notes then gives the order of the document, which
@@ -34,7 +39,7 @@ def from_string(text: str | bytes, assets: dict[str, bytes] | None = None) -> tu
         raise
 
 
-def from_path(path: Any, assets: dict[str, bytes] | None = None) -> tuple[Any, Document]:
+def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = None) -> tuple[MjSpec, Document]:
     """Return the ``MjSpec`` of an MJCF file, and the document as it was read, with those that it includes.
 
     Raises:
@@ -64,7 +69,7 @@ def _read(path: Path, folder: Path, assets: dict[str, bytes]) -> str:
     return _INCLUDE.sub(included, _COMMENT.sub("", text)) if "<include" in text else text
 
 
-def _named(spec: Any, text: str) -> Any:
+def _named(spec: MjSpec, text: str) -> MjSpec:
     if not re.search(r"<mujoco[^>]*\smodel\s*=", text):
         spec.modelname = "unnamed_model"
     return spec

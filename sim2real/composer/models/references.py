@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from sim2real.composer.models import translate
 from sim2real.composer.models.tree import Handle, Tree
 
@@ -36,7 +34,7 @@ REFERENCES = {
 """Kind of element -> its attributes that name another element."""
 
 
-def refer(element: Handle, key: str, target: Any) -> None:
+def refer(element: Handle, key: str, target: Handle | str | None) -> None:
     """Let an attribute name another element, whatever that is called later.
 
     Args:
@@ -44,7 +42,7 @@ def refer(element: Handle, key: str, target: Any) -> None:
         key: The attribute, in the spelling of ``MjSpec``.
         target: The other element, or its name; None: no element any more.
     """
-    model: Tree[Any] = element.root
+    model: Tree[Handle] = element.root
     if isinstance(target, Handle):
         model.references[element._native, key] = target
         target = target.name or ""
@@ -54,7 +52,7 @@ def refer(element: Handle, key: str, target: Any) -> None:
     model.touch()
 
 
-def referenced(element: Handle, name: str) -> Any:
+def referenced(element: Handle, name: str) -> Handle | str | None:
     """Return the element that an attribute names, its name where it does not exist, or None."""
     model, said = element.root, element.recorded()
     kind = name.rstrip("12")

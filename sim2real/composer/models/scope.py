@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
 from sim2real.composer.models import merge
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjSpec, Native
 
 T = TypeVar("T", bound="Scope")
 
@@ -18,7 +21,7 @@ class Attachment(Generic[T]):
     """A model below another one, and the empty body that holds its place there."""
 
     model: T
-    frame: Any
+    frame: Native
 
 
 class Scope:
@@ -36,9 +39,9 @@ class Scope:
         overrides: Settings that were written while other models were attached.
     """
 
-    def __init__(self, model: str | None = None, spec: Any = None) -> None:
+    def __init__(self, model: str | None = None, spec: MjSpec | None = None) -> None:
         self._revision: int | None = 0 if spec is None else None
-        self._spec: Any = mj.MjSpec() if spec is None else spec
+        self._spec: MjSpec = mj.MjSpec() if spec is None else spec
         self._spec.modelname = model or (self._spec.modelname if spec is not None else "unnamed_model")
         self.check_name("model", self._spec.modelname)
         self._settings: merge.Settings | None = {} if spec is None else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from sim2real.composer.models.element_list import ElementList
 from sim2real.composer.models.translate import mj
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.tree import Handle
 
 _INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 _CHOICES = {
@@ -39,7 +42,7 @@ class Section:
 
     __slots__ = ("_kinds", "_model", "_name", "_path")
 
-    def __init__(self, model: Tree[Any], name: str, path: str = "", kinds: tuple[str, ...] = ()) -> None:
+    def __init__(self, model: Tree[Handle], name: str, path: str = "", kinds: tuple[str, ...] = ()) -> None:
         for key, value in (("_model", model), ("_name", name), ("_path", path), ("_kinds", kinds)):
             object.__setattr__(self, key, value)
 
@@ -136,7 +139,7 @@ class Flags:
 
     __slots__ = ("_model",)
 
-    def __init__(self, model: Tree[Any]) -> None:
+    def __init__(self, model: Tree[Handle]) -> None:
         object.__setattr__(self, "_model", model)
 
     def _check(self, name: str) -> None:
@@ -178,7 +181,7 @@ class DocumentsOnly:
         raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=schema.FROM_DOCUMENTS)
 
 
-def make_sections(model: Tree[Any]) -> dict[str, Any]:
+def make_sections(model: Tree[Handle]) -> dict[str, Any]:
     """Return the sections of a model by name."""
     found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):

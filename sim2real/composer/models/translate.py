@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import mujoco
 import numpy as np
 
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjSpec, Native
 
 mj: Any = mujoco
 
@@ -98,7 +101,7 @@ def native_name(kind: str, key: str) -> str:
     return _RENAMED.get(kind, {}).get(key, key)
 
 
-def read(native: Any, kind: str, key: str) -> Any:
+def read(native: Native, kind: str, key: str) -> Any:
     """Return an attribute of an element; AttributeError when there is none of that name.
 
     Args:
@@ -117,7 +120,7 @@ def read(native: Any, kind: str, key: str) -> Any:
     return value
 
 
-def point(native: Any, key: str, name: str) -> None:
+def point(native: Native, key: str, name: str) -> None:
     """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
 
     Args:
@@ -134,7 +137,7 @@ def point(native: Any, key: str, name: str) -> None:
     setattr(native, key, names)
 
 
-def is_plain(native: Any, kind: str, key: str, value: Any) -> bool:
+def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser.
 
     Args:
@@ -153,7 +156,7 @@ _PLAIN: dict[tuple[str, str], tuple[bool, bool]] = {}
 """Kind and attribute -> whether a value can be put there: one that is no text, one that is."""
 
 
-def _is_plain(native: Any, kind: str, key: str) -> tuple[bool, bool]:
+def _is_plain(native: Native, kind: str, key: str) -> tuple[bool, bool]:
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return True, True
     name = native_name(kind, key)
@@ -164,7 +167,7 @@ def _is_plain(native: Any, kind: str, key: str) -> tuple[bool, bool]:
     return True, not is_keyword or (kind, key) in _ENUMS
 
 
-def reset(native: Any, source: Any, names: tuple[str, ...] | None = None) -> None:
+def reset(native: Native, source: Native, names: tuple[str, ...] | None = None) -> None:
     """Put attributes of an element back to those of another one, its defaults; default: all but its name.
 
     Args:
@@ -182,7 +185,7 @@ def reset(native: Any, source: Any, names: tuple[str, ...] | None = None) -> Non
 
 
 @functools.cache
-def blank(kind: str) -> Any:
+def blank(kind: str) -> Native:
     """Return an element of a kind as MuJoCo makes it."""
     spec = mj.MjSpec()
     kind = "body" if kind == "inertial" else kind
@@ -190,16 +193,16 @@ def blank(kind: str) -> Any:
     return getattr(spec.worldbody if kind in TREE_KINDS else spec, f"add_{kind}")()
 
 
-_BLANKS: list[Any] = []
+_BLANKS: list[MjSpec] = []
 
 
-def class_defaults(native: Any, kind: str) -> Any:
+def class_defaults(native: Native, kind: str) -> Native:
     """Return what holds the defaults of an element's class."""
     found = getattr(getattr(native, "classname", None), kind, None)
     return blank(kind) if found is None else found
 
 
-def assign(native: Any, kind: str, key: str, value: Any) -> None:
+def assign(native: Native, kind: str, key: str, value: Any) -> None:
     """Set an attribute of an element.
 
     Args:
@@ -238,7 +241,7 @@ def assign(native: Any, kind: str, key: str, value: Any) -> None:
 _PLANS: dict[tuple[str, str], tuple[str, int, Any, dict[str, Any] | None]] = {}
 
 
-def _plan(native: Any, kind: str, key: str) -> tuple[str, int, Any, dict[str, Any] | None]:
+def _plan(native: Native, kind: str, key: str) -> tuple[str, int, Any, dict[str, Any] | None]:
     """Return the native name of an attribute, length and dtype where it is an array, and names of its values."""
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return key, 0, None, None
@@ -273,7 +276,7 @@ def _numbers(value: Any) -> Any:
     return [float(word) for word in value.split()] if isinstance(value, str) else value
 
 
-def attributes(native: Any) -> tuple[str, ...]:
+def attributes(native: Native) -> tuple[str, ...]:
     """Return the names of an element's plain attributes."""
     return _attributes(type(native))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any, ClassVar, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models import translate
 from sim2real.composer.models.given import Document, Given, Records
@@ -12,6 +12,9 @@ from sim2real.composer.models.schema import KIND_OF_TAG, SECTION_OF
 from sim2real.composer.models.scope import Scope
 from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjSpec, Native
 
 _ADDED_LATER = 1_000_000_000
 """Elements that were parsed are ordered by their line; those that a program added come after them."""
@@ -28,11 +31,11 @@ class Handle:
 
     __slots__ = ("_native", "kind", "root")
 
-    root: Tree[Any]
+    root: Tree[Handle]
     kind: str
-    _native: Any
+    _native: Native
 
-    def __init__(self, root: Tree[Any], kind: str, native: Any) -> None:
+    def __init__(self, root: Tree[Handle], kind: str, native: Native) -> None:
         for name, value in (("root", root), ("kind", kind), ("_native", native)):
             object.__setattr__(self, name, value)
 
@@ -40,7 +43,7 @@ class Handle:
         return f"<{self.kind} {self.full_identifier!r}>"
 
     @property
-    def native(self) -> Any:
+    def native(self) -> Native:
         """The element of the ``MjSpec``."""
         self.root.expose()
         return self._native
@@ -67,7 +70,7 @@ class Handle:
         return "worldbody" if self.is_worldbody else self.recorded().tag
 
     @property
-    def class_defaults(self) -> Any:
+    def class_defaults(self) -> Native:
         """The native element that holds the defaults of this element's class."""
         return translate.class_defaults(self._native, self.kind)
 
@@ -101,7 +104,7 @@ class Handle:
         return self.root.records.of(self._native, self.kind)
 
 
-H = TypeVar("H", bound=Handle)
+H = TypeVar("H", bound=Handle, covariant=True)
 
 
 class Tree(Scope, Generic[H]):
@@ -120,17 +123,17 @@ class Tree(Scope, Generic[H]):
     handle_type: ClassVar[type[Handle]] = Handle
     """The class of the handles."""
 
-    def __init__(self, model: str | None = None, spec: Any = None, document: Document | None = None) -> None:
+    def __init__(self, model: str | None = None, spec: MjSpec | None = None, document: Document | None = None) -> None:
         super().__init__(model, spec)
         self.records = Records(document, is_blank=spec is None)
-        self.references: dict[tuple[Any, str], H] = {}
-        self._handles: dict[Any, H] = {}
-        self._order: dict[Any, int] = {}
+        self.references: dict[tuple[Native, str], H] = {}
+        self._handles: dict[Native | tuple[Native, str], H] = {}
+        self._order: dict[Native, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
         self._sections: dict[str, Any] = {}  # by name; ``Model`` makes them, as they need what works on a tree
 
     @classmethod
-    def owning(cls, spec: Any, document: Document | None = None) -> Self:
+    def owning(cls, spec: MjSpec, document: Document | None = None) -> Self:
         """Return a model around a spec that nobody else changes: changes are then seen, and results kept till then."""
         model = cls(spec=spec, document=document)
         model._revision = 0
@@ -160,14 +163,14 @@ class Tree(Scope, Generic[H]):
         """The world of this model, which becomes the attachment frame."""
         return self.handle("body", self._spec.worldbody)
 
-    def handle(self, kind: str, native: Any) -> H:
+    def handle(self, kind: str, native: Native) -> H:
         """Return the handle on an element of the spec; always the same one."""
         key = (native, kind) if kind == "inertial" else native  # a part of its body
         if key not in self._handles:
             self._handles[key] = cast("H", self.handle_type(self, kind, native))
         return self._handles[key]
 
-    def find_handle(self, native: Any) -> H:
+    def find_handle(self, native: Native) -> H:
         """Return the handle on an element that has one."""
         return self._handles[native]
 
@@ -179,7 +182,7 @@ class Tree(Scope, Generic[H]):
         """Return a class of defaults by its name."""
         return self._sections["default"].find("default", getattr(name, "dclass", name))
 
-    def enlist(self, kind: str, native: Any, tag: str, values: dict[str, Any]) -> H:
+    def enlist(self, kind: str, native: Native, tag: str, values: dict[str, Any]) -> H:
         """Note that an element was added after all others; return its handle.
 
         Args:
@@ -192,7 +195,7 @@ class Tree(Scope, Generic[H]):
         self.records.note(native, tag, values)
         return self.handle(kind, native)
 
-    def strike(self, natives: list[Any]) -> None:
+    def strike(self, natives: list[Native]) -> None:
         """Forget elements that are about to be deleted."""
         for native in natives:
             self._order.pop(native, None)
@@ -253,7 +256,7 @@ class Tree(Scope, Generic[H]):
                 found += attachment.model.find_all(kind)
         return found
 
-    def walk(self, body: Any, kind: str, shallow: bool, own: bool) -> Iterator[H]:
+    def walk(self, body: Native, kind: str, shallow: bool, own: bool) -> Iterator[H]:
         """Yield the elements of a kind below a native body, in the order of the document.
 
         Args:
@@ -275,7 +278,7 @@ class Tree(Scope, Generic[H]):
         if attachment is not None and not own and not shallow:
             yield from attachment.model.find_all(kind)
 
-    def _position(self, native: Any) -> int:
+    def _position(self, native: Native) -> int:
         added = self._order.get(native)
         if added is not None:
             return added

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dm_env import specs
@@ -18,12 +18,17 @@ from sim2real.composer.observation.observable.base import Observable
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sim2real.composer.types import AnyPhysics, RandomState, Steps
+
 DEFAULT_BUFFER_SIZE = 1
 DEFAULT_UPDATE_INTERVAL = 1
 DEFAULT_DELAY = 0
 
 
-def _drawer(value: Any, default: int, random_state: Any) -> int | Callable[[], Any]:
+def _drawer(value: Steps | None, default: int, random_state: RandomState) -> int | Callable[[], int]:
     """Return an option as a number, or as a function that draws one."""
     if isinstance(value, Variation):
         return lambda: value(random_state=random_state)
@@ -53,8 +58,8 @@ class _Channel:
         self,
         name: str,
         observable: Observable,
-        physics: Any,
-        random_state: Any,
+        physics: AnyPhysics,
+        random_state: RandomState,
         steps_per_read: int,
         strip: bool,
         pad_initial: bool,
@@ -192,7 +197,7 @@ class Updater:
 
     def __init__(
         self,
-        observables: Any,
+        observables: Mapping[str, Observable] | Sequence[Mapping[str, Observable]],
         physics_steps_per_control_step: int = 1,
         strip_singleton_buffer_dim: bool = False,
         pad_with_initial_value: bool = False,
@@ -207,7 +212,7 @@ class Updater:
         self._channels: Any = None
         self._flat: list[_Channel] = []
 
-    def reset(self, physics: Any, random_state: Any) -> None:
+    def reset(self, physics: AnyPhysics, random_state: RandomState) -> None:
         """Start an episode: take the first samples."""
         self._now = 0
 

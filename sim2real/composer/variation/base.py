@@ -8,12 +8,15 @@ from __future__ import annotations
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arrays import is_jax, namespace
 
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
-def evaluate(structure: Any, *args: Any, **kwargs: Any) -> Any:
+
+def evaluate(structure: Varying, *args: Any, **kwargs: Any) -> Any:
     """Return nested dicts, lists and tuples with every callable in them replaced by what it returns."""
     if isinstance(structure, dict):
         return type(structure)((k, evaluate(v, *args, **kwargs)) for k, v in structure.items())
@@ -28,7 +31,12 @@ class Variation(ABC):
     """A value that varies; ``+ - * / // ** -`` and ``[]`` make new variations."""
 
     @abstractmethod
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a value.
 
         Args:
@@ -37,40 +45,40 @@ class Variation(ABC):
             random_state: Source of randomness.
         """
 
-    def __add__(self, other: Any) -> Variation:
+    def __add__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.add, self, other)
 
-    def __radd__(self, other: Any) -> Variation:
+    def __radd__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.add, other, self)
 
-    def __sub__(self, other: Any) -> Variation:
+    def __sub__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.sub, self, other)
 
-    def __rsub__(self, other: Any) -> Variation:
+    def __rsub__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.sub, other, self)
 
-    def __mul__(self, other: Any) -> Variation:
+    def __mul__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.mul, self, other)
 
-    def __rmul__(self, other: Any) -> Variation:
+    def __rmul__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.mul, other, self)
 
-    def __truediv__(self, other: Any) -> Variation:
+    def __truediv__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.truediv, self, other)
 
-    def __rtruediv__(self, other: Any) -> Variation:
+    def __rtruediv__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.truediv, other, self)
 
-    def __floordiv__(self, other: Any) -> Variation:
+    def __floordiv__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.floordiv, self, other)
 
-    def __rfloordiv__(self, other: Any) -> Variation:
+    def __rfloordiv__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.floordiv, other, self)
 
-    def __pow__(self, other: Any) -> Variation:
+    def __pow__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.pow, self, other)
 
-    def __rpow__(self, other: Any) -> Variation:
+    def __rpow__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.pow, other, self)
 
     def __getitem__(self, index: Any) -> Variation:
@@ -83,10 +91,15 @@ class Variation(ABC):
 class UnaryOperation(Variation):
     """An operator applied to a variation."""
 
-    def __init__(self, op: Callable[[Any], Any], variation: Any) -> None:
+    def __init__(self, op: Callable[[Any], Any], variation: Varying) -> None:
         self._op, self._variation = op, variation
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the operator's result."""
         return self._op(evaluate(self._variation, initial_value, current_value, random_state))
 
@@ -109,10 +122,15 @@ class BinaryOperation(Variation):
         second: The right value.
     """
 
-    def __init__(self, op: Callable[[Any, Any], Any], first: Any, second: Any) -> None:
+    def __init__(self, op: Callable[[Any, Any], Any], first: Varying, second: Varying) -> None:
         self._op, self._first, self._second = op, first, second
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the operator's result."""
         first = evaluate(self._first, initial_value, current_value, random_state)
         second = evaluate(self._second, initial_value, current_value, random_state)
@@ -133,10 +151,15 @@ class BinaryOperation(Variation):
 class GetItemOperation(Variation):
     """A part of a variation's value."""
 
-    def __init__(self, variation: Any, index: Any) -> None:
+    def __init__(self, variation: Varying, index: Any) -> None:
         self._variation, self._index = variation, index
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the part."""
         value = evaluate(self._variation, initial_value, current_value, random_state)
         return (value if is_jax(value) else namespace(value).asarray(value))[self._index]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import colorsys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.arrays import namespace
 from sim2real.composer.variation.base import Variation, evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 
 class RgbVariation(Variation):
@@ -21,10 +24,15 @@ class RgbVariation(Variation):
         alpha: Opacity, from 0 to 1.
     """
 
-    def __init__(self, r: Any, g: Any, b: Any, alpha: Any = 1.0) -> None:
+    def __init__(self, r: Varying, g: Varying, b: Varying, alpha: Varying = 1.0) -> None:
         self._channels = [r, g, b, alpha]
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a colour."""
         values = evaluate(self._channels, initial_value, current_value, random_state)
         return namespace(values).asarray(values)
@@ -47,10 +55,15 @@ class HsvVariation(Variation):
         alpha: Opacity, from 0 to 1.
     """
 
-    def __init__(self, h: Any, s: Any, v: Any, alpha: Any = 1.0) -> None:
+    def __init__(self, h: Varying, s: Varying, v: Varying, alpha: Varying = 1.0) -> None:
         self._channels = (h, s, v, alpha)
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a colour."""
         h, s, v, alpha = evaluate(self._channels, initial_value, current_value, random_state)
         xp = namespace(h, s, v, alpha)
@@ -71,7 +84,7 @@ class HsvVariation(Variation):
 class GrayVariation(HsvVariation):
     """Gray level and alpha."""
 
-    def __init__(self, gray_level: Any, alpha: Any = 1.0) -> None:
+    def __init__(self, gray_level: Varying, alpha: Varying = 1.0) -> None:
         super().__init__(h=0.0, s=0.0, v=gray_level, alpha=alpha)
 
     def __repr__(self) -> str:

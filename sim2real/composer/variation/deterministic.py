@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arrays import namespace
 from sim2real.composer.variation.base import Variation, evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 
 class Constant(Variation):
     """Always the same value."""
 
-    def __init__(self, value: Any) -> None:
-        self._value = value
+    def __init__(self, value: Varying) -> None:
+        self._value: Any = value
 
     @property
     def value(self) -> Any:
         """The value."""
         return self._value
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the value."""
         return self._value
 
@@ -37,7 +45,7 @@ class Constant(Variation):
 class Sequence(Variation):
     """One value after the other, from the start again after the last one; on MJX: of numbers or arrays of one shape."""
 
-    def __init__(self, values: Iterable[Any]) -> None:
+    def __init__(self, values: Iterable[Varying]) -> None:
         self._values = values
         self._iterator = iter(values)
 
@@ -46,7 +54,12 @@ class Sequence(Variation):
         """The values."""
         return self._values
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: Any = None,
+    ) -> Any:
         """Return the next value."""
         if hasattr(random_state, "recall"):
             position = random_state.recall(self, 0)
@@ -64,7 +77,12 @@ class Sequence(Variation):
 class Identity(Variation):
     """The current value."""
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the current value."""
         return current_value
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import functools
 import math
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.arrays import namespace
 from sim2real.composer.variation.base import Variation, evaluate
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, Draw, RandomState, Varying
 
 
 class Distribution(Variation):
@@ -26,10 +28,15 @@ class Distribution(Variation):
 
     __slots__ = ("_args", "_kwargs", "_single_sample")
 
-    def __init__(self, *args: Any, single_sample: bool = False, **kwargs: Any) -> None:
+    def __init__(self, *args: Varying, single_sample: bool = False, **kwargs: Varying) -> None:
         self._single_sample, self._args, self._kwargs = single_sample, args, kwargs
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a sample."""
         given = {"initial_value": initial_value, "current_value": current_value, "random_state": random_state}
         size = None if self._single_sample or initial_value is None else np.shape(initial_value)
@@ -47,7 +54,7 @@ class Distribution(Variation):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         """Return the function that samples, given the parameters and ``size``."""
 
     def __eq__(self, other: object) -> bool:
@@ -72,10 +79,10 @@ class Uniform(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, low: Any = 0.0, high: Any = 1.0, single_sample: bool = False) -> None:
+    def __init__(self, low: Varying = 0.0, high: Varying = 1.0, single_sample: bool = False) -> None:
         super().__init__(low=low, high=high, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.uniform
 
 
@@ -90,10 +97,10 @@ class UniformInteger(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, low: Any, high: Any = None, single_sample: bool = False) -> None:
+    def __init__(self, low: Varying, high: Varying = None, single_sample: bool = False) -> None:
         super().__init__(low, high=high, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.randint
 
 
@@ -102,10 +109,10 @@ class UniformChoice(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, choices: Any, single_sample: bool = False) -> None:
+    def __init__(self, choices: Varying, single_sample: bool = False) -> None:
         super().__init__(choices, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.choice
 
 
@@ -115,7 +122,12 @@ class UniformPointOnSphere(Variation):
     def __init__(self, single_sample: bool = False) -> None:
         self._single_sample = single_sample
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a vector, shape ``(3,)``, or one for each entry of the initial value."""
         random_state = random_state or np.random
         shape: tuple[int, ...] = () if self._single_sample or initial_value is None else np.shape(initial_value)
@@ -140,10 +152,10 @@ class Normal(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, loc: Any = 0.0, scale: Any = 1.0, single_sample: bool = False) -> None:
+    def __init__(self, loc: Varying = 0.0, scale: Varying = 1.0, single_sample: bool = False) -> None:
         super().__init__(loc=loc, scale=scale, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.normal
 
 
@@ -158,10 +170,10 @@ class LogNormal(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, mean: Any = 0.0, sigma: Any = 1.0, single_sample: bool = False) -> None:
+    def __init__(self, mean: Varying = 0.0, sigma: Varying = 1.0, single_sample: bool = False) -> None:
         super().__init__(mean=mean, sigma=sigma, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.lognormal
 
 
@@ -170,10 +182,10 @@ class Exponential(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, scale: Any = 1.0, single_sample: bool = False) -> None:
+    def __init__(self, scale: Varying = 1.0, single_sample: bool = False) -> None:
         super().__init__(scale=scale, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.exponential
 
 
@@ -182,10 +194,10 @@ class Poisson(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, lam: Any = 1.0, single_sample: bool = False) -> None:
+    def __init__(self, lam: Varying = 1.0, single_sample: bool = False) -> None:
         super().__init__(lam=lam, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return random_state.poisson
 
 
@@ -194,10 +206,10 @@ class Bernoulli(Distribution):
 
     __slots__ = ()
 
-    def __init__(self, prob: Any = 0.5, single_sample: bool = False) -> None:
+    def __init__(self, prob: Varying = 0.5, single_sample: bool = False) -> None:
         super().__init__(prob, single_sample=single_sample)
 
-    def _callable(self, random_state: Any) -> Callable[..., Any]:
+    def _callable(self, random_state: RandomState) -> Draw:
         return functools.partial(random_state.binomial, 1)
 
 
@@ -221,7 +233,12 @@ class BiasedRandomWalk(Variation):
         self._scale = stdev * math.sqrt(1.0 - self._retain**2)
         self._value: Any = 0.0
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: Any = None,
+    ) -> Any:
         """Return the next value."""
         random_state = random_state or np.random
         if hasattr(random_state, "recall"):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.variation.base import Variation, evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 
 class Additive(Variation):
@@ -15,12 +18,17 @@ class Additive(Variation):
         cumulative: Add to the current value rather than to the initial one.
     """
 
-    def __init__(self, variation: Any, cumulative: bool = False) -> None:
+    def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the sum."""
-        base = current_value if self._cumulative else initial_value
+        base: Any = current_value if self._cumulative else initial_value
         return base + evaluate(self._variation, initial_value, current_value, random_state)
 
     def __eq__(self, other: object) -> bool:
@@ -40,12 +48,17 @@ class Multiplicative(Variation):
         cumulative: Multiply the current value rather than the initial one.
     """
 
-    def __init__(self, variation: Any, cumulative: bool = False) -> None:
+    def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the product."""
-        base = current_value if self._cumulative else initial_value
+        base: Any = current_value if self._cumulative else initial_value
         return base * evaluate(self._variation, initial_value, current_value, random_state)
 
     def __eq__(self, other: object) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.arrays import multiply_quaternions, namespace, rotate
 from sim2real.composer.variation.base import Variation, evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -15,7 +18,12 @@ IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 class UniformQuaternion(Variation):
     """Uniformly distributed rotations (Shoemake, Graphics Gems III, 1992)."""
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a quaternion."""
         random_state = random_state or np.random
         u1, u2, u3 = random_state.uniform([0.0] * 3, [1.0, 2.0 * np.pi, 2.0 * np.pi])
@@ -33,10 +41,15 @@ class UniformQuaternion(Variation):
 class QuaternionFromAxisAngle(Variation):
     """Rotations about an axis by an angle [rad], both of which may vary."""
 
-    def __init__(self, axis: Any, angle: Any) -> None:
+    def __init__(self, axis: Varying, angle: Varying) -> None:
         self._axis, self._angle = axis, angle
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a quaternion."""
         given = (initial_value, current_value, random_state or np.random)
         axis, angle = evaluate(self._axis, *given), evaluate(self._angle, *given)
@@ -60,14 +73,20 @@ class QuaternionFromAxisAngle(Variation):
 class QuaternionPreMultiply(Variation):
     """Rotates the initial rotation, or the current one, further."""
 
-    def __init__(self, quat: Any, cumulative: bool = False) -> None:
+    def __init__(self, quat: Varying, cumulative: bool = False) -> None:
         self._quat, self._cumulative = quat, cumulative
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a quaternion."""
         random_state = random_state or np.random
         first = evaluate(self._quat, initial_value, current_value, random_state)
-        return multiply_quaternions(first, current_value if self._cumulative else initial_value)
+        base: Any = current_value if self._cumulative else initial_value
+        return multiply_quaternions(first, base)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, QuaternionPreMultiply):
@@ -87,10 +106,15 @@ class QuaternionRotate(Variation):
         cumulative: Whether the current value is rotated, rather than the initial one.
     """
 
-    def __init__(self, quat: Any, vec: Any = None, cumulative: bool = False) -> None:
+    def __init__(self, quat: Varying, vec: Varying = None, cumulative: bool = False) -> None:
         self._quat, self._vec, self._cumulative = quat, vec, cumulative
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return a vector."""
         given = (initial_value, current_value, random_state or np.random)
         quaternion = evaluate(self._quat, *given)

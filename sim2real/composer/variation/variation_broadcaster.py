@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.variation.base import Variation, evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 
 class VariationBroadcaster:
@@ -16,7 +19,7 @@ class VariationBroadcaster:
         wrapped_variation: What is drawn from.
     """
 
-    def __init__(self, wrapped_variation: Any) -> None:
+    def __init__(self, wrapped_variation: Varying) -> None:
         self._wrapped = wrapped_variation
         self._waiting: weakref.WeakKeyDictionary[Proxy, deque[Any]] = weakref.WeakKeyDictionary()
 
@@ -26,7 +29,7 @@ class VariationBroadcaster:
         self._waiting[proxy] = deque()
         return proxy
 
-    def next_value(self, proxy: Proxy, random_state: Any) -> Any:
+    def next_value(self, proxy: Proxy, random_state: RandomState | None) -> Any:
         """Return the next draw that a proxy has not had yet."""
         if not self._waiting[proxy]:
             value = evaluate(self._wrapped, None, None, random_state)
@@ -41,6 +44,11 @@ class Proxy(Variation):
     def __init__(self, broadcaster: VariationBroadcaster) -> None:
         self._broadcaster = broadcaster
 
-    def __call__(self, initial_value: Any = None, current_value: Any = None, random_state: Any = None) -> Any:
+    def __call__(
+        self,
+        initial_value: ArrayLike | None = None,
+        current_value: ArrayLike | None = None,
+        random_state: RandomState | None = None,
+    ) -> Any:
         """Return the next draw."""
         return self._broadcaster.next_value(self, random_state)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.composer.arrays import is_jax
 from sim2real.composer.variation.base import evaluate
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.element import Element, Elements
+    from sim2real.composer.types import RandomState, Varying
 
 CONSTANTS = frozenset(
     {"mass", "inertia", "ipos", "iquat", "pos", "quat", "armature", "qpos0", "qpos_spring", "gear", "stiffness", "size"}
@@ -19,7 +23,7 @@ CONSTANTS = frozenset(
 class _Bound:
     __slots__ = ("initial", "variation")
 
-    def __init__(self, variation: Any, initial: Any = None) -> None:
+    def __init__(self, variation: Varying, initial: Any = None) -> None:
         self.variation, self.initial = variation, initial
 
 
@@ -27,9 +31,9 @@ class MJCFVariator:
     """Varies attributes of models before they are compiled; for ``initialize_episode_mjcf``."""
 
     def __init__(self) -> None:
-        self._variations: dict[Any, dict[str, _Bound]] = {}
+        self._variations: dict[Element, dict[str, _Bound]] = {}
 
-    def bind_attributes(self, element: Any, **attributes: Any) -> None:
+    def bind_attributes(self, element: Element, **attributes: Varying) -> None:
         """Bind variations, or fixed values, to attributes of an element; None unbinds."""
         bound = self._variations.setdefault(element, {})
         for name, variation in attributes.items():
@@ -38,7 +42,7 @@ class MJCFVariator:
             else:
                 bound[name] = _Bound(variation, copy.copy(getattr(element, name)))
 
-    def apply_variations(self, random_state: Any) -> None:
+    def apply_variations(self, random_state: RandomState) -> None:
         """Draw a value for every bound attribute and set it."""
         for element, attributes in self._variations.items():
             values = {}
@@ -68,9 +72,9 @@ class PhysicsVariator:
     """
 
     def __init__(self) -> None:
-        self._variations: dict[Any, dict[str, _Bound]] = {}
+        self._variations: dict[Elements, dict[str, _Bound]] = {}
 
-    def bind_attributes(self, element: Any, **attributes: Any) -> None:
+    def bind_attributes(self, element: Elements, **attributes: Varying) -> None:
         """Bind variations, or fixed values, to attributes that ``physics.bind(element)`` has; None unbinds."""
         bound = self._variations.setdefault(element, {})
         for name, variation in attributes.items():
@@ -79,7 +83,7 @@ class PhysicsVariator:
             else:
                 bound[name] = _Bound(variation)
 
-    def apply_variations(self, physics: Any, random_state: Any) -> None:
+    def apply_variations(self, physics: Any, random_state: RandomState) -> None:
         """Draw a value for every bound attribute and set it."""
         derived = False
         for element, attributes in self._variations.items():

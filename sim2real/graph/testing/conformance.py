@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -94,6 +94,9 @@ class NodeConformance(ABC):
             _same_form(jax.eval_shape(node.step, given)[1], node.step(given)[1], f"node {node.name!r}: traced output")
 
 
+T = TypeVar("T")
+
+
 class Played(NamedTuple):
     """One episode of hash nodes, as a runtime played it.
 
@@ -144,7 +147,7 @@ class RuntimeConformance(ABC):
                 assert len(got) >= 0.6 * len(hashes) - 3, f"seed {seed}: node {name!r} made {len(got)} steps"
 
 
-def _without_keys(tree: Any) -> Any:
+def _without_keys(tree: T) -> T:
     """Return the tree with JAX keys replaced by their raw numbers."""
 
     def one(leaf: Any) -> Any:
@@ -154,12 +157,12 @@ def _without_keys(tree: Any) -> Any:
     return jax.tree_util.tree_map(one, tree)
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _equal(a: object, b: object) -> bool:
     same = jax.tree_util.tree_map(lambda x, y: np.array_equal(x, y, equal_nan=False), a, b)
     return all(jax.tree_util.tree_leaves(same))
 
 
-def _same_form(expected: Any, got: Any, what: str) -> None:
+def _same_form(expected: object, got: object, what: str) -> None:
     trees = [jax.tree_util.tree_structure(t) for t in (expected, got)]
     assert trees[0] == trees[1], f"{what}: {trees[1]} instead of {trees[0]}"
     flat, _ = jax.tree_util.tree_flatten_with_path(expected)

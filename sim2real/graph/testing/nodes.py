@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,9 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.node import BaseNode, BaseWorld, Jitter, Scheduling
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
 
 _PRIME, _OFFSET, _MASK = 16777619, 12345, 2**32 - 1
 
@@ -59,7 +62,7 @@ class HashInPython(BaseNode):
         del graph_state
         return Value(x=jax.random.bits(rng, (), jnp.uint32))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, Value]:
         """Mix everything into the state."""
         windows = [
             ([int(s) for s in np.asarray(w.seq)], [int(x) for x in np.asarray(w.data.x)])
@@ -74,10 +77,10 @@ class HashInJax(HashInPython):
 
     jittable = True
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, Value]:
         """Mix everything into the state."""
 
-        def mixed(a: Any, b: Any) -> Any:
+        def mixed(a: jax.Array, b: ArrayLike) -> jax.Array:
             return (a ^ jnp.asarray(b).astype(jnp.uint32)) * jnp.uint32(_PRIME) + jnp.uint32(_OFFSET)
 
         acc = mixed(jnp.asarray(step_state.state), step_state.seq)
@@ -109,7 +112,7 @@ class Contraction(BaseNode):
         del graph_state
         return Value(x=jax.random.normal(rng))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, Value]:
         """Move towards the mean of the inputs, plus a term that differs from step to step."""
         seen = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
         target = sum(seen) / max(len(seen), 1)
@@ -172,7 +175,9 @@ def contracting_node(name: str, rate: float, world: bool, **options: Any) -> Bas
     return ContractingWorld(name, rate) if world else Contraction(name, rate, **options)
 
 
-def random_graph(seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node) -> Any:
+def random_graph(
+    seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node
+) -> dict[str, BaseNode]:
     """Return nodes by name with random rates, delays and connections; the first one can be the supervisor.
 
     Delays are multiples of 0.1 ms and often equal to the expected ones, so ties occur; some are several periods long,

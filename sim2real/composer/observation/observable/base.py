@@ -5,12 +5,17 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dm_env import specs
 
 from sim2real.composer.arrays import namespace
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sim2real.composer.types import Aggregate, AnyPhysics, Array, Corrupt, RandomState, Steps
 
 
 class Aggregator:
@@ -24,7 +29,7 @@ class Aggregator:
     def __init__(self, name: str, preserves_bounds: bool) -> None:
         self.name, self.preserves_bounds = name, preserves_bounds
 
-    def __call__(self, values: Any) -> Any:
+    def __call__(self, values: Array) -> Array:
         """Return the reduced values; a number, of which there is nothing to reduce, as it is."""
         if np.ndim(values) == 0:  # as numpy does, and jax.numpy does not
             return values
@@ -37,7 +42,7 @@ class Aggregator:
 AGGREGATORS = {name: Aggregator(name, name != "sum") for name in ("min", "max", "mean", "median", "sum")}
 
 
-def _aggregator(value: Any) -> Any:
+def _aggregator(value: str | Aggregate | None) -> Aggregate | None:
     if value is None or callable(value):
         return value
     try:
@@ -65,11 +70,11 @@ class Observable(ABC):
 
     def __init__(
         self,
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
     ) -> None:
         self.update_interval = update_interval
         self.buffer_size = buffer_size
@@ -81,12 +86,12 @@ class Observable(ABC):
         self._aggregator = _aggregator(aggregator)
 
     @property
-    def aggregator(self) -> Any:
+    def aggregator(self) -> Aggregate | None:
         """The reduction of the buffer, or None."""
         return self._aggregator
 
     @aggregator.setter
-    def aggregator(self, value: Any) -> None:
+    def aggregator(self, value: str | Aggregate | None) -> None:
         self._aggregator = _aggregator(value)
 
     @property
@@ -95,17 +100,17 @@ class Observable(ABC):
         return None
 
     @abstractmethod
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
         """Return a function that samples the raw value."""
 
-    def observation_callable(self, physics: Any, random_state: Any = None) -> Callable[[], Any]:
+    def observation_callable(self, physics: AnyPhysics, random_state: RandomState | None = None) -> Callable[[], Any]:
         """Return a function that samples the value and corrupts it."""
         sample, corruptor = self._callable(physics), self.corruptor
         if corruptor is None:
             return sample
         return lambda: corruptor(sample(), random_state=random_state)
 
-    def __call__(self, physics: Any, random_state: Any = None) -> Any:
+    def __call__(self, physics: AnyPhysics, random_state: RandomState | None = None) -> Any:
         """Return a sample."""
         return self.observation_callable(physics, random_state)()
 
@@ -132,16 +137,16 @@ class Generic(Observable):
     def __init__(
         self,
         raw_observation_callable: Callable[[Any], Any],
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
     ) -> None:
         self._raw_callable = raw_observation_callable
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
         return functools.partial(self._raw_callable, physics)
 
 
@@ -161,17 +166,17 @@ class MujocoFeature(Observable):
     def __init__(
         self,
         kind: str,
-        feature_name: Any,
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        feature_name: str | Sequence[str] | Callable[[], str | Sequence[str]],
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
     ) -> None:
         self._kind, self._feature_name = kind, feature_name
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
         array, name = getattr(physics.named.data, self._kind), self._feature_name
         return lambda: array[name() if callable(name) else name]
 
@@ -196,11 +201,11 @@ class MujocoCamera(Observable):
         camera_name: str,
         height: int = 240,
         width: int = 320,
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
         depth: bool = False,
     ) -> None:
         self._camera_name, self.height, self.width, self._depth = camera_name, height, width, depth

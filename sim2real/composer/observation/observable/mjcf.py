@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dm_env import specs
@@ -12,8 +12,12 @@ from sim2real.composer.models.element import Element
 from sim2real.composer.observation.observable.base import Observable
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.composer.models.element import Elements
+    from sim2real.composer.types import Aggregate, AnyPhysics, Corrupt, MjvOption, Steps
 
-def _check_elements(elements: Any) -> None:
+
+def _check_elements(elements: Elements) -> None:
     for element in (elements,) if isinstance(elements, Element) or not isinstance(elements, Iterable) else elements:
         if not isinstance(element, Element):
             raise UsageError(f"expected an `mjcf.Element`, got type {type(element)}: {element}")
@@ -41,19 +45,19 @@ class MJCFFeature(Observable):
     def __init__(
         self,
         kind: str,
-        mjcf_element: Any,
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        mjcf_element: Elements,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
         index: Any = None,
     ) -> None:
         _check_elements(mjcf_element)
         self._kind, self._element, self._index = kind, mjcf_element, index
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
         binding, kind, index = physics.bind(self._element), self._kind, self._index
         if index is None:
             return lambda: getattr(binding, kind)
@@ -92,14 +96,14 @@ class MJCFCamera(Observable):
         mjcf_element: Element,
         height: int = 240,
         width: int = 320,
-        update_interval: Any = 1,
-        buffer_size: Any = None,
-        delay: Any = None,
-        aggregator: Any = None,
-        corruptor: Any = None,
+        update_interval: Steps = 1,
+        buffer_size: Steps | None = None,
+        delay: Steps | None = None,
+        aggregator: str | Aggregate | None = None,
+        corruptor: Corrupt | None = None,
         depth: bool = False,
         segmentation: bool = False,
-        scene_option: Any = None,
+        scene_option: MjvOption | None = None,
     ) -> None:
         if not isinstance(mjcf_element, Element):
             raise UsageError(f"expected an `mjcf.Element`, got type {type(mjcf_element)}: {mjcf_element}")

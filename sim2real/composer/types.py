@@ -1,0 +1,237 @@
+"""Types that many modules of this package name in their annotations; only type checkers import this module.
+
+MuJoCo's classes come from its compiled modules, which say nothing of their attributes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, TypeAlias
+
+import jax
+import numpy as np
+import numpy.typing as npt
+from mujoco._render import MjrContext as MjrContext
+from mujoco._specs import (
+    MjsActuator,
+    MjsBody,
+    MjsCamera,
+    MjsDefault,
+    MjsEquality,
+    MjsExclude,
+    MjsGeom,
+    MjsHField,
+    MjsJoint,
+    MjsKey,
+    MjsLight,
+    MjsMaterial,
+    MjsMesh,
+    MjsNumeric,
+    MjsPair,
+    MjsSensor,
+    MjsSite,
+    MjsSkin,
+    MjsTendon,
+    MjsText,
+    MjsTexture,
+    MjsTuple,
+)
+from mujoco._specs import MjSpec as MjSpec
+from mujoco._structs import MjData as MjData
+from mujoco._structs import MjModel as MjModel
+from mujoco._structs import MjrRect as MjrRect
+from mujoco._structs import MjvOption as MjvOption
+from mujoco._structs import MjvScene as MjvScene
+
+Native: TypeAlias = (
+    MjsActuator
+    | MjsBody
+    | MjsCamera
+    | MjsEquality
+    | MjsExclude
+    | MjsGeom
+    | MjsHField
+    | MjsJoint
+    | MjsKey
+    | MjsLight
+    | MjsMaterial
+    | MjsMesh
+    | MjsNumeric
+    | MjsPair
+    | MjsSensor
+    | MjsSite
+    | MjsSkin
+    | MjsTendon
+    | MjsText
+    | MjsTexture
+    | MjsTuple
+)
+"""An element of an ``MjSpec``."""
+NativeDefault: TypeAlias = MjsDefault
+"""A class of defaults of an ``MjSpec``."""
+
+Array: TypeAlias = np.ndarray | jax.Array
+"""What an engine computes with: numpy's arrays on C, arrays and tracers of JAX on MJX."""
+ArrayLike: TypeAlias = npt.ArrayLike | jax.Array
+"""What an array can be made of; texts too, as attributes in MJCF may be."""
+
+
+class AnyPhysics(Protocol):
+    """What hooks are given: the physics of either engine, ``Physics`` or ``MjxPhysics``."""
+
+    variables: dict[str, Any]
+
+    @property
+    def np(self) -> Any:
+        """The module that computes with the engine's arrays."""
+        ...
+
+    @property
+    def model(self) -> Any:
+        """The model; its attributes are those of an ``MjModel``."""
+        ...
+
+    @property
+    def data(self) -> Any:
+        """The state; its attributes are those of an ``MjData``."""
+        ...
+
+    @property
+    def named(self) -> Any:
+        """Model and state by names."""
+        ...
+
+    def time(self) -> float | jax.Array:
+        """Return the simulated time [s]."""
+        ...
+
+    def timestep(self) -> float | jax.Array:
+        """Return the time that a step takes [s]."""
+        ...
+
+    def control(self) -> Array:
+        """Return the controls, shape ``(nu,)``."""
+        ...
+
+    def set_control(self, control: Any) -> None:
+        """Set the controls, shape ``(nu,)``."""
+
+    def position(self) -> Array:
+        """Return qpos, shape ``(nq,)``."""
+        ...
+
+    def velocity(self) -> Array:
+        """Return qvel, shape ``(nv,)``."""
+        ...
+
+    def bind(self, elements: Any) -> Any:
+        """Return the attributes of elements."""
+        ...
+
+    def get(self, elements: Any, name: str) -> Any:
+        """Return an attribute of elements."""
+        ...
+
+    def set(self, elements: Any, name: str, value: Any) -> AnyPhysics:
+        """Set an attribute of elements.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute.
+            value: What it is set to.
+        """
+        ...
+
+    def write(self, elements: Any, name: str, value: Any, index: Any) -> AnyPhysics:
+        """Set a part of an attribute of elements.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute.
+            value: What the part is set to.
+            index: Which part.
+        """
+        ...
+
+    def fail(self, condition: Any = True) -> None:
+        """Give this initial state up where a condition holds."""
+
+    def forward(self) -> None:
+        """Compute everything that follows from the state."""
+
+    def mark_as_dirty(self) -> None:
+        """Have that computed before it is read."""
+
+    def recompute_constants(self) -> None:
+        """Compute what follows from masses and lengths."""
+
+    def suppress_physics_errors(self) -> AbstractContextManager[None]:
+        """Let warnings raise nothing inside a ``with`` block."""
+        ...
+
+
+Draw: TypeAlias = Callable[..., Any]
+"""A function that draws a number or an array, of the parameters of a distribution and ``size``."""
+
+
+class RandomState(Protocol):
+    """A source of randomness: ``numpy.random.RandomState``, the module ``numpy.random``, or a ``JaxRandomState``."""
+
+    @property
+    def uniform(self) -> Draw:
+        """Floats in ``[low, high)``."""
+        ...
+
+    @property
+    def normal(self) -> Draw:
+        """Normally distributed floats."""
+        ...
+
+    @property
+    def lognormal(self) -> Draw:
+        """Exponentials of normally distributed floats."""
+        ...
+
+    @property
+    def exponential(self) -> Draw:
+        """Exponentially distributed floats."""
+        ...
+
+    @property
+    def poisson(self) -> Draw:
+        """Poisson distributed integers."""
+        ...
+
+    @property
+    def binomial(self) -> Draw:
+        """Binomially distributed integers."""
+        ...
+
+    @property
+    def randint(self) -> Draw:
+        """Integers in ``[low, high)``."""
+        ...
+
+    @property
+    def choice(self) -> Draw:
+        """Items of a sequence."""
+        ...
+
+    @property
+    def permutation(self) -> Draw:
+        """A sequence in random order."""
+        ...
+
+
+Varying: TypeAlias = "ArrayLike | Callable[..., Any] | Sequence[Varying] | Mapping[str, Varying] | None"
+"""A value, a variation that draws one, or lists and dicts of these: what ``variation.evaluate`` takes."""
+
+Steps: TypeAlias = int | Callable[..., int]
+"""A number of physics steps or of samples, or a variation or a function that draws one."""
+Aggregate: TypeAlias = Callable[[Any], Any]
+"""A reduction of a buffer's first axis, of the arrays of either engine."""
+Corrupt: TypeAlias = Callable[..., Any]
+"""What is called as ``corrupt(value, random_state=...)`` on every sample of an observable."""
+Hook: TypeAlias = Callable[..., Any]
+"""A hook of a task or an entity; what it takes depends on its name."""
