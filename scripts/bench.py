@@ -16,7 +16,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,11 @@ def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     return module, parser.parse_args(chosen.flags)
 
 
+def told(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Return flags as a report has them: of a path the name alone."""
+    return {name: value.name if isinstance(value, Path) else value for name, value in flags.items()}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one bench."""
     module, options = parse(arguments)
@@ -89,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("quick: tiny sizes, these figures measure nothing", file=sys.stderr)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        document = plain({**about, "machine": machine(), "versions": versions(), **result})
+        document = plain({**about, "flags": told(flags), "machine": machine(), "versions": versions(), **result})
         options.json.write_text(json.dumps(document, indent=1) + "\n")
         print(f"wrote {options.json}", file=sys.stderr)
     return 0

@@ -103,18 +103,23 @@ def league(report: Mapping[str, Any]) -> str:
     scale = {"rad": 1e3, "mrad": 1.0}
     v = {r["name"]: scale[r["unit"]] * r["value"] for r in report["rows"] if r["value"] is not None}
     folds = {name: {f["fold"] for f in report["folds"] if f["set"] == name} for name in LEAGUE_SETS}
+    seconds = {
+        name: [f["seconds"] for f in report["folds"] if (f["set"], f["entrant"]) == (name, "ours")]
+        for name in LEAGUE_SETS
+    }
 
     def told(name: str, entrant: str, what: str = "mean") -> str:
         value = v.get(f"league/{name}/{entrant}/{what}")
         return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
     lines = [
-        ("held out in turn, mean [mrad]", "sim2real", "its worst", *LEAGUE_ENTRANTS.values()),
-        ("---", *["---:"] * (2 + len(LEAGUE_ENTRANTS))),
+        ("held out in turn, mean [mrad]", "sim2real", "its worst", "its median time", *LEAGUE_ENTRANTS.values()),
+        ("---", *["---:"] * (3 + len(LEAGUE_ENTRANTS))),
     ]
     for name, about in LEAGUE_SETS.items():
         if folds[name]:
-            own = (told(name, "ours"), told(name, "ours", "worst"))
+            took = f"{statistics.median(seconds[name]):.0f} s" if seconds[name] else "-"
+            own = (told(name, "ours"), told(name, "ours", "worst"), took)
             lines.append((f"{about}, {len(folds[name])} folds", *own, *(told(name, e) for e in LEAGUE_ENTRANTS)))
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 

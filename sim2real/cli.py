@@ -45,6 +45,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   info      about the installation, a pipeline, a log or a run
   check     judge what a recording, or a planned one, can tell about the parameters
   validate  score what was identified on a later log
+  latency   where the milliseconds go between motion and motion: host, bus and device
   import    turn files of other recorders into logs, and say what is what in them
   new       write the files of a pipeline for a robot of which there is a model
   export    write what was identified for MuJoCo, mjlab, Isaac Lab, or as JSON
@@ -325,6 +326,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "view": _view,
     "report": _view,
     "info": _info,
+    "latency": _stage,
     "check": _check,
     **dict.fromkeys(("import", "validate", "new"), _files),
     **dict.fromkeys(("log", "export"), _only),

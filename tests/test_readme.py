@@ -57,14 +57,19 @@ def league():
         for entrant, both in entrants.items()
         for what, value in zip(("mean", "worst"), both, strict=True)
     ]
-    folds = [{"set": name, "fold": f"block {i}"} for name, count in (("disk", 5), ("go2", 3)) for i in range(count)]
+    folds = [
+        {"set": name, "fold": f"block {i}", "entrant": entrant, "seconds": 10.0 * (i + 1)}
+        for name, count in (("disk", 5), ("go2", 3))
+        for i in range(count)
+        for entrant in values[name]
+    ]
     return {"rows": rows, "folds": folds, "commit": "0123456789"}
 
 
 def test_the_league_has_a_line_a_set_in_one_unit(script, league):
     text = script.tables({"league": league})["league"]
-    assert "| motor with eccentric mass, RMSE, 5 folds | 25.1 | 30.2 | 100 | 35.0 | - | - | - |\n" in text
-    assert "| Unitree Go2 in the air, RMSE, 3 folds | 4.1 | 5.0 | - | - | 123 | - | - |\n" in text
+    assert "| motor with eccentric mass, RMSE, 5 folds | 25.1 | 30.2 | 30 s | 100 | 35.0 | - | - | - |\n" in text
+    assert "| Unitree Go2 in the air, RMSE, 3 folds | 4.1 | 5.0 | 20 s | - | - | 123 | - | - |\n" in text
     assert "XL330" not in text
     assert text.endswith("Commit that was measured: `0123456` (league).\n")
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}

@@ -66,6 +66,14 @@ BENCHES = {
             *(f"scripts/benches/{part}.py" for part in ("cmaes", "identify", "recordings", "sysid", "sysid_rows")),
         ),
     ),
+    "links": Bench(
+        "links",
+        "delays, losses and drift of emulated links, found from the motion",
+        (
+            *(f"sim2real/identify/{part}.py" for part in ("hidden", "likelihood", "links", "losses")),
+            *("sim2real/artifacts/links.py", "scripts/benches/emulated_links.py"),
+        ),
+    ),
     "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),

@@ -180,9 +180,8 @@ def judged(
     case: Case, first: Fit, results: list[dict[str, np.ndarray]], test: Mapping[str, Episode], seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
     """Return the errors of our model, of the same without delay, and of none."""
-    table = first.problem.table
-    without = table.with_fixed({p.name: p.nominal for p in table if p.kind == "delay"})
-    bare = predict(case, {"identified": as_numbers(without, refit(first.problem, without, first.z))}, test)
+    kept = np.array([c.parameter.kind != "delay" for c in first.problem.table.columns])
+    bare = predict(case, {"identified": refit(first.problem, kept, first.z)}, test)
     if case.name == "disk":
         return _disk_rows(case, results[0], bare)
     if case.name == "xl330":

@@ -62,7 +62,7 @@ def read_json(path: Path, kind: type[T]) -> T:
         raise ValueError(str(error)) from error
 
 
-def write_json(path: Path, document: Any) -> None:
+def write_json(path: Path, document: object) -> None:
     """Write a dataclass, or what it consists of, as JSON; a reader sees the old file or the new one, never a part.
 
     Args:
@@ -110,7 +110,7 @@ def number(value: float | None, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     """Return numpy's arrays and numbers as those of Python."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

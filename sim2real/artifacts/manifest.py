@@ -35,7 +35,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     return manifest if _is_manifest(manifest) else None
 
 
-def _is_manifest(value: Any) -> bool:
+def _is_manifest(value: object) -> bool:
     """Whether a JSON document has a manifest's entries, and its outputs lie in its folder."""
     if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
         return False
@@ -77,7 +77,7 @@ def reserve(folder: Path) -> None:
         os.fsync(file.fileno())
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value as dicts, lists, strings, numbers, booleans and None.
 
     Dataclasses become dicts, arrays nested lists, enums their names, paths strings; numbers that JSON lacks become the

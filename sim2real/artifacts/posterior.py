@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from sim2real.artifacts.files import check
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 Transform = Literal["linear", "log", "logit"]
 TRANSFORMS = {
@@ -19,7 +22,7 @@ TRANSFORMS = {
 """The scales on which parameters are searched, and on which their uncertainty is Normal."""
 
 
-def from_scale(transform: str, x: Any, numpy: Any = np) -> Any:
+def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
     """Return values for points on a scale.
 
     Args:

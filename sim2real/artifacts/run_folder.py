@@ -23,6 +23,8 @@ from sim2real.artifacts.manifest import git_state, plain, read_manifest, reserve
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
+TESTS = ("latency",)
+"""What has a folder in a run as stages have, but no other stage takes up."""
 DRY = "dry run"
 """Status of a stage that ended well but moved nothing: later stages do not use it."""
 INTERRUPTED = 130
@@ -150,7 +152,7 @@ def open_stage(
     Args:
         root: Folder of all runs.
         pipeline: Name of the pipeline.
-        stage: One of ``STAGES``.
+        stage: One of ``STAGES``, or of ``TESTS``.
         config: The resolved configuration, a dataclass.
         inputs: Name -> file or folder that the stage reads; hashed before it starts.
         run_dir: Run folder to add to; None makes a new one.
@@ -210,8 +212,8 @@ def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str,
 
 def _check_names(pipeline: str, stage: str) -> None:
     """Refuse unknown stages, and names of pipelines, which may come from files, that lead out of the folder of runs."""
-    if stage not in STAGES:
-        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(STAGES)}")
+    if stage not in (known := (*STAGES, *TESTS)):
+        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(known)}")
     if not _NAME.fullmatch(pipeline):
         raise UsageError(
             f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"

@@ -22,12 +22,15 @@ import tty
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.hardware.planned import BusEmulation, PlannedBus, truth_header
 from sim2real.hardware.plant import load_named, load_plant
 from sim2real.hardware.truth import TruthLog
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
@@ -71,7 +74,7 @@ class _StopFlag:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
 
-    def _set(self, number: int, frame: Any) -> None:
+    def _set(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         self.is_set = True
 

@@ -133,6 +133,14 @@ class Guardian:
             hint="was it stopped, or the machine too busy? servo_watchdog_s sets the limit",
         )
 
+    def require_watching(self) -> None:
+        """Raise SafetyStop, as `beat` does, but whether or not a sign of life is due: asked when the bus seems lost.
+
+        A guardian that takes over asks the servos itself, and their answers are missed here.
+        """
+        self._beat_s = 0.0
+        self.beat()
+
     def settle(self) -> bool:
         """Wait until it has finished taking the torque off, if it is doing so. Never raises.
 

@@ -362,6 +362,8 @@ class ServoLink(ABC):
 
     def _judge(self, losses: int, silent_s: float, what: str) -> None:
         if losses >= _LEAST_LOSSES and silent_s > self.config.max_silence_s:
+            if self.guardian is not None:
+                self.guardian.require_watching()
             raise HardwareLost(
                 f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
                 hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "

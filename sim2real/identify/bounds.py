@@ -18,7 +18,7 @@ def is_physical(p: Parameter, upper: bool) -> bool:
         p: The parameter, with its bounds.
         upper: Whether the upper one is meant.
     """
-    return not upper and p.low == 0.0 and (p.kind == "delay" or p.transform == "linear")
+    return not upper and p.low == 0.0 and not p.narrowed and (p.kind == "delay" or p.transform == "linear")
 
 
 def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:

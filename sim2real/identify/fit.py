@@ -16,7 +16,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.refine import Refined, refine
 from sim2real.identify.search import SearchResult, search
-from sim2real.identify.segments import Span
+from sim2real.identify.segments import Data, Span
 from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
@@ -56,9 +56,15 @@ class Fit:
         return uncertainty(self.problem, self.z)
 
 
-def as_numbers(table: ParameterTable, z: np.ndarray) -> dict[str, Any]:
-    """Return values by name as Python numbers, lists where each recording has its own."""
-    return {n: np.asarray(v, np.float64).tolist() for n, v in table.decode(jnp.asarray(z, jnp.float32)).items()}
+def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Any]:
+    """Return values by name as Python numbers, lists where each recording has its own.
+
+    Args:
+        table: The parameters.
+        z: Shape ``(P,)``: the unbounded vector.
+        kept: Shape ``(P,)``, bool: as in ``table.decode``.
+    """
+    return {n: np.asarray(v, np.float64).tolist() for n, v in table.decode(jnp.asarray(z, jnp.float32), kept).items()}
 
 
 def fit(
@@ -88,16 +94,16 @@ def fit(
     problem = windows = Problem(model, recordings, spans, length_s, config, table)
     if begins:
         begins(problem)
-    starts, found = problem.table.start()[None], None
+    # Also from the middle, and with longer delays: a descent may end where a delay, say, stands for an inertia.
+    starts, found = problem.table.starts(), None
+    z, loss = starts[0], float("nan")
     if config.generations:
         found = run_search(problem, starts[0], told)
-        starts = found.finalists
+        starts = np.stack([*found.finalists[: config.refine], starts[0]])
+        z, loss = found.z, found.loss
     refined = []
-    z, loss = starts[0], found.loss if found else float("nan")
     if config.refine:
-        # Also from where the search began: a short search may end in another minimum, with a delay for an inertia, say.
-        begin = [] if found is None else [problem.table.start()]
-        refined.append(_refine(problem, np.stack([*starts[: config.refine], *begin]), told))
+        refined.append(_refine(problem, starts, told))
         z, loss = refined[-1].z, refined[-1].loss
     if config.refine and config.long_s and long_spans:
         problem = Problem(model, recordings, long_spans, config.long_s, config, table)
@@ -106,22 +112,22 @@ def fit(
     return Fit(problem, centred(problem, z), loss, found, tuple(refined), windows)
 
 
-def refit(problem: Problem, table: ParameterTable, near: np.ndarray, told: Told | None = None) -> np.ndarray:
-    """Estimate fewer free parameters, by refinement alone.
+def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any]:
+    """Estimate fewer parameters, by refinement alone; the others are held at what a model without them has.
 
     Args:
         problem: The residuals, with all parameters.
-        table: The parameters, of which fewer are free.
+        kept: Shape ``(P,)``, bool: which free parameters are estimated.
         near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's own.
-        told: Progress.
 
     Returns:
-        The estimate ``(Q,)`` of the table's free parameters.
+        The estimate by name.
     """
-    other = problem.with_table(table)
-    values = as_numbers(problem.table, near)
-    starts = np.stack([other.table.encode(values), other.table.start()])
-    return _refine(other, starts, told).z
+    table = problem.table
+    if not kept.any():
+        return as_numbers(table, near, kept)
+    starts = np.stack([table.encode(as_numbers(table, near)), table.start()])
+    return as_numbers(table, _refine(problem, starts, None, problem.part(kept=kept)).z, kept)
 
 
 def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
@@ -141,19 +147,21 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
             told("search", generations / total, best, z)
 
     compiling = _compiling(told, "search", start)
-    return search(problem.losses, start, problem.config, problem.train, advance, problem.programs, compiling)
+    every, programs = problem.train, problem.programs
+    loss = lambda z: problem.at(z)[1]  # noqa: E731 - refinement needs this program anyway
+    return search(problem.losses, start, problem.config, every, advance, programs, compiling, loss)
 
 
-def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
+def _refine(problem: Problem, starts: np.ndarray, told: Told | None, data: Data | None = None) -> Refined:
     rounds = 3
-    total = rounds * len(starts)
+    total = rounds + len(starts) - 1
 
     def advance(best: float, z: np.ndarray) -> None:
         if told:
             told("refine", 1 / total, best, z)
 
     compiling = _compiling(told, "refine", starts[0])
-    return refine(problem, starts, problem.config.refine_steps, rounds, advance, on_compile=compiling)
+    return refine(problem, starts, problem.config.refine_steps, rounds, advance, data, compiling)
 
 
 def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:

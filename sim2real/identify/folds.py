@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify import terms
 from sim2real.identify.fit import Fit
-from sim2real.identify.prediction import labels
+from sim2real.identify.prediction import labels, simulated
 from sim2real.identify.problem import Problem
 from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
@@ -122,13 +121,14 @@ def leave_out(
     stats = terms.statistics(problem, linearise(problem, found.z), touched)
     values, kept = [], []
     for k, mask in enumerate(touched):
-        own = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
+        chosen = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
+        own = table.of_terms(chosen)
         # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
-        start = table.at_scale(stats.x + stats.step(table, own, k))
+        start = table.at_scale(stats.x + stats.step(table, chosen, k))
         z = refine(problem, start[None], steps, 1, data=problem.part(problem.train[mask], own)).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
-        kept.append(tuple(n for n, there in zip(table.terms, own, strict=True) if there))
-    stacked = {n: jnp.stack([jnp.asarray(v[n], jnp.float32) for v in values]) for n in values[0]}
+        kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
+    stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
     own = np.einsum("kpp->kp", stats.information)
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
     ahead = _ahead(found.windows, parts, stacked, settle_s)
@@ -167,9 +167,7 @@ def _predicted(
     problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float
 ) -> list[np.ndarray]:
     """Return the errors ``(N, fields)`` of segments beyond their first part, in deviations of the measurement."""
-    own = {n: v[fold] for n, v in stacked.items()}
-    predict = jax.jit(jax.vmap(lambda v, e: problem.predict(v, e, settle_s)))
-    errors, ts = (np.asarray(a, np.float64) for a in predict(own, jnp.asarray(segment)))
+    errors, ts = simulated(problem, {n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
     return [e[t > settle_s] for e, t in zip(errors, ts, strict=True)]
 
 

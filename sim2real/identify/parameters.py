@@ -36,6 +36,7 @@ class Parameter:
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": of none.
         off: Its value where that term is left out; default: the nominal one.
+        narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Parameter:
     side: Literal["", "command", "measurement"] = ""
     term: str = ""
     off: float | None = None
+    narrowed: bool = False
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -169,7 +171,7 @@ class ParameterTable:
         changed = {p.name: p for p in self.parameters}
         for name, (low, high) in bounds.items():
             own = self[name]
-            p = replace(own, low=float(low), high=float(high))
+            p = replace(own, low=float(low), high=float(high), narrowed=float(low) > own.low)
             if p.kind != "delay" and not p.low <= p.nominal <= p.high:
                 raise UsageError(
                     f"the bounds [{low:g}, {high:g}] {p.unit} of {name!r} exclude its nominal value {p.nominal:.4g}",
@@ -204,19 +206,28 @@ class ParameterTable:
         )
         return ParameterTable(rows, self.recordings)
 
+    def of_terms(self, kept: np.ndarray) -> np.ndarray:
+        """Return which entries are part of a model with some of ``terms``, ``(P,)``, bool.
+
+        Args:
+            kept: Shape ``(T,)``, bool: which terms.
+        """
+        there = dict(zip(self.terms, kept, strict=True)) | {"": True}
+        return np.array([there[c.parameter.term] for c in self.columns], bool)
+
     def decode(self, z: Any, kept: Any = None) -> dict[str, Any]:
         """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable.
 
         Args:
             z: The vector.
-            kept: Shape ``(T,)``, bool: which of ``terms`` are part of the model; default: all.
+            kept: Shape ``(P,)``, bool: others are held at what a model without them has; default: all are kept.
         """
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
         found: dict[str, list[Any]] = {}
         for i, c in enumerate(self.columns):
             p, value = c.parameter, from_scale(c.parameter.transform, x[i], jnp)
-            if kept is not None and p.term:
-                value = jnp.where(kept[self.terms.index(p.term)], value, p.without)
+            if kept is not None:
+                value = jnp.where(kept[i], value, p.without)
             found.setdefault(p.name, []).append(value)
         values: dict[str, Any] = {}
         for p in self.parameters:
@@ -264,10 +275,15 @@ class ParameterTable:
         transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in self.columns)
         return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
 
-    def start(self) -> np.ndarray:
-        """Return where a search begins, ``(P,)``: the nominal value, for delays a quarter of the interval."""
-        first = {p.name: p.nominal if p.kind != "delay" else p.low + 0.25 * (p.high - p.low) for p in self.parameters}
+    def start(self, share: float = 0.25) -> np.ndarray:
+        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval."""
+        first = {p.name: p.nominal if p.kind != "delay" else p.low + share * (p.high - p.low) for p in self.parameters}
         return self.encode(first)
+
+    def starts(self) -> np.ndarray:
+        """Return where a descent begins that no search precedes, ``(K, P)``: with short delays, and with long ones."""
+        delayed = any(c.parameter.kind == "delay" for c in self.columns)
+        return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
     def prior_residuals(self, z: Any) -> Any:
         """Return ``(K,)`` residuals whose half sum of squares is the negative log prior, up to a constant."""

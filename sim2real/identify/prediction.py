@@ -13,6 +13,7 @@ from sim2real.artifacts.identification import FreeRun, Prediction
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify.model import Channel
 from sim2real.identify.problem import Problem
+from sim2real.identify.programs import program
 
 Values = Mapping[str, Any]
 
@@ -31,11 +32,11 @@ def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> 
         a joint was told to be at that time, where commands are positions.
     """
     held_out = ~np.isin(np.arange(problem.segments), problem.train)
-    fit_s = jnp.asarray(np.where(held_out, settle_s, problem.segment_s), jnp.float32)
-    predict = jax.jit(lambda v: jax.vmap(lambda e, f: problem.predict(v, e, f))(jnp.arange(problem.segments), fit_s))
+    every, fit_s = np.arange(problem.segments), np.where(held_out, settle_s, problem.segment_s)
     columns: dict[str, np.ndarray] = {}
     for name, values in models.items():
-        residuals, ts = (np.asarray(x, np.float64) for x in predict({k: jnp.float32(v) for k, v in values.items()}))
+        rows = {n: np.broadcast_to(v, (problem.segments, *np.shape(v))) for n, v in values.items()}
+        residuals, ts = simulated(problem, rows, every, fit_s)
         at = np.nonzero(ts >= 0)
         if not columns:
             segment, into = at[0], ts[at]
@@ -52,6 +53,32 @@ def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> 
         for i, (label, (_, sigma, _)) in enumerate(zip(labels(problem), problem.fields, strict=True)):
             columns[f"{label}_{name}"] = columns[f"{label}_measured"] + residuals[..., i][at] * sigma
     return columns
+
+
+def simulated(
+    problem: Problem, values: Mapping[str, np.ndarray], segments: np.ndarray, fit_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Simulate segments, each with values of its own, after fitting its initial state to its first part.
+
+    Args:
+        problem: The segments.
+        values: Name -> values, ``(R, ...)``.
+        segments: Shape ``(R,)``: numbers of the segments.
+        fit_s: Shape ``(R,)``: lengths of their first parts [s].
+
+    Returns:
+        Residuals ``(R, C, fields)`` and their times ``(R, C)`` [s], as ``problem.predict`` returns them.
+    """
+    # So many at a time, however many there are: a program serves all, and compiling it takes longer than it runs.
+    size = problem.segments
+    predict = problem.programs.setdefault("predict", program(jax.vmap(problem.predict)))
+    found = []
+    for first in range(0, len(segments), size):
+        rows = np.minimum(np.arange(first, first + size), len(segments) - 1)
+        own = {n: jnp.asarray(v[rows], jnp.float32) for n, v in values.items()}
+        found.append(predict(own, jnp.asarray(segments[rows]), jnp.asarray(fit_s[rows], jnp.float32)))
+    residuals, ts = (np.concatenate(a)[: len(segments)].astype(np.float64) for a in zip(*found, strict=True))
+    return residuals, ts
 
 
 def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, np.ndarray]:

@@ -6,9 +6,9 @@ solves for these states (one Gauss-Newton step on the linearised rollout): a sea
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,26 +22,11 @@ from sim2real.identify.derivative import finite_differences
 from sim2real.identify.engine import CRollouts, choose
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.programs import program
 from sim2real.identify.robust import tamed
-from sim2real.identify.segments import Segments, Span, cut
+from sim2real.identify.segments import Data, Span, cut
 from sim2real.runtime.bursts import make_room
 from sim2real.runtime.compiled import CompiledGraph
-
-
-class Data(NamedTuple):
-    """What is fitted, as an argument of compiled programs: one program serves other measurements, and parts of them.
-
-    Attributes:
-        measured: Field -> ``(E, N, ...)``, as in ``Segments``.
-        starts: Shape ``(E, channels, 4)``, as in ``Segments``.
-        weight: Shape ``(E,)``: 1 for a segment that counts, 0 for one that is left out; None: all count.
-        kept: Shape ``(T,)``, bool: which of the table's terms are part of the model; None: all.
-    """
-
-    measured: Mapping[str, Any]
-    starts: Any
-    weight: Any = None
-    kept: Any = None
 
 
 class Problem:
@@ -86,7 +71,7 @@ class Problem:
         self.recording = np.array([s.recording for s in self.spans])
         self.train = np.flatnonzero([s.fitted for s in self.spans])
         self.given = cuts.given
-        self.data = _data(cuts)
+        self.data = Data.of(cuts)
         self._recording = jnp.asarray(self.recording)
         self._ts = jnp.asarray(cuts.ts, jnp.float32)
         # Traced once for all programs that it is a part of: tracing a rollout of MuJoCo takes 6 s.
@@ -142,7 +127,7 @@ class Problem:
             The sensor's predictions, leaves of shape ``(C, ...)``, and the numbers of their steps, ``(C,)``.
         """
         own = self.table.of_recording(values, self._recording[eps])
-        start = self._start(eps, sum(own[n] for n in self._late), data or self.data) + shift
+        start = self.start(eps, sum(own[n] for n in self._late), data or self.data) + shift
         return self._rollout(own, start, eps)
 
     def _simulate(self, own: Mapping[str, Any], start: Any, eps: Any) -> tuple[Any, Any]:
@@ -236,14 +221,18 @@ class Problem:
         shift = jnp.zeros(2 * len(self.channels))
         error, ts = self.residuals(values, eps, shift)
         counts = ((ts >= 0) & (ts <= fit_s))[:, None]
-        for _ in range(2 if self.config.initial_state == "free" else 0):
+
+        def step(_: Any, at: tuple[Any, Any]) -> tuple[Any, Any]:
+            shift, error = at
             sensitivity = self.sensitivity(values, eps, shift * self.prior)
             moved = shift + self._solve(error, ts, sensitivity, shift, fit_s)
             after, _ = self.residuals(values, eps, moved * self.prior)
             # Near kinks, such as friction that sticks, the linear step may make it worse.
             gain = jnp.sum(jnp.where(counts, error**2 - after**2, 0.0)) + jnp.sum(shift**2 - moved**2)
-            shift, error = (jnp.where(gain > 0, new, old) for new, old in ((moved, shift), (after, error)))
-        return error, ts
+            return jnp.where(gain > 0, moved, shift), jnp.where(gain > 0, after, error)
+
+        steps = 2 if self.config.initial_state == "free" else 0
+        return jax.lax.fori_loop(0, steps, step, (shift, error))[1], ts
 
     def losses(self, candidates: Any, around: Any, pick: Any = None, data: Data | None = None) -> Any:
         """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, and the priors.
@@ -259,18 +248,35 @@ class Problem:
         """
         pick = jnp.asarray(self.train) if pick is None else pick
         columns = self.sensitivities(around, pick, data)
+        return jax.vmap(lambda z: self._loss(z, pick, columns, data))(candidates)
 
-        def candidate(z: Any) -> Any:
-            values = self._values(z, data)
-            r, ts = jax.vmap(lambda e, c: self.projected(values, e, c, data))(pick, columns)
-            r, counts = self._tamed(r), ts >= 0
-            if data is not None and data.weight is not None:
-                own = data.weight[pick]
-                r, counts = r * own[:, None, None], counts * own[:, None]
-            prior = jnp.sum(self.table.prior_residuals(z) ** 2) / self.measurements
-            return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(counts) * r.shape[-1], 1) + prior)
+    def _loss(self, z: Any, pick: Any, columns: Any, data: Data | None) -> Any:
+        values = self._values(z, data)
+        r, ts = jax.vmap(lambda e, c: self.projected(values, e, c, data))(pick, columns)
+        r, counts = self._tamed(r), ts >= 0
+        if data is not None and data.weight is not None:
+            own = data.weight[pick]
+            r, counts = r * own[:, None, None], counts * own[:, None]
+        prior = jnp.sum(self.table.prior_residuals(z) ** 2) / self.measurements
+        return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(counts) * r.shape[-1], 1) + prior)
 
-        return jax.vmap(candidate)(candidates)
+    def at(self, z: jax.typing.ArrayLike, data: Data | None = None) -> tuple[Any, float]:
+        """Return ``sensitivities`` of the fitted segments at a point, and the loss there; compiled once.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            data: What is fitted; default: the logs.
+        """
+        if "at" not in self.programs:
+            pick = jnp.asarray(self.train)
+
+            def at(z: Any, data: Data) -> tuple[Any, Any]:
+                columns = self.sensitivities(z, pick, data)
+                return columns, self._loss(z, pick, columns, data)
+
+            self.programs["at"] = program(at)
+        columns, loss = self.programs["at"](jnp.asarray(z, jnp.float32), data or self.part())
+        return columns, float(loss)
 
     def sensitivities(self, z: Any, pick: Any = None, data: Data | None = None) -> Any:
         """Return ``sensitivity`` for several segments, ``(B, 2 * channels, C, fields)``; None if states are not fitted.
@@ -342,39 +348,40 @@ class Problem:
 
     def _has_derivative(self) -> bool:
         """Return whether every node can be differentiated: a callback to Python, say, cannot."""
-        self.forward = True
-        point = jnp.zeros(len(self.table))
+        point, still = jnp.zeros(len(self.table)), jnp.zeros(2 * len(self.channels))
+        errors = lambda z: self.residuals(self.table.decode(z), 0, still)[0]  # noqa: E731
         try:
-            jax.eval_shape(lambda z: jax.jvp(lambda y: self.losses(y[None], z), (z,), (z,)), point)
+            jax.eval_shape(lambda z: jax.jvp(errors, (z,), (z,)), point)
         except (ValueError, TypeError, NotImplementedError):
             return False
         return True
 
-    def with_table(self, table: ParameterTable) -> Problem:
-        """Return the same residuals for another table, such as one with some parameters fixed."""
-        other = copy.copy(self)
-        other.table = table.for_recordings(self.table.recordings)
-        other.programs = {}
-        return other
-
     def part(self, left_out: Any = (), kept: Any = None) -> Data:
-        """Return what is fitted without some segments, and with some of the table's terms.
+        """Return what is fitted without some segments, and with some of the parameters.
 
         Args:
             left_out: Numbers of the segments that do not count.
-            kept: Shape ``(T,)``, bool: which terms are part of the model; default: all.
+            kept: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
         """
         weight = np.ones(self.segments, np.float32)
         weight[np.asarray(left_out, int)] = 0.0
-        kept = np.ones(len(self.table.terms), bool) if kept is None else np.asarray(kept)
+        kept = np.ones(len(self.table), bool) if kept is None else np.asarray(kept)
         return self.data._replace(weight=jnp.asarray(weight), kept=jnp.asarray(kept))
 
     def cut_anew(self, spans: Sequence[Span], length_s: float) -> Problem:
         """Return the same recordings, cut into other segments [s]."""
-        return Problem(self.model, self._recordings, spans, length_s, self.config, self.table)
+        # Whether there are derivatives is known: to find out takes a second.
+        config = replace(self.config, jacobian="forward" if self.forward else "finite")
+        return Problem(self.model, self._recordings, spans, length_s, config, self.table)
 
-    def _start(self, eps: Any, delay_s: Any, data: Data) -> Any:
-        """Return the initial state ``(2 * channels,)`` as measured around the start; samples come ``delay_s`` late."""
+    def start(self, eps: Any, delay_s: Any, data: Data) -> Any:
+        """Return the initial state ``(2 * channels,)`` as measured around the start.
+
+        Args:
+            eps: Number of the segment.
+            delay_s: How late samples come [s].
+            data: What was measured.
+        """
         c = jnp.asarray(data.starts)[eps]  # (channels, 4): a cubic in time
         if self.config.initial_state == "rest":
             return jnp.concatenate([c[:, 0], jnp.zeros(len(self.channels))])
@@ -390,8 +397,3 @@ class Problem:
         J = jnp.where(fitted[None, :, None], sensitivity, 0.0).reshape(n, -1)
         r = jnp.where(fitted[:, None], error, 0.0).reshape(-1)
         return jnp.linalg.solve(J @ J.T + jnp.eye(n), -J @ r - shift)
-
-
-def _data(cuts: Segments) -> Data:
-    measured = {f: jnp.asarray(rows, jnp.float32) for f, rows in cuts.measured.items()}
-    return Data(measured, jnp.asarray(cuts.starts, jnp.float32))

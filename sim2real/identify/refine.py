@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import Sim2RealError
 from sim2real.identify.derivative import by_jacobian
-from sim2real.identify.problem import Data, Problem
+from sim2real.identify.problem import Problem
+from sim2real.identify.programs import program
 from sim2real.identify.search import telling
+from sim2real.identify.segments import Data
+
+_GAIN = 1e-4
+"""A round that gains a smaller share of the loss is the last."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ def refine(
     data: Data | None = None,
     on_compile: Callable[[bool], None] | None = None,
 ) -> Refined:
-    """Improve each start, and return the best result; a round that does not lower the loss is dropped.
+    """Improve each start by a round, the best of them by further ones; one that does not lower the loss is dropped.
 
     How residuals depend on initial states is linearised once a round.
 
@@ -56,7 +59,7 @@ def refine(
         problem: The residuals.
         starts: Shape ``(K, P)``.
         steps: Most steps of a round.
-        rounds: Most rounds from a start; the first that gains less than 0.01 % is the last.
+        rounds: Most rounds; the first that gains less than 0.01 % is the last.
         on_round: Called after each round with the best loss and point so far.
         data: What is fitted; default: the problem's logs.
         on_compile: Called with True before a program is compiled, and with False afterwards.
@@ -68,47 +71,45 @@ def refine(
     if ("improve", steps) not in problem.programs:
         with telling(on_compile):
             like = jnp.asarray(starts[0], jnp.float32)
-            problem.programs["improve", steps] = _program(problem, steps).lower(like, data).compile()
+            columns, _ = problem.at(like, data)
+            problem.programs["improve", steps] = _program(problem, steps).lower(like, columns, data).compile()
     improve = problem.programs["improve", steps]
-    of_data = problem.programs.setdefault("loss", jax.jit(lambda z, d: problem.losses(z[None], z, data=d)[0]))
-    full_loss = functools.partial(of_data, d=data)
-    first = [float(full_loss(jnp.asarray(s, jnp.float32))) for s in starts]
+    begin = [problem.at(s, data) for s in starts]
+    first = [loss for _, loss in begin]
     if not np.isfinite(first).any():
         raise Sim2RealError(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
     best, best_loss, taken = np.asarray(starts[int(np.nanargmin(first))]), float(np.nanmin(first)), 0
-    for start, loss in zip(starts, first, strict=True):
-        z = jnp.asarray(start, jnp.float32)
-        for _ in range(rounds):
-            moved, count = improve(z, data)
+    going = [(jnp.asarray(z, jnp.float32), columns, loss) for z, (columns, loss) in zip(starts, begin, strict=True)]
+    for _ in range(rounds):
+        ended = []
+        for z, columns, loss in going:
+            moved, count = improve(z, columns, data)
             taken += int(count)
-            new = float(full_loss(moved))
+            after, new = problem.at(moved, data)
             better = bool(jnp.all(jnp.isfinite(moved))) and new < loss
-            gain = loss - new
-            if better:
-                z, loss = moved, new
-                if new < best_loss:
-                    best, best_loss = np.asarray(z), new
+            if better and new < best_loss:
+                best, best_loss = np.asarray(moved), new
+            if better and loss - new >= _GAIN * abs(loss):
+                ended.append((moved, after, new))
             if on_round:
                 on_round(best_loss, best)
-            if not better or gain < 1e-4 * abs(loss):
-                break
+        # A round nearly ends a descent: only the best goes on, if it is one of those that still gain.
+        going = [e for e in ended if e[2] == best_loss]
     return Refined(best, best_loss, float(np.nanmin(first)), taken)
 
 
 def _program(problem: Problem, steps: int) -> Any:
-    """Return one round of Levenberg-Marquardt, jitted: ``z, data -> (z, steps taken)``."""
+    """Return one round of Levenberg-Marquardt, jitted: ``z, columns, data -> (z, steps taken)``."""
     import optimistix  # 0.5 s
 
     rtol, atol = problem.tolerance
     solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=atol)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
-    def improve(z: Any, data: Data) -> tuple[Any, Any]:
-        columns = problem.sensitivities(z, data=data)
-
+    def improve(z: Any, columns: Any, data: Data) -> tuple[Any, Any]:
         def weighed(y: Any) -> Any:
             residuals = problem.stacked(y, columns, data).reshape(-1)
             return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
@@ -119,4 +120,4 @@ def _program(problem: Problem, steps: int) -> Any:
         )
         return found.value, found.stats["num_steps"]
 
-    return jax.jit(improve)
+    return program(improve)

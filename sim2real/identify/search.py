@@ -15,6 +15,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.tree import strong
 from sim2real.identify.config import FitConfig
+from sim2real.identify.programs import program
 
 Losses = Callable[[Any, Any, Any], Any]
 """``candidates (N, P), around (P,), pick (B,) or None -> losses (N,)``, traceable."""
@@ -56,6 +57,7 @@ def search(
     on_generations: Callable[[int, float, np.ndarray], None] | None = None,
     programs: dict[Any, Any] | None = None,
     on_compile: Callable[[bool], None] | None = None,
+    alone: Callable[[np.ndarray], float] | None = None,
 ) -> SearchResult:
     """Minimise; every candidate of a generation sees the same data (common random numbers).
 
@@ -71,6 +73,7 @@ def search(
             of this run so far.
         programs: Compiled programs of earlier calls with the same losses; those of this one are added.
         on_compile: Called with True before a program is compiled, and with False afterwards.
+        alone: Loss of one candidate on all segments, where there is a program for it; default: that of ``losses``.
 
     Raises:
         UsageError: When there is no such strategy, or it cannot work with this population.
@@ -97,19 +100,24 @@ def search(
         runs.append(z)
         histories.append(history)
         evaluations += count
-    finalists = np.stack(runs)
     # Each is linearised at itself: finalists of several runs may lie far apart.
-    alone = programs.setdefault("alone", jax.jit(lambda z: losses(z[None], z, None)[0]))
-    final = np.array([float(alone(jnp.asarray(z))) for z in finalists])
-    order = np.argsort(np.where(np.isfinite(final), final, _INFINITE))
-    best = float(final[order[0]])
+    loss = alone or programs.setdefault("alone", program(lambda z: losses(z[None], z, None)[0]))
+    finalists, best = _ranked(np.stack(runs), loss)
+    history = np.minimum.accumulate(np.concatenate(histories))
+    return SearchResult(finalists[0], best, history, evaluations, finalists)
+
+
+def _ranked(finalists: np.ndarray, alone: Callable[[Any], Any]) -> tuple[np.ndarray, float]:
+    """Return the finalists ``(K, P)``, best first, and the loss of the best."""
+    losses = np.array([float(alone(z)) for z in finalists])
+    order = np.argsort(np.where(np.isfinite(losses), losses, _INFINITE))
+    best = float(losses[order[0]])
     if not best < _INFINITE:
         raise Sim2RealError(
             "no candidate could be simulated: every loss is infinite or no number",
             hint="check the bounds: they may admit only unstable models",
         )
-    history = np.minimum.accumulate(np.concatenate(histories))
-    return SearchResult(finalists[order[0]], best, history, evaluations, finalists[order])
+    return finalists[order], best
 
 
 class _Run:
@@ -148,7 +156,7 @@ class _Run:
         state = strong(self._first(k_first, jnp.asarray(middle, jnp.float32), std, params))  # else it compiles twice
         if self.advance is None:
             with telling(on_compile):
-                self.advance = jax.jit(self._advance).lower(state, params, k_first).compile()
+                self.advance = program(self._advance).lower(state, params, k_first).compile()
         history: list[np.ndarray] = []
         for k_generations in keys:
             state, best = self.advance(state, params, k_generations)

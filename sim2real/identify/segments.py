@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
@@ -53,6 +54,28 @@ class Segments:
     measured: Mapping[str, np.ndarray]
     ts: np.ndarray
     starts: np.ndarray
+
+
+class Data(NamedTuple):
+    """What is fitted, as an argument of compiled programs: one program serves other measurements, and parts of them.
+
+    Attributes:
+        measured: Field -> ``(E, N, ...)``, as in ``Segments``.
+        starts: Shape ``(E, channels, 4)``, as in ``Segments``.
+        weight: Shape ``(E,)``: 1 for a segment that counts, 0 for one that is left out; None: all count.
+        kept: Shape ``(P,)``, bool: which free parameters are part of the model; None: all.
+    """
+
+    measured: Mapping[str, Any]
+    starts: Any
+    weight: Any = None
+    kept: Any = None
+
+    @classmethod
+    def of(cls, cuts: Segments) -> Data:
+        """Return all of the segments."""
+        measured = {f: jnp.asarray(rows, jnp.float32) for f, rows in cuts.measured.items()}
+        return cls(measured, jnp.asarray(cuts.starts, jnp.float32))
 
 
 def cut(

@@ -12,6 +12,7 @@ from scipy.special import chdtri, stdtrit
 
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
+from sim2real.identify.programs import program
 
 VAGUE = 0.15
 """Standard errors above this share of the bounds' width are not identifiable (a uniform distribution has 0.29)."""
@@ -97,9 +98,9 @@ def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
 def linearise(problem: Problem, z: np.ndarray) -> Linearised:
     """Compute residuals and Jacobian at ``z (P,)``."""
     point = jnp.asarray(z, jnp.float32)
-    sensitivities = problem.programs.setdefault("sensitivities", jax.jit(problem.sensitivities))
-    linearised = problem.programs.setdefault("linearised", jax.jit(problem.linearised))
-    r, J, raw = (np.asarray(a, np.float64) for a in linearised(point, sensitivities(point)))
+    linearised = problem.programs.setdefault("linearised", program(problem.linearised))
+    columns, _ = problem.at(z)
+    r, J, raw = (np.asarray(a, np.float64) for a in linearised(point, columns))
     x, stretch = problem.table.scale(z)
     priors = np.asarray(jax.jacfwd(problem.table.prior_residuals)(point), np.float64) / stretch
     prior = priors.T @ priors + np.diag(12.0 / problem.table.span**2)

@@ -224,27 +224,27 @@ def _at_bounds(
     """
     said, least, flags = [], [], []
     for i in known:
-        c = table.columns[i]
-        if spread.verdict[i] == "at a bound":
-            upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
-            if is_physical(c.parameter, upper):
-                least.append(c.label)
-                continue
-            out = way_out(c.parameter, upper, max_delay_s)
-            bound = c.parameter.high if upper else c.parameter.low
-            said.append(_bound(c.label, "upper" if upper else "lower", f"{bound:.4g} {c.parameter.unit}", out))
-            flags.append(out)
+        if spread.verdict[i] != "at a bound":
+            continue
+        label, p = table.columns[i].label, table.columns[i].parameter
+        upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
+        if is_physical(p, upper):
+            least.append(label)
+        else:
+            flags.append(way_out(p, upper, max_delay_s))
+            said.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
     if trip and not trip.apart and trip.verdict == "at a bound":
-        parameters = {c.label: c.parameter for c in table.columns}
-        if all(is_physical(parameters[n], trip.at_bound == "upper") for n in trip.parts):
-            return said, [*least, "the sum of the delays"], " ".join(dict.fromkeys(f for f in flags if f))
-        out = way_out_of(trip, parameters, max_delay_s)
-        bound = trip.lower if trip.at_bound == "lower" else trip.upper
-        said.append(_bound("the sum of the delays", trip.at_bound, f"{1e3 * bound:.4g} ms", out))
-        flags.append(out)
+        parts = {c.label: c.parameter for c in table.columns if c.label in trip.parts}
+        upper = trip.at_bound == "upper"
+        if all(is_physical(p, upper) for p in parts.values()):
+            least.append("the sum of the delays")
+        else:
+            flags.append(way_out_of(trip, parts, max_delay_s))
+            bound = trip.upper if upper else trip.lower
+            said.append(_bound("the sum of the delays", upper, f"{1e3 * bound:.4g} ms", flags[-1]))
     return said, least, " ".join(dict.fromkeys(f for f in flags if f))
 
 
-def _bound(name: str, side: str, bound: str, flags: str) -> str:
+def _bound(name: str, upper: bool, bound: str, flags: str) -> str:
     what = f"identify again with {flags}, or doubt the model" if flags else "no flag moves it: doubt the model"
-    return f"at a bound: {name} is at its {side} one, {bound.rstrip()}; {what}"
+    return f"at a bound: {name} is at its {'upper' if upper else 'lower'} one, {bound.rstrip()}; {what}"

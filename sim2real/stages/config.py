@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -86,6 +86,8 @@ class IdentifyConfig(FitConfig):
     """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
     world: str | None = None
     """World of an installed package to identify in; default: the robot's own."""
+    links: bool = False
+    """Find how delays of the measurements are distributed, which were lost, and the drift of their clock, as well."""
     reveal: bool = True
     """Show the embedded robot's true parameters beside the estimates; the search never sees them."""
 
@@ -147,6 +149,21 @@ class TrainConfig:
             )
         if not 0.0 <= self.randomise <= 10.0:
             raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
+
+
+@dataclass(frozen=True)
+class LatencyConfig(RecordConfig):
+    """Find out where the milliseconds go: play steps, and judge clocks, bus and motion."""
+
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+    """How the device's share is found from the motion."""
+
+    @staticmethod
+    def of(record: RecordConfig, identify: IdentifyConfig) -> LatencyConfig:
+        """Return the defaults for a robot: 30 s of steps, and no more of an identification than the delay needs."""
+        own = {f.name: getattr(record, f.name) for f in fields(record)}
+        steps = {"duration_s": 30.0, "excitation": "steps"}
+        return LatencyConfig(**own | steps, identify=replace(identify, folds=0, free_run_s=0.0))
 
 
 @dataclass(frozen=True)

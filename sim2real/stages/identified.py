@@ -22,6 +22,7 @@ from sim2real.artifacts.identification import (
     Refinement,
     Search,
 )
+from sim2real.artifacts.links import Link
 from sim2real.identify import identifiability, uncertainty
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
@@ -182,11 +183,33 @@ def show(found: Identification) -> None:
         models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
         errors = [[row.name, *(row.rmse.get(m) for m in models), row.unit] for row in found.held_out]
         print(table(errors, [f"off {found.held_out[0].horizon_s:g} s ahead, held out", *models, "unit"]))
+    if found.links:
+        print(
+            table([r for link in found.links for r in _link_rows(link)], ["link", "estimate", "95 % interval", "unit"])
+        )
     note(f"verdict: {found.verdict.status}")
     for reason in found.verdict.reasons:
         note(f"  {reason}")
     if found.verdict.next:
         note(f"next: {found.verdict.next}")
+
+
+def _link_rows(link: Link) -> list[list[Any]]:
+    """Return a link's numbers for a table: of a sum, its parts are named."""
+    whole, own = " + ".join(link.parts), link.name
+    shown = [
+        (f"{whole}, mean", link.mean, 1e3, "ms"),
+        (f"{whole}, 95 % of the messages", link.p95, 1e3, "ms"),
+        (f"{own}, deviation", link.deviation, 1e3, "ms"),
+        (f"{own}, lost", link.lost, 100.0, "%"),
+        (f"{own}, lost in a row", link.burst, 1.0, ""),
+        (f"{own}, drift of the clock", link.drift, 1e6, "us/s"),
+    ]
+    return [
+        [name, factor * r.value, f"[{factor * number(r.low95):.4g}, {factor * number(r.high95):.4g}]", unit]
+        for name, r, factor, unit in shown
+        if r.value is not None
+    ]
 
 
 def summary(found: Identification) -> dict[str, Any]:

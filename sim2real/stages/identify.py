@@ -19,6 +19,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identify import prediction
 from sim2real.identify.aggregate import aggregate
 from sim2real.identify.fit import Fit, Told, as_numbers, fit, refit
+from sim2real.identify.links import links, measured
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
@@ -36,6 +37,8 @@ from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.recordings import open_recording, require_units
 from sim2real.stages.truth import true_values
 
+_NO_DELAY_S = 1e-4
+"""Delays below this are none [s]."""
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 """Shares of the horizon at which prediction errors are listed."""
 
@@ -74,6 +77,8 @@ def identify(
     units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
     table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
+    if config.links:
+        measured(table)  # a model that has no such delay is refused before the search
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
@@ -83,8 +88,9 @@ def identify(
         findings = patiently(lambda: identified.Findings.of(found, without))
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
         document = identified.document(pipeline.name, findings, truth, time.monotonic() - begin)
-        document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, table, found))
-        document = replace(document, left_out=without, terms=terms)
+        document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, found))
+        own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
+        document = replace(document, left_out=without, terms=terms, links=own)
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
         identified.judged(document, findings, units, config.max_delay_s, outside),
@@ -185,7 +191,6 @@ def _predicted(
     episodes: Sequence[Episode],
     fitted: int,
     config: IdentifyConfig,
-    table: ParameterTable,
     found: Fit,
 ) -> Identification:
     """Return the document with the columns of all segments and of the free runs, and their errors."""
@@ -193,7 +198,7 @@ def _predicted(
     models = {"identified": found.values, **_baselines(found), "nominal": _nominal(model)}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    runs, free = _free_runs(model, episodes, fitted, config, table, models)
+    runs, free = _free_runs(found, episodes, fitted, config, models)
     return replace(
         document,
         samples=samples,
@@ -228,13 +233,13 @@ def _begins(problem: Problem) -> None:
 def _baselines(found: Fit) -> dict[str, Any]:
     """Return the same model fitted without any delay, where it has some."""
     table = found.problem.table
-    delays = {p.name: p.nominal for p in table if p.kind == "delay" and p.free}
-    if not delays:
+    kept = np.array([c.parameter.kind != "delay" for c in table.columns])
+    if kept.all():
         return {}
-    without = table.with_fixed(delays)
-    if not len(without):
-        return {NO_DELAY: as_numbers(without, np.zeros(0))}
-    return {NO_DELAY: as_numbers(without, refit(found.problem, without, found.z))}
+    late = [np.max(np.abs(found.values[p.name] - np.float64(p.without))) for p in table if p.free and p.kind == "delay"]
+    # What has no delay is its own baseline: to fit it again took a quadruped two minutes, and changed nothing.
+    none = max(late) < _NO_DELAY_S
+    return {NO_DELAY: as_numbers(table, found.z, kept) if none else refit(found.problem, kept, found.z)}
 
 
 def _nominal(model: IdentifiableModel) -> dict[str, float]:
@@ -243,12 +248,7 @@ def _nominal(model: IdentifiableModel) -> dict[str, float]:
 
 
 def _free_runs(
-    model: IdentifiableModel,
-    episodes: Sequence[Episode],
-    fitted: int,
-    config: IdentifyConfig,
-    table: ParameterTable,
-    models: Mapping[str, Any],
+    found: Fit, episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, models: Mapping[str, Any]
 ) -> tuple[list[FreeRun], dict[str, np.ndarray]]:
     """Simulate what is held out of each log in one go; return its errors and its columns."""
     splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
@@ -258,7 +258,7 @@ def _free_runs(
     if not held_out or not config.free_run_s:
         return [], {}
     length_s = min(config.free_run_s, min(ends[s.recording] - s.begin_s for s in held_out))
-    problem = Problem(model, list(episodes), held_out, length_s, config, table)
+    problem = found.windows.cut_anew(held_out, length_s)
     columns = prediction.samples(problem, models, config.settle_s)
     return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns
 

@@ -23,6 +23,8 @@ _LEAST_PARTS = 2
 """Errors of which a mean and a worst are worth saying."""
 _LEAST = 4
 """Segments of which parts can be left out."""
+_STEPS = 8
+"""Most steps of a refinement without a part, on C: of a quadruped the loss is within 0.01 % of its end after four."""
 _FEWEST = 4
 """Parts from which on they say how much estimates differ."""
 
@@ -73,7 +75,10 @@ def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[
         note(f"{segments} segments are too few to leave parts out of the fit")
         return ()
     parts = folds_of(found.problem, min(config.folds, segments // 2), names)
-    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", config.refine_steps, config.free_run_s)
+    # From the solution of the linearised problem few steps are left to go. On C they take seconds each, and a program
+    # of fewer compiles in as long as two; else the one that refined before is taken.
+    few = min(config.refine_steps, _STEPS) if found.problem.engine.name == "c" else config.refine_steps
+    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", few, config.free_run_s)
     return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, overload
 from weakref import WeakKeyDictionary
 
 from sim2real.errors import UsageError
-from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
+from sim2real.stages.config import DeployConfig, IdentifyConfig, LatencyConfig, RecordConfig, TrainConfig
 
 if TYPE_CHECKING:
     from sim2real.log.mapping import ImportMapping
@@ -56,6 +56,11 @@ class Pipeline:
     def folder(self) -> Path:
         """The folder of the pipeline's files."""
         return Path(str(importlib.import_module(self.package).__file__)).parent
+
+    @property
+    def latency(self) -> LatencyConfig:
+        """Defaults of the test of latency."""
+        return LatencyConfig.of(self.record, self.identify)
 
     @property
     def words(self) -> tuple[str, ...]:

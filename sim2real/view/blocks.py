@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
@@ -118,7 +118,7 @@ class PageSection:
     banner: Banner | None = None
 
 
-def number(value: Any, digits: int = 4) -> str:
+def number(value: object, digits: int = 4) -> str:
     """Return a number as text with ``digits`` significant digits; other values as ``str`` does."""
     if value is None:
         return MISSING
@@ -178,7 +178,7 @@ def spoken(name: str) -> tuple[str, str]:
     return name.replace("_", " "), "1"
 
 
-def flat(tree: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
+def flat(tree: object, prefix: str = "") -> Iterable[tuple[str, str]]:
     """Yield dotted name and value, as text, of every leaf of nested dictionaries."""
     if isinstance(tree, Mapping) and tree:
         for name, value in tree.items():
@@ -189,6 +189,6 @@ def flat(tree: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
         yield prefix, MISSING if tree is None else f"{tree:g}" if isinstance(tree, float) else str(tree)
 
 
-def pairs_table(caption: str, tree: Any) -> TableBlock:
+def pairs_table(caption: str, tree: object) -> TableBlock:
     """Return a table of names and values."""
     return TableBlock(caption, ("name", "value"), list(flat(tree)), text_columns=(1,))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -198,7 +197,7 @@ def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
     return [(float(t_s[b]), float(t_s[e - 1])) for b, e in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _model_look(model: str, number: int) -> tuple[str, Any, str]:
+def _model_look(model: str, number: int) -> tuple[str, style.Dash, str]:
     """Return colour, dash and mark of a model: those that it has in all figures, if it has any."""
     known = {
         "identified": (BLUE, style.DASHES[0], "o"),
@@ -211,7 +210,7 @@ def _model_look(model: str, number: int) -> tuple[str, Any, str]:
 
 
 def _error_line(
-    axes: Axes, found: Identification, quantity: str, model: str, held_out: bool, look: tuple[str, Any, str]
+    axes: Axes, found: Identification, quantity: str, model: str, held_out: bool, look: tuple[str, style.Dash, str]
 ) -> None:
     color, dash, mark = look
     rows = [r for r in found.prediction if r.model == model and r.held_out == held_out and quantity in r.rmse]

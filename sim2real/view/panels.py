@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -87,7 +87,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
         if zoom and len(zooms) == 1:
             grid[0, 1].set_title(f"{zoom[0]:g} to {zoom[1]:g} s", fontweight="normal", color=MUTED)
         seen = {line.label: line for panel in panels for line in panel.lines}
-        entries: list[Any] = [_legend_entry(line) for line in seen.values()]
+        entries: list[Artist] = [_legend_entry(line) for line in seen.values()]
         entries += [Patch(facecolor=SHADE, edgecolor=GRID, label=shade)] if any(p.spans for p in panels) else []
         style.legend_above(figure, entries)
         return to_svg(figure, name, label)

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -74,13 +74,16 @@ _RC: dict[str, Any] = {
     "hatch.linewidth": 0.6,
 }
 
+Dash: TypeAlias = str | tuple[int, tuple[float, ...]]
+"""The dashes of a line, as matplotlib takes them."""
+
 
 @dataclass(frozen=True)
 class Role:
     """The appearance of a kind of line, the same in every figure."""
 
     color: str
-    dash: Any
+    dash: Dash
     width: float
     order: float
 

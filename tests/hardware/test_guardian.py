@@ -135,6 +135,22 @@ def test_a_process_that_wakes_again_ends_with_torque_off(start_host):
     assert_off_soon(robot, since_ns, within_s=0.5)
 
 
+def test_a_bus_that_seems_lost_as_the_guardian_uses_it_is_a_safety_stop(start_robot, open_bus, monkeypatch):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.3, max_silence_s=0.01)
+    attempts = []
+
+    def answered_elsewhere(*_):
+        """The guardian takes over between two signs of life, and what the servos answer goes to it."""
+        attempts.append(time.sleep(0.5 if not attempts else 0.005))
+        bus._link.guardian._beat_s = time.monotonic()
+
+    monkeypatch.setattr(bus._link, "_attempt", answered_elsewhere)
+    with pytest.raises(SafetyStop, match="the guardian has taken the torque off"):
+        bus.read(1, reg.TORQUE_ENABLE)
+    assert len(attempts) >= 3
+
+
 def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
     robot, host, pid = start_host()
     assert os.getsid(int(pid)) != os.getsid(host.pid)

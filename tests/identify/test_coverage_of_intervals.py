@@ -10,8 +10,8 @@ import pytest
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify import identifiability, uncertainty
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Data, Problem
-from sim2real.identify.segments import Span, cut
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Data, Span, cut
 from sim2real.identify.uncertainty import Linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation import excitation
@@ -68,7 +68,9 @@ def fitted(request):
         z = jax.lax.scan(step, z_true, length=2 if known else 4)[0]
         return z, *problem.linearised(z, problem.sensitivities(z, data=data), data)
 
-    z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40))(data)
+    # It runs for half a minute: here it pays to let LLVM optimise, as the suite does not.
+    optimised = {"xla_backend_optimization_level": 2}
+    z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40), compiler_options=optimised)(data)
     np.testing.assert_array_equal(r, raw)  # a squared loss tames nothing
     return problem, *(np.asarray(a, np.float64) for a in (z, r, J))
 

@@ -14,7 +14,7 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import fit
+from sim2real.identify.fit import fit, refit
 from sim2real.identify.folds import Fold, folds_of, leave_out
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -163,6 +163,18 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
         for name in ("gain", "tau", "bias", "square"):
             spread = abs(alone[name] - one.fit.values[name])
             assert float(row.values[name]) == pytest.approx(alone[name], abs=0.02 * spread + 2e-5)
+
+
+def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one):
+    names = one.fit.problem.table.names
+    found = refit(one.fit.problem, np.array([n in ("gain", "tau") for n in names]), one.fit.z)
+    fixed = Model.parameters.with_fixed({"bias": 0.0, "square": 0.0})
+    alone = fit(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed).values
+    assert (found["bias"], found["square"]) == (0.0, 0.0)
+    for name in ("gain", "tau"):
+        assert found[name] == pytest.approx(alone[name], rel=2e-5)
+        assert abs(found[name] - one.fit.values[name]) > 1e-4
+    assert refit(one.fit.problem, np.zeros(len(names), bool), one.fit.z)["gain"] == 1.5
 
 
 def test_blocks_cover_the_log_without_overlap(one):

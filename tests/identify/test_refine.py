@@ -25,12 +25,9 @@ def stub(residuals, count=3):
         tolerance=(1e-5, 1e-6),
         table=SimpleNamespace(prior_residuals=lambda z: jnp.zeros(0)),
         part=lambda: None,
-        sensitivities=lambda z, data: None,
         stacked=lambda z, columns, data: residuals(z),
         differentiable=lambda f: f,
-        losses=lambda candidates, around, data: jax.vmap(lambda z: 0.5 * jnp.sum(residuals(z) ** 2) / count)(
-            candidates
-        ),
+        at=lambda z, data: (None, float(0.5 * jnp.sum(residuals(jnp.asarray(z, jnp.float32)) ** 2) / count)),
     )
 
 
@@ -72,7 +69,7 @@ def test_a_start_at_the_optimum_stays(minimum):
 def test_what_is_worse_by_the_full_loss_is_not_accepted():
     """Held directions promise what the loss does not keep."""
     problem = stub(valley)
-    problem.losses = lambda candidates, around, data: jnp.sum((candidates - 5.0) ** 2, axis=1)
+    problem.at = lambda z, data: (None, float(jnp.sum((z - 5.0) ** 2)))
     start = np.array([[4.0, 4.5], [3.0, 3.0]], np.float32)
     found = refine(problem, start)
     assert not found.accepted
@@ -91,9 +88,7 @@ def test_starts_that_cannot_be_simulated_are_passed_over(minimum):
 def test_priors_take_part():
     problem = stub(lambda z: z - 1.0, count=1)
     problem.table.prior_residuals = lambda z: 2.0 * (z - 6.0)
-    problem.losses = lambda candidates, around, data: (
-        0.5 * jnp.sum((candidates - 1.0) ** 2 + 4.0 * (candidates - 6.0) ** 2, axis=1)
-    )
+    problem.at = lambda z, data: (None, float(0.5 * jnp.sum((z - 1.0) ** 2 + 4.0 * (z - 6.0) ** 2)))
     np.testing.assert_allclose(refine(problem, np.zeros((1, 1))).z, [5.0], atol=1e-3)
 
 

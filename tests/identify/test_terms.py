@@ -101,7 +101,9 @@ def test_a_table_knows_its_terms():
     assert fewer["f"].nominal == 0.5
     with pytest.raises(UsageError, match="unknown term 'gone'"):
         TABLE.with_terms(["gone"])
-    values = TABLE.decode(np.ones(6), np.array([True, False, False]))
+    kept = TABLE.of_terms(np.array([True, False, False]))
+    assert kept.tolist() == [n in "abc" for n in TABLE.names]
+    values = TABLE.decode(np.ones(6), kept)
     assert [round(float(values[n]), 3) for n in "def"] == [0.0, 0.0, 0.5]
     assert float(values["c"]) == pytest.approx(float(TABLE.decode(np.ones(6))["c"])) != 0.0
     with pytest.raises(UsageError, match="where its term"):

@@ -155,6 +155,14 @@ def test_a_friction_or_a_delay_of_0_is_told_and_accepted(name):
     assert f"{name} comes out at 0, less than which there is not: held there, the same fit" in found.reasons
 
 
+def test_a_bound_of_0_that_a_user_set_above_the_models_is_a_bound():
+    table = TABLE.with_bounds({"offset": (0.0, 1.0)})
+    x = (table.low + table.high) / 2
+    x[table.names.index("offset")] = 0.0
+    found = verdict.judge(scores(rows(0.1, 1.0), ONE), table, x, spread(offset="at a bound"), check(), max_delay_s=0.06)
+    assert (found.status, found.flags) == ("hit a bound", "--bounds offset -1 1")
+
+
 def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not():
     loose = dict.fromkeys(DELAYS, "not identifiable")
     found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.12))

@@ -133,8 +133,8 @@ def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):
     assert cli.main(["identify", "pendulum", "--runs", str(tmp_path)]) == 2
     assert finished(latest.run_dir, "identify") is None
     # Named, the older run is used, and gets the new attempt.
-    flags = ["--run", completed.name, "--runs", str(tmp_path), "--generations", "10", "--population", "8"]
-    assert cli.main(["identify", "pendulum", "--folds", "0", *flags]) == 0
+    flags = ["--run", completed.name, "--runs", str(tmp_path), "--generations", "0", "--refine-steps", "3"]
+    assert cli.main(["identify", "pendulum", "--folds", "0", "--free-run-s", "0", *flags]) == 0
     assert (tmp_path / "pendulum" / completed.name / "identify.2").is_dir()
 
 

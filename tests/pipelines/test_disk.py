@@ -118,7 +118,7 @@ def test_the_model_is_the_loop(synthetic):
     log = replace(synthetic.episode, outputs={**synthetic.episode.outputs, "sensor": {"th": synthetic.exact}})
     problem = Problem(model, [log], [Span(0, 0.0)], 10.0, config)
     start = jnp.array([encoder(TRUTH, 0.3), 0.0])
-    estimated = problem._start(jnp.int32(0), 0.0, problem.data)
+    estimated = problem.start(jnp.int32(0), 0.0, problem.data)
     values = {n: jnp.float32(v) for n, v in TRUTH.items()}
     residuals, ts = problem.residuals(values, jnp.int32(0), start - estimated)
     off = np.asarray(residuals)[np.asarray(ts) >= 0, 0] * model.channels[0].position_sigma

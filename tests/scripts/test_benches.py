@@ -47,6 +47,11 @@ def run(tmp_path, capsys):
     return run
 
 
+def test_a_report_names_files_without_the_folders_of_this_machine(tmp_path):
+    flags = {"data": tmp_path / "data", "seeds": [0], "keep": None}
+    assert bench.told(flags) == {"data": "data", "seeds": [0], "keep": None}
+
+
 @pytest.fixture
 def traced(monkeypatch):
     """Programs on MJX are traced but not compiled, which would take three quarters of the time."""
@@ -103,6 +108,11 @@ def test_compose_without_warp_leaves_its_rows_out(monkeypatch, capsys):
     assert "MuJoCo Warp is not installed, its rows are left out" in capsys.readouterr().err
 
 
+def test_links(run):
+    found = names(run("links"))
+    assert {"links/gamma/mean_ms", "links/bursts/lost", "links/intervals/mean"} <= found
+
+
 def test_log(run):
     report = run("log")
     rows = {row["name"]: row["value"] for row in report["rows"]}
@@ -128,7 +138,7 @@ def test_identify(run, disk):
     pytest.importorskip("mujoco.sysid")
     report = run("identify", "--data", disk)
     assert {"identify/disk/fit_s", "identify/disk/free_run_over_sysid"} <= names(report)
-    assert report["flags"]["data"] == str(disk)
+    assert report["flags"]["data"] == disk.name
     assert report["values"][0]["delay"] >= 0
 
 

@@ -1,0 +1,168 @@
+"""Links found from the motion of a motor with a lag that is solved here by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.errors import UsageError
+from sim2real.identify.likelihood import Seen
+from sim2real.identify.links import describe, find, links, measured
+from sim2real.identify.losses import losses
+from sim2real.stages.identified import show
+
+GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]
+COMMAND_DELAY_S, NOISE_RAD, COUNT_RAD = 0.004, 1e-3, 1e-3
+STEP_S, PERIOD_S = 2e-4, 0.0101
+GRID = np.arange(0.0, 0.0405, 0.001)
+
+
+def turned(gain, rate, volts, step_s, speed=0.0, angle=0.0):
+    """Solve ``q'' = rate * (gain * u - q')`` for voltages that hold for a step each; return the angles."""
+    fade, goal = np.exp(-rate * step_s), gain * volts
+    # What the speed lacks decays, and is renewed by each change of the goal.
+    late = lfilter([1.0], [1.0, -fade], np.concatenate([[speed - goal[0]], -np.diff(goal)]))
+    moved = goal * step_s + late * (1 - fade) / rate
+    return angle + np.concatenate([[0.0], np.cumsum(moved)[:-1]])
+
+
+def lag(kind, n, rng):
+    """Return how long messages take [s], and which are lost."""
+    lost = np.zeros(n, bool)
+    if kind == "gamma":
+        return 0.003 + rng.gamma(2.5, 0.002, n), lost
+    if kind == "bimodal":
+        return np.where(rng.random(n) < 0.3, 0.017, 0.005) + rng.normal(0, 0.0007, n), lost
+    if kind == "usb":
+        return 0.001 + 0.016 * ((0.37 - PERIOD_S / 0.016 * np.arange(n) + 0.1 * rng.random(n)) % 1.0), lost
+    if kind == "bursts":
+        for i in range(1, n):
+            lost[i] = rng.random() < (0.7 if lost[i - 1] else 0.04)
+    return 0.006 + rng.normal(0, 0.0008, n), lost
+
+
+def log(kind, duration_s, seed):
+    """Simulate a log: commands of 50 Hz, and measurements older than their stamps say."""
+    rng = np.random.default_rng(seed)
+    sent = np.arange(0.0, duration_s, 0.02)
+    volts = 0.5 * np.sin(2 * np.pi * rng.uniform(0.5, 3.0, 6) * sent[:, None] + rng.uniform(0, 6, 6)).sum(axis=1)
+    at = np.arange(round((duration_s + 0.1) / STEP_S)) * STEP_S
+    acting = volts[np.maximum(np.searchsorted(sent, at - COMMAND_DELAY_S + 1e-9, "right") - 1, 0)]
+    angles = turned(GAIN, RATE, acting, STEP_S)
+    t = np.arange(0.2, duration_s, PERIOD_S) + rng.uniform(0, 0.002, len(np.arange(0.2, duration_s, PERIOD_S)))
+    took, lost = lag(kind, len(t), rng)
+    seen = np.round((np.interp(t, at, angles) + rng.normal(0, NOISE_RAD, len(t))) / COUNT_RAD) * COUNT_RAD
+    for i in np.flatnonzero(lost):
+        seen[i] = seen[i - 1]
+    drift = 200e-6 if kind == "drift" else 0.0
+    stamps = t + took + drift * (t - t.mean())
+    return SimpleNamespace(acting=acting, at=at, stamps=stamps, seen=seen, took=took, lost=lost, drift=drift)
+
+
+def identify(log):
+    """Find the link with a model of the same form, from a wrong start; the commands' delay is held."""
+    again = np.concatenate([[False], np.diff(log.seen) == 0.0])
+
+    def angles(x):
+        return turned(np.exp(x[0]), np.exp(x[1]), log.acting, STEP_S, x[2], x[3])
+
+    def linearise(x, delay_s):
+        own = angles(x)
+        errors = np.interp(log.stamps[:, None] - GRID, log.at, own) - log.seen[:, None]
+        slopes = [np.interp(log.stamps - delay_s, log.at, angles(x + s) - own) / 1e-3 for s in 1e-3 * np.eye(4)]
+        J = np.stack(slopes, axis=1)[:, None] / NOISE_RAD
+        return Seen(log.stamps - log.stamps.mean(), GRID, errors[:, None] / NOISE_RAD, J, 1e-4 * np.eye(4))
+
+    start = np.array([np.log(GAIN) + 0.1, np.log(RATE) - 0.2, 0.0, 0.0])
+    found = find(linearise, start, 0.01, again, np.array([COUNT_RAD / NOISE_RAD]))
+    return describe("measured", ("measured", "commands"), found, COMMAND_DELAY_S), found
+
+
+@pytest.mark.parametrize("kind", ["gamma", "bimodal", "usb", "bursts", "drift"])
+def test_a_link_is_found_with_the_dynamics(kind):
+    record = log(kind, 12.0, 3)
+    link, found = identify(record)
+    arrived = record.took[~record.lost] + COMMAND_DELAY_S
+    assert link.mean.value == pytest.approx(arrived.mean(), abs=0.5e-3)
+    assert link.p95.value == pytest.approx(np.quantile(arrived, 0.95), abs=1.5e-3)
+    assert link.deviation.value == pytest.approx(arrived.std(), abs=0.4e-3)
+    assert link.lost.value == pytest.approx(record.lost.mean(), rel=0.2, abs=2e-3)
+    assert link.drift.low95 <= record.drift <= link.drift.high95
+    assert np.exp(found.hidden.x[:2]) == pytest.approx([GAIN, RATE], rel=0.03)
+    assert not link.told_apart
+    assert link.share.sum() == pytest.approx(1.0)
+
+
+def test_intervals_hold_the_truth():
+    held = {"mean": 0, "p95": 0, "deviation": 0}
+    truth = lag("gamma", 200_000, np.random.default_rng(0))[0]
+    mean, p95 = truth.mean() + COMMAND_DELAY_S, np.quantile(truth, 0.95) + COMMAND_DELAY_S
+    truth = {"mean": mean, "p95": p95, "deviation": truth.std()}
+    for seed in range(24):
+        link, _ = identify(log("gamma", 3.0, seed))
+        for name in held:
+            own = getattr(link, name)
+            held[name] += own.low95 <= truth[name] <= own.high95
+    assert min(held.values()) >= 20, held  # 24 intervals of 95 % hold fewer once in 200 times
+
+
+def test_a_constant_delay_has_no_jitter():
+    record = log("constant", 6.0, 1)
+    record.stamps += 0.006 - record.took
+    link, _ = identify(record)
+    assert link.mean.value == pytest.approx(0.010, abs=0.3e-3)
+    assert link.deviation.value < 0.3e-3
+
+
+def test_bursts_have_their_length():
+    rng, lost = np.random.default_rng(0), np.zeros(5000, bool)
+    for i in range(1, len(lost)):
+        lost[i] = rng.random() < (0.75 if lost[i - 1] else 0.02)
+    found = losses(lost, np.full(len(lost), 1e-4))
+    assert found.share.value == pytest.approx(lost.mean(), rel=0.05)
+    assert found.burst.low95 < 4.0 < found.burst.high95
+    assert found.share.low95 < 0.02 / (0.02 + 0.25) < found.share.high95
+
+
+def test_what_repeats_at_rest_is_no_loss():
+    again = np.arange(1000) % 2 == 1
+    found = losses(again, np.ones(1000))
+    assert found.share.value < 0.1
+    moving = losses(again, np.full(1000, 1e-6))
+    assert moving.share.value == pytest.approx(0.5)
+
+
+def test_without_losses_a_burst_has_no_length():
+    found = losses(np.zeros(500, bool), np.ones(500))
+    assert found.share.value == 0.0
+    assert 0.0 < found.share.high95 < 0.02
+    assert found.burst.value is None
+
+
+def test_a_problem_knows_its_links(fitted):
+    (link,) = links(fitted.problem, fitted.found.z)
+    delay_s = fitted.truth["sensor_delay"] + fitted.truth["actuator_delay"]
+    assert link.parts == ("sensor_delay", "actuator_delay")
+    assert link.mean.value == pytest.approx(delay_s, abs=0.5e-3)
+    assert link.deviation.value < 0.5e-3
+    assert abs(link.drift.value) < 1e-4
+
+
+def test_without_a_delay_of_the_measurements_there_is_no_link(fitted):
+    with pytest.raises(UsageError, match="has none"):
+        measured(fitted.problem.table.with_fixed({"sensor_delay": 0.02}))
+
+
+def test_links_are_kept_and_shown(tmp_path, capsys):
+    link, _ = identify(log("gamma", 3.0, 0))
+    found = Identification("robot", (), Judgement("accepted", ()), (), links=(link,))
+    found.save(tmp_path)
+    (kept,) = Identification.load(tmp_path).links
+    assert (kept.mean, kept.parts, kept.burst.value) == (link.mean, link.parts, None)
+    assert kept.share == pytest.approx(link.share)
+    show(found)
+    told = capsys.readouterr().out
+    assert "measured + commands, mean" in told
+    assert "measured, lost in a row" not in told
