@@ -17,8 +17,8 @@ from sim2real.train.config import PPOConfig
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import TrainResult, train
 
-SPREAD, DRAWS = 0.02, 1024
-"""Copies differ in each of the dynamics by this share, in so many draws."""
+SPREAD, SPREAD_S, DRAWS = 0.02, 0.002, 1024
+"""Copies differ in each of the dynamics by this share, in the delay by up to so many seconds, in so many draws."""
 QUICK = {"steps": 256, "envs": 8, "timelines": 2, "episode_s": 0.5, "evaluations": 2, "minibatches": 2}
 
 
@@ -41,6 +41,8 @@ def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     values = {**truth, "sensor_delay": 0.02, "actuator_delay": 0.025}
     rng = np.random.default_rng(0)
     draws = {name: value * (1 + SPREAD * rng.standard_normal(DRAWS)) for name, value in truth.items()}
+    draws["sensor_delay"] = np.full(DRAWS, values["sensor_delay"])
+    draws["actuator_delay"] = values["actuator_delay"] + rng.uniform(-SPREAD_S, SPREAD_S, DRAWS)
     jitter = rng.gamma(4.0, 2e-4, 2000)
     computation = {n: EmpiricalDist(jitter) for n in ("sensor", "agent", "actuator")}
     nodes, task = robot.training(values, draws, computation, True)

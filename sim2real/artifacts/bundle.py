@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, malformed, read_json, write_json
 from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
@@ -77,12 +78,14 @@ class Bundle:
         contract: What it sees, what it sends, at which rate, and what it was trained from.
         weights: Name -> array, as ``Policy.from_weights`` takes them.
         history: How training went; None where only the policy was copied.
+        episodes: What its episodes were drawn from; None where only the policy was copied.
         path: Its folder; None before it was saved.
     """
 
     contract: PolicyContract
     weights: Mapping[str, np.ndarray]
     history: History | None = None
+    episodes: Episodes | None = None
     path: Path | None = None
 
     def save(self, folder: Path) -> dict[str, str]:
@@ -96,7 +99,7 @@ class Bundle:
         if self.history is not None:
             self.history.save(folder / HISTORY)
             written["history"] = HISTORY
-        return written
+        return written if self.episodes is None else {**written, **self.episodes.save(folder)}
 
     @staticmethod
     def load(path: Path) -> Bundle:
@@ -112,4 +115,5 @@ class Bundle:
         contract = load_bundle(folder).contract
         beside = folder.with_name(HISTORY)
         history = History.load(beside) if beside.is_file() else None
-        return Bundle(contract, read_weights(folder), history, folder)
+        episodes = Episodes.load(folder.parent) if folder.with_name(EPISODES).is_file() else None
+        return Bundle(contract, read_weights(folder), history, episodes, folder)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.links import Link
+from sim2real.artifacts.noise import Noise
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run_folder import Source
 from sim2real.artifacts.timing import TIMING, Timing
@@ -260,6 +261,8 @@ class Identification:
         left_out: What was identified with one part left out, for each part; empty where that was not asked for.
         terms: Optional terms of the model that were chosen, or given; None where it has none.
         links: How delays are distributed; empty unless that was asked for.
+        noise: How measurements scatter around the model; empty in older files.
+        widening: Factor on the posterior's deviations that covers the model's own errors; None in older files.
         segments: How many segments were simulated.
         held_out_from_s: Where the first segment that was held out begins [s].
         settle_s: Length of the first part of a held-out segment, to which its initial state was fitted [s].
@@ -291,6 +294,8 @@ class Identification:
     left_out: tuple[Left, ...] = ()
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()
+    noise: tuple[Noise, ...] = ()
+    widening: float | None = None
     segments: int | None = None
     held_out_from_s: float | None = None
     settle_s: float = 0.0

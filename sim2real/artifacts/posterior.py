@@ -35,7 +35,7 @@ def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
 
 @dataclass(frozen=True)
 class Posterior:
-    """A Normal distribution on the parameters' scales, cut off at their bounds.
+    """A Normal distribution on the parameters' scales, folded back at their bounds.
 
     Attributes:
         names: P of them, with ``@recording`` where each recording has its own.
@@ -76,5 +76,7 @@ class Posterior:
         values, axes = np.linalg.eigh(self.covariance)
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T
-        x = np.clip(x, self.low, self.high)
+        # Folded back at the bounds, not clipped: clipped ones would heap up there.
+        turns = np.abs((x - self.low) / (self.high - self.low) % 2.0 - 1.0)
+        x = np.where((x < self.low) | (x > self.high), self.high - turns * (self.high - self.low), x)
         return {n: from_scale(t, x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}

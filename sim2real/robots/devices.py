@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+from flax import struct
 
-from sim2real.graph.base import GraphState, StepState
+from sim2real.artifacts.noise import Noise
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.robots.loop import DelayParams, delay_of
 from sim2real.robots.messages import Goals
@@ -22,11 +26,15 @@ class SimSensor(BaseNode):
         rate: Steps per second [Hz].
         world: The world that it reads.
         **options: Options of ``BaseNode``.
+
+    Attributes:
+        noise: What readings have on top of the motion; empty: they are exact.
     """
 
     def __init__(self, name: str, rate: float, world: BaseNode, **options: Any) -> None:
         super().__init__(name, rate, **options)
         self._world = world
+        self.noise: tuple[Noise, ...] = ()
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
@@ -42,9 +50,44 @@ class SimSensor(BaseNode):
         del rng
         return delay_of(self.name, self._world.name, graph_state)
 
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the biases of an episode, ``(noise,)``; without any noise there is no state."""
+        if not self.noise:
+            return super().init_state(rng, graph_state)
+        drawn = jnp.zeros(len(self.noise)) if rng is None else jax.random.normal(rng, (len(self.noise),))
+        return SensorBias(drawn * jnp.array([n.bias for n in self.noise]))
+
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Return the world's message."""
-        return step_state, step_state.inputs[self._world.name][-1].data
+        """Return the world's message, with noise if there is any."""
+        message = step_state.inputs[self._world.name][-1].data
+        return step_state, self._noisy(message, step_state) if self.noise else message
+
+    def _noisy(self, message: Any, step_state: StepState) -> Any:
+        if step_state.rng is None:
+            raise UsageError(f"sensor {self.name!r} has noise and no random numbers to draw it from")
+        # A key of its own for each step; the sensor has no other use for its random numbers.
+        key = jax.random.fold_in(step_state.rng, step_state.seq)
+        added = jax.random.normal(key, (len(self.noise),)) * jnp.array([n.deviation for n in self.noise])
+        added = added + step_state.state.bias
+        changed: dict[str, Any] = {}
+        for noise, error in zip(self.noise, added, strict=True):
+            field, index = noise.place
+            value = jnp.asarray(changed.get(field, getattr(message, field)))
+            own = (value if index is None else value[index]) + error
+            own = noise.quantum * jnp.round(own / noise.quantum) if noise.quantum else own
+            changed[field] = own if index is None else value.at[index].set(own)
+        return message.replace(**changed)
+
+
+@struct.dataclass
+class SensorBias(Base):
+    """What a simulated sensor's readings are off by in an episode.
+
+    Attributes:
+        bias: Shape ``(noise,)``, each in the unit of its noise.
+    """
+
+    bias: Any
 
 
 class SimActuator(BaseNode):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
@@ -21,6 +22,8 @@ BURST = 3
 the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
+EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
+"""No samples."""
 
 
 @struct.dataclass
@@ -65,7 +68,11 @@ def delay_parameters(max_delay_s: float, roles: Roles = ROLES) -> list[Parameter
 
 
 def delay_bounds(
-    values: Mapping[str, float], tick_s: float, spread_s: float, lead_s: float = 0.0
+    values: Mapping[str, float],
+    tick_s: float,
+    spread_s: float,
+    lead_s: float = 0.0,
+    draws: Mapping[str, np.ndarray] = EMPTY,
 ) -> dict[str, tuple[float, float, float]]:
     """Return the bounds of the trainable delays for training.
 
@@ -74,13 +81,17 @@ def delay_bounds(
         tick_s: The world's period [s], over which the sensor interpolates.
         spread_s: Largest deviation of an episode's delay from its value [s].
         lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
+        draws: Samples that episodes use in place of the values, each of shape ``(K,)`` [s].
 
     Returns:
         Name -> (value, min, max) [s].
     """
-    room = tick_s + spread_s
-    added = dict(zip(DELAYS, (0.0, lead_s), strict=True))
-    return {n: (values[n] + lead, max(0.0, values[n] - room), values[n] + spread_s + lead) for n, lead in added.items()}
+    bounds = {}
+    for name, lead in zip(DELAYS, (0.0, lead_s), strict=True):
+        own = np.append(draws.get(name, []), values[name])
+        low, high = float(own.min()) - tick_s - spread_s, float(own.max()) + spread_s
+        bounds[name] = (values[name] + lead, max(0.0, low), high + lead)
+    return bounds
 
 
 def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> dict[str, float]:
@@ -99,6 +110,22 @@ def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> di
     total = values[DELAYS[0]] + values[DELAYS[1]]
     sensor = min(max(values[DELAYS[0]], tick_s + spread_s), total)
     return {**values, DELAYS[0]: sensor, DELAYS[1]: total - sensor}
+
+
+def drawn_in_a_loop(values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return samples of parameters with the sensor's delay as it is, as far as the sum of both delays allows.
+
+    All that the sum varies by is then in the actuator's delay: a policy sees only the sum.
+
+    Args:
+        values: What ``in_a_loop`` returns.
+        draws: Samples of some parameters, each of shape ``(K,)``, of both delays or of neither [s].
+    """
+    if not set(DELAYS) <= set(draws):
+        return dict(draws)
+    total = draws[DELAYS[0]] + draws[DELAYS[1]]
+    sensor = np.minimum(values[DELAYS[0]], total)
+    return {**draws, DELAYS[0]: sensor, DELAYS[1]: total - sensor}
 
 
 def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict[str, BaseNode]:
@@ -175,9 +202,7 @@ def recorded_loop(
     return {n.name: n for n in (sensor, actuator, world)}
 
 
-def draw_values(
-    key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array], spread_s: float
-) -> dict[str, Any]:
+def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array]) -> dict[str, Any]:
     """Draw the parameters of one episode.
 
     Args:
@@ -185,20 +210,10 @@ def draw_values(
         values: Parameters by name.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn in place of the
             values.
-        spread_s: Largest deviation of an episode's delay from its value [s].
 
     Returns:
         Parameters by name.
     """
-    row_key, *own = jax.random.split(key, 1 + len(values))
-    keys = dict(zip(values, own, strict=True))
     count = min((len(d) for d in draws.values()), default=1)
-    row = jax.random.randint(row_key, (), 0, count)
-    drawn: dict[str, Any] = {}
-    for name, value in values.items():
-        if name.endswith("_delay"):
-            shift = jax.random.uniform(keys[name], minval=-spread_s, maxval=spread_s)
-            drawn[name] = jnp.maximum(value + shift, 0.0)
-        else:
-            drawn[name] = draws[name][row] if name in draws else value
-    return drawn
+    row = jax.random.randint(key, (), 0, count)
+    return {name: draws[name][row] if name in draws else value for name, value in values.items()}

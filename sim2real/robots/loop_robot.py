@@ -23,7 +23,7 @@ from sim2real.robots.base import Datum, Robot, positive, tuple_of
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
-from sim2real.robots.loop import control_nodes, delay_bounds, in_a_loop, simulated_loop
+from sim2real.robots.loop import control_nodes, delay_bounds, drawn_in_a_loop, in_a_loop, simulated_loop
 from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
 
@@ -43,7 +43,8 @@ class LoopRobot(Robot):
         message: Makes the actuator's message from a command, shape ``(actions,)``.
         expected_delay_s: Computation delays of sensor, supervisor and actuator that phases allow for: a bus
             transaction, and a policy with its thread's wake-up [s].
-        delay_spread_s: By how much delays vary between episodes of training, either way [s].
+        delay_spread_s: By how much a delay that is given to the loop in simulation may be off the one it was made for,
+            either way [s].
         lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
     """
 
@@ -199,7 +200,8 @@ class LoopRobot(Robot):
         """
         roles, world = self.roles, self.make_world()
         values = in_a_loop(values, self.tick_s, self.delay_spread_s)
-        bounds = delay_bounds(values, self.tick_s, self.delay_spread_s, self.lead_s) if delays else None
+        draws, spread_s = drawn_in_a_loop(values, draws), self.delay_spread_s
+        bounds = delay_bounds(values, self.tick_s, spread_s, self.lead_s, draws) if delays else None
         names = (roles.sensor, roles.supervisor, roles.actuator)
         on_sensor, on_agent, on_actuator = (
             {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
@@ -207,7 +209,7 @@ class LoopRobot(Robot):
         )
         agent, sensor = self.make_agent(**on_agent), SimSensor(roles.sensor, self.rate_hz, world, **on_sensor)
         nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
-        return nodes, LoopTask(self, agent, values, draws, self.delay_spread_s if delays else 0.0)
+        return nodes, LoopTask(self, agent, values, draws)
 
     def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
         """Return node parameters of the loop in simulation, from rest.

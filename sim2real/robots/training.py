@@ -59,7 +59,6 @@ class LoopTask:
         values: Parameters by name.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
             in place of the values.
-        delay_spread_s: Largest deviation of an episode's delay from its value [s].
     """
 
     def __init__(
@@ -68,12 +67,10 @@ class LoopTask:
         agent: Any,
         values: Mapping[str, float],
         draws: Mapping[str, np.ndarray],
-        delay_spread_s: float,
     ) -> None:
         self.robot, self.agent, self.values = robot, agent, dict(values)
         self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
-        self.delay_spread_s = delay_spread_s
         self.observation_size = robot.observation_size
         self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.action], np.float32).T
 
@@ -98,4 +95,4 @@ class LoopTask:
         return self.robot.success(self.robot.judged(graph_state))
 
     def _draw(self, key: jax.Array) -> dict[str, Any]:
-        return draw_values(key, self.values, self.draws, self.delay_spread_s)
+        return draw_values(key, self.values, self.draws)

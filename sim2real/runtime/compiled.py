@@ -94,6 +94,10 @@ class CompiledGraph:
         """Number of the supervisor's steps in the shortest episode; ``reset`` returns the first."""
         return int(self._walk.counts.min())
 
+    def last_row(self, steps: np.ndarray) -> np.ndarray:
+        """Return the row of the last of the supervisor's first ``steps (E,)`` steps in each episode, ``(E,)``."""
+        return self._walk.last_row(steps)
+
     def init(
         self,
         rng: jax.Array,

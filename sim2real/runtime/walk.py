@@ -53,6 +53,11 @@ class Walk:
         """Largest number of rows from one step of the supervisor to the next."""
         return int(np.diff(self.places // max(1, len(self.turns)), axis=1).max(initial=1))
 
+    def last_row(self, steps: np.ndarray) -> np.ndarray:
+        """Return the row of the last of an episode's first ``steps (E,)`` steps that is computed, ``(E,)``."""
+        there = (np.arange(self.places.shape[1]) < steps[:, None]) & (self.places < self.end)
+        return np.where(there, self.places, 0).max(axis=1, initial=0) // max(1, len(self.turns))
+
     def first_turn(self) -> int:
         """Return the supervisor's first slot.
 

@@ -12,7 +12,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from sim2real.errors import UsageError
 from sim2real.hardware.config import GateLimits as GateLimits
 from sim2real.identify.config import FitConfig
-from sim2real.train.config import PPOConfig
+from sim2real.stages.train_config import TrainConfig as TrainConfig
+from sim2real.stages.train_config import check_seed
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
-        _check_seed(self.seed)
+        check_seed(self.seed)
         if not 1.0 <= self.duration_s <= 3600.0:
             raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.low_hz < self.high_hz:
@@ -120,38 +121,6 @@ class IdentifyConfig(FitConfig):
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """Train a policy on the identified model with the robot's timing."""
-
-    model: Literal["identified", "nominal"] = "identified"
-    """Parameters to train on: what identify found, or the nominal ones without any delay."""
-    parameters: str | None = None
-    """parameters.json to train on; default: the newest identification of the pipeline."""
-    world: str | None = None
-    """World of an installed package to train in; default: the one that was identified, or the robot's own."""
-    timelines: int = 32
-    """Timelines drawn from the recorded timing."""
-    episode_s: float = 5.0
-    """Length of an episode [s]."""
-    randomise: float = 1.0
-    """Copies differ in their parameters by this many standard errors of the identification, and at least by 2 %."""
-    seed: int = 0
-    """Seed of training."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """The learning algorithm."""
-
-    def __post_init__(self) -> None:
-        """Check what can be checked before anything is compiled."""
-        _check_seed(self.seed)
-        if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
-            raise UsageError(
-                f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
-            )
-        if not 0.0 <= self.randomise <= 10.0:
-            raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
-
-
-@dataclass(frozen=True)
 class LatencyConfig(RecordConfig):
     """Find out where the milliseconds go: play steps, and judge clocks, bus and motion."""
 
@@ -191,18 +160,13 @@ class DeployConfig:
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
-        _check_seed(self.seed)
+        check_seed(self.seed)
         if self.episodes < 1:
             raise UsageError(f"episodes must be at least 1, got {self.episodes}")
         if not 1.0 <= self.duration_s <= 3600.0:
             raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.settle_s <= 600.0:
             raise UsageError(f"settle_s must lie in (0, 600] s, got {self.settle_s}")
-
-
-def _check_seed(seed: int) -> None:
-    if not 0 <= seed < 2**31:
-        raise UsageError(f"seed must lie in [0, 2**31), got {seed}")
 
 
 @dataclass(frozen=True)

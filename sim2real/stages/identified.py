@@ -23,7 +23,7 @@ from sim2real.artifacts.identification import (
     Search,
 )
 from sim2real.artifacts.links import Link
-from sim2real.identify import identifiability, uncertainty
+from sim2real.identify import identifiability, noise, uncertainty
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.prediction import position_of
@@ -44,6 +44,7 @@ class Findings:
         spread: Its uncertainty.
         check: What the data determines.
         trip: The sum of the delays; None where there are none.
+        widening: Factor on its deviations with which draws cover the errors of the model.
     """
 
     fit: Fit
@@ -51,6 +52,7 @@ class Findings:
     spread: uncertainty.Uncertainty
     check: identifiability.Check
     trip: RoundTrip | None
+    widening: float
 
     @staticmethod
     def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
@@ -63,7 +65,8 @@ class Findings:
         at = uncertainty.linearise(fit.problem, fit.z)
         spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
-        return Findings(fit, at.x, spread, check, round_trip(fit.problem.table, at.x, spread))
+        trip = round_trip(fit.problem.table, at.x, spread)
+        return Findings(fit, at.x, spread, check, trip, noise.widening(fit.problem.table, at, spread))
 
 
 def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds: float) -> Identification:
@@ -98,6 +101,7 @@ def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds
         misfit=spread.misfit,
         check=Determined(check.condition, check.undetermined, check.messages, minute),
         posterior=fit.problem.table.posterior(fit.z, spread.scale_covariance),
+        widening=found.widening,
     )
 
 

@@ -21,6 +21,7 @@ from sim2real.identify.aggregate import aggregate
 from sim2real.identify.fit import Fit, Told, as_numbers, fit, refit
 from sim2real.identify.links import links, measured
 from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.noise import noises
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, beyond
@@ -97,6 +98,7 @@ def identify(
         logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
         units=units,
         world=config.world,
+        noise=noises(document.samples, units),
         aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
         timing=fitted[0].timing,
     )

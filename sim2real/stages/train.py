@@ -11,36 +11,22 @@ import jax
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle, History
-from sim2real.artifacts.files import number
+from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
 from sim2real.artifacts.timing import Timing
-from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.delays import DelayDistribution
-from sim2real.graph.node import BaseNode
-from sim2real.graph.schedule import draw
-from sim2real.graph.timeline import Timeline
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
-from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.interruption import patiently
-from sim2real.stages.parameters import check_parameters, open_identification
+from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.prepared import prepare, require_accepted, timing_of
 from sim2real.stages.robot import moving_robot
-from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
-
-_LONGEST_GAP = 1.25
-"""Timelines with a pause between policy steps longer than this many times the median are drawn again."""
-_HICCUP = 0.25
-"""Steps that took longer than this share of the policy's period on the robot are not drawn from."""
-_LEAST_SPREAD, _MOST = 0.02, 2.0
-"""Copies differ by at least this share of a parameter, and at most by this factor, however uncertain it is."""
-_DRAWS = 1024
 
 
 def train(
@@ -63,25 +49,17 @@ def train(
 
     Raises:
         UsageError: When the identified model is asked for without an identification, or in another world.
-        Sim2RealError: When the identification is of another robot, or its timing cannot be trained with.
+        Sim2RealError: When the identification is of another robot or was not accepted, or its timing cannot be trained
+            with.
     """
     pipeline = pipeline_of(robot)
     config = config or pipeline.train
-    delays = config.model == "identified"
-    if delays and identification is None:
-        raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
-    if identification is not None and delays:
-        check_parameters(identification, pipeline)
-    robot = moving_robot(pipeline, _world(config, identification if delays else None))
-    values, draws = model_values(robot, identification, config)
-    computation, dropped = _computation(robot, identification, timing) if delays else ({}, {})
-    nodes, task = robot.training(values, draws, computation, delays)
-    timeline, redrawn = draw_timelines(nodes, robot.roles.supervisor, config)
-    env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
-    ppo = replace(config.ppo, eval_steps=env.length + 1)
+    made = prepare(pipeline, config, identification, timing)
+    ppo = replace(config.ppo, eval_steps=made.env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
-        result = patiently(lambda: learn(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
-    bundle = Bundle(_contract(robot, task, values), result.best.to_weights(), _history(result))
+        result = patiently(lambda: learn(made.env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
+    contract = _contract(made.robot, made.env.task, made.values)
+    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes)
     about = {
         "model": config.model,
         "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
@@ -89,8 +67,8 @@ def train(
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
         "train": f"{result.train_s:.1f} s",
-        "hiccups left out": sum(dropped.values()),
-        "timelines drawn again": redrawn,
+        "episodes that end at a pause": f"{made.episodes.cut} of {made.episodes.timelines}",
+        "timelines drawn again": made.episodes.again,
     }
     return bundle, about
 
@@ -107,9 +85,14 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     moving_robot(pipeline)  # before anything is read
     path, run_dir = _find_parameters(pipeline, config, root, run_dir)
     identification = None if path is None else open_identification(path, pipeline)
-    if identification is not None:
-        _timing_of(identification)  # without it a folder is not made
+    if identification is not None:  # what is refused is refused before a folder is made
+        timing_of(identification)
+        require_accepted(identification, config)
+        if identification.verdict.status != "accepted":
+            note(f"trains on an identification that is not accepted: {identification.verdict.status}")
     inputs = {} if path is None else {"parameters": path}
+    if config.explain:
+        return _explain(pipeline, config, identification, inputs, root, run_dir)
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         bundle, about = train(pipeline, config, identification)
         hashes = {name: sha256(file) for name, file in inputs.items()}
@@ -124,109 +107,52 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     return stage.result
 
 
-def _world(config: TrainConfig, identified: Identification | None) -> str | None:
-    """Return the world to train in.
+def _explain(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None,
+    inputs: Mapping[str, Path],
+    root: Path,
+    run_dir: Path | None,
+) -> StageFolder:
+    """Show what episodes are drawn from, in a folder of its own, and train nothing."""
+    with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:
+        episodes = prepare(pipeline, config, identification).episodes
+        for name, file in episodes.save(stage.folder).items():
+            stage.output(name, file)
+        from sim2real.view.episodes import picture  # matplotlib takes 0.5 s to import
 
-    Raises:
-        UsageError: When another one is asked for than was identified.
-    """
-    if identified is not None and config.world not in (None, identified.world):
-        own = repr(identified.world) if identified.world else "the robot's own"
-        raise UsageError(
-            f"these parameters are of another world, {own}, than {config.world!r}",
-            hint=f"identify with --world {config.world}, or train with --model nominal",
+        picture(stage.output("picture", "episodes.png"), episodes)
+        print(table(*parameter_rows(episodes)))
+        if episodes.noise:
+            print(table(*noise_rows(episodes)))
+        stage.summary(
+            {
+                "posterior": f"deviations times {episodes.widening:.1f}, for what the model leaves unexplained",
+                "timelines": episodes.timelines,
+                "episodes that end at a pause": episodes.cut,
+                "timelines drawn again": episodes.again,
+                "longest pause": f"{1e3 * episodes.longest_pause_s:.1f} ms",
+            }
         )
-    return config.world if identified is None else identified.world
+    return stage.result
 
 
-def model_values(
-    robot: Robot, identified: Identification | None, config: TrainConfig
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """Return the parameters to train on, and draws of the dynamics from their posterior, ``(K,)`` each.
-
-    Draws keep the correlations between parameters. Where the log leaves one open, draws are cut off at half and twice
-    its estimate.
-
-    Args:
-        robot: The robot, for its nominal parameters.
-        identified: What identify found; the nominal model needs none.
-        config: Which model, how far copies differ, and the seed.
-    """
-    if config.model == "nominal" or identified is None or identified.posterior is None:
-        return robot.nominal(), {}
-    rng = np.random.default_rng(config.seed)
-    drawn = identified.posterior.sample(rng, _DRAWS, config.randomise)
-    draws = {}
-    for p in identified.parameters:
-        if p.kind == "dynamics" and p.name in drawn:
-            value, error = p.estimate, config.randomise * number(p.standard_error)
-            size = abs(value) or 1e-9
-            lacking = np.sqrt(max(0.0, _LEAST_SPREAD**2 - (error / size) ** 2))
-            own = drawn[p.name] + lacking * size * rng.standard_normal(_DRAWS)
-            low, high = sorted((value / _MOST, value * _MOST))
-            draws[p.name] = np.clip(own, low, high)
-    return identified.values, draws
+def parameter_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
+    """Return the table of what is drawn of each parameter: rows and headers."""
+    rows = []
+    for p in episodes.parameters:
+        drawn = episodes.draws[p.name]
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        known = "" if p.low95 is None or p.high95 is None else f"[{p.low95:.4g}, {p.high95:.4g}]"
+        rows.append([p.name, p.value, known, f"[{low:.4g}, {high:.4g}]", p.unit, "left open by the log" * p.open])
+    return rows, ["parameter", "value", "95 % identified", "95 % drawn", "unit", ""]
 
 
-def _computation(
-    robot: Robot, identified: Identification | None, timing: Timing | None
-) -> tuple[dict[str, DelayDistribution], dict[str, int]]:
-    """Return how long each node's steps take, and how many were left out of each node as hiccups.
-
-    Raises:
-        Sim2RealError: When nothing says how long they take, or most of them are hiccups.
-    """
-    longest_s = _HICCUP / robot.rate_hz
-    computation, dropped = (timing or _timing_of(identified)).computation(longest_s)
-    if dropped:
-        steps = ", ".join(f"{count} of {name!r}" for name, count in dropped.items())
-        note(f"steps longer than {1e3 * longest_s:g} ms are no part of the timing that is trained with: {steps}")
-    return computation, dropped
-
-
-def _timing_of(identified: Identification | None) -> Timing:
-    """Return the timing of the recording that was identified from."""
-    if identified is None or identified.timing is None:
-        raise Sim2RealError(
-            "this identification does not say how long the robot's steps take: its timing.json is not beside it",
-            hint="name the folder that identify wrote, or run `sim2real identify` again",
-        )
-    return identified.timing
-
-
-def draw_timelines(nodes: Mapping[str, BaseNode], supervisor: str, config: TrainConfig) -> tuple[Timeline, int]:
-    """Draw timelines without long pauses of the policy.
-
-    Args:
-        nodes: The graph.
-        supervisor: The node whose steps the policy makes.
-        config: How many timelines of which length, and the seed.
-
-    Returns:
-        The timelines, and how many were drawn again.
-
-    Raises:
-        Sim2RealError: When most timelines have a pause.
-    """
-    rng = np.random.default_rng(config.seed)
-    timeline = draw(nodes, config.episode_s, config.timelines, rng)
-    redrawn = 0
-    while (bad := _hiccups(timeline, supervisor)).any():
-        redrawn += int(bad.sum())
-        if redrawn > 20 * config.timelines:
-            raise Sim2RealError(
-                "nearly every timeline drawn from this log holds a pause of the policy",
-                hint="record on a less busy machine, or train shorter episodes with --episode-s",
-            )
-        again = draw(nodes, config.episode_s, int(bad.sum()), rng)
-        timeline = Timeline.stack([timeline[~bad], again]) if (~bad).any() else again
-    return timeline, redrawn
-
-
-def _hiccups(timeline: Timeline, supervisor: str) -> np.ndarray:
-    vertex = timeline.vertices[supervisor]
-    gaps = np.diff(vertex.start[:, : int(vertex.count.min())], axis=1)
-    return gaps.max(axis=1) > _LONGEST_GAP * np.median(gaps)
+def noise_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
+    """Return the table of what readings have on top of the motion: rows and headers."""
+    rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in episodes.noise]
+    return rows, ["reading", "deviation", "step", "bias", "unit"]
 
 
 def _find_parameters(

@@ -71,24 +71,28 @@ class EnvState(NamedTuple):
 class GraphEnvironment:
     """A graph as an environment; each episode has a random one of the graph's timelines, and its own parameters.
 
-    An episode is truncated at the end of its timeline. If the graph has a world of a composed task, that task may end
-    the episode earlier.
+    An episode is truncated at the end of its timeline, or after as many policy steps as it is told. If the graph has a
+    world of a composed task, that task may end the episode earlier.
 
     Args:
         graph: The compiled graph, with the task's supervisor.
         task: The pipeline's task.
+        steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
 
     Raises:
         UsageError: When the supervisor makes several steps in one row of the timelines.
     """
 
-    def __init__(self, graph: CompiledGraph, task: TrainingTask) -> None:
+    def __init__(self, graph: CompiledGraph, task: TrainingTask, steps: np.ndarray | None = None) -> None:
         self.graph, self.task = graph, task
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high
         # One row less than the tables have, as the observation after an episode's last row is looked up in them too.
         # So no row is past their end, and no state has to be masked.
         self.length = graph.rows - 1
+        # The row of an episode's last step is not played: what the policy sees there is the final observation.
+        counts = graph.timeline.vertices[graph.supervisor].count if steps is None else steps
+        self._last = jnp.asarray(graph.last_row(np.asarray(counts)), jnp.int32)
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
         # Worlds of composed tasks have a method `ends`. Looked up by name: importing their class would import MuJoCo.
@@ -113,13 +117,14 @@ class GraphEnvironment:
         step_state, output = self.task.act(state.step_state, action)
         gs = self.graph.advance(state.graph, step_state, output, inside=True)
         reward = self.task.reward(gs, action)
-        second_half = gs.step > self.length // 2
+        last = self._last[gs.eps]
+        second_half = gs.step > last // 2
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
         terminated = jnp.any(jnp.array([e[0] for e in ended], bool))
-        truncated: Any = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
+        truncated: Any = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
-        metrics = {"return": total, "success": good / (self.length - self.length // 2)}
+        metrics = {"return": total, "success": good / (last - last // 2)}
         new = EnvState(gs, step_state, total, good)
         return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)

@@ -10,6 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment, Scores
+from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.artifacts.timing import Timing
@@ -30,6 +31,7 @@ from sim2real.view.blocks import (
     number,
     spoken,
 )
+from sim2real.view.episodes import episodes_svg
 from sim2real.view.identify_section import identify_section
 from sim2real.view.servos import DRY, servo_blocks
 from sim2real.view.signals import Signals, signals_of, simulated_series
@@ -73,7 +75,27 @@ def train_section(artifact: StageFolder) -> PageSection:
     rows = [[str(seed), number(float(curves.returns[-1, seed])), f"{last[seed]:.1%}"] for seed in range(seeds)]
     table = TableBlock("Each seed at the end", ("seed", "return", "success"), rows)
     lead = "A policy for the identified model, with the timing of the robot."
-    return PageSection("train", "Train", lead, tiles, [figure, table, *about(artifact)])
+    return PageSection("train", "Train", lead, tiles, [figure, table, *_drawn_blocks(artifact), *about(artifact)])
+
+
+def _drawn_blocks(artifact: StageFolder) -> list[Block]:
+    """Return what episodes were drawn from; nothing where an older version trained."""
+    if "episodes" not in artifact.outputs:
+        return []
+    drawn = Episodes.load(artifact.folder)
+    if not drawn.parameters and not drawn.drawn_s:
+        return [NoteBlock("All episodes had the same parameters, without delays.")]
+    caption = (
+        "What episodes were drawn from: parameters beside the 95 % interval that was identified, times beside those of "
+        "the recording, noise beside how far it lay off the model. For what the model leaves unexplained, the "
+        f"posterior's deviations are {drawn.widening:.1f} times as wide."
+    )
+    if drawn.cut or drawn.again:
+        caption += (
+            f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that training cannot "
+            f"hold; {drawn.again} were drawn again, as it came in their first half."
+        )
+    return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
 
 
 def deploy_section(artifact: StageFolder) -> PageSection:

@@ -43,8 +43,10 @@ def test_draws_stay_within_the_bounds(posterior):
     drawn = posterior.sample(np.random.default_rng(1), 5000, widen=30.0)
     for name, low, high in (("gain", 0.1, 40.0), ("offset", -3.0, 3.0), ("share", 0.01, 0.99)):
         assert drawn[name].shape == (5000,)
-        assert drawn[name].min() == pytest.approx(low)
-        assert drawn[name].max() == pytest.approx(high)
+        width = high - low
+        assert low - 1e-9 <= drawn[name].min() < low + 0.02 * width
+        assert high - 0.02 * width < drawn[name].max() <= high + 1e-9
+        assert len(np.unique(drawn[name])) > 4900, "no heap at a bound"
 
 
 def test_a_direction_without_spread_is_no_problem(posterior):

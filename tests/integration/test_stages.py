@@ -13,6 +13,7 @@ from live_robots import PATIENT, TINY, manifest_of
 import sim2real
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.run_folder import STAGES, finished, newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
@@ -91,6 +92,33 @@ def test_a_run_that_was_copied_goes_on_without_its_origin(completed, tmp_path, m
     assert cli.main(["report", str(run_dir)]) == 0
     before, after = (Bundle.load(run_dir / n) for n in ("train", "train.2"))
     assert all(np.array_equal(before.weights[n], after.weights[n]) for n in before.weights)
+    assert set(after.episodes.draws) == {"gain", "gravity", "damping", "friction", "round_trip_delay"}
+
+
+def test_training_on_what_is_not_accepted_must_be_asked_for(completed, tmp_path, capsys):
+    """And ``--explain`` shows what episodes are drawn from, and trains nothing."""
+    run_dir = tmp_path / "pendulum" / "copy"
+    shutil.copytree(completed, run_dir)
+    file = run_dir / "identify" / "parameters.json"
+    document = json.loads(file.read_text())
+    document["verdict"] = {"status": "hit a bound", "reasons": ["friction is at its bound"], "next": "widen it"}
+    document["parameters"][0]["verdict"] = "not identifiable"
+    file.write_text(json.dumps(document))
+    home = ["train", "pendulum", "--run", str(run_dir), "--runs", str(tmp_path), "--timelines=4", "--explain"]
+    assert cli.main(home) == 1
+    said = capsys.readouterr().err
+    assert all(
+        part in said for part in ("not accepted: hit a bound", "friction is at its bound", "widen it", "--force")
+    )
+    assert not (run_dir / "explain").exists()
+    assert cli.main([*home, "--force"]) == 0
+    shown = capsys.readouterr()
+    assert "trains on an identification that is not accepted" in shown.err
+    assert "left open by the log" in shown.out
+    assert (run_dir / "explain" / "episodes.png").stat().st_size > 10_000
+    drawn = Episodes.load(run_dir / "explain")
+    assert (drawn.timelines, {n.column for n in drawn.noise}) == (4, {"th", "thdot"})
+    assert not (run_dir / "train.2").exists()
 
 
 def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
@@ -117,7 +145,7 @@ def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
     ppo = replace(had["small"], total_steps=256)
     config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=ppo)
     nominal, about = sim2real.train(pendulum, replace(config, model="nominal"))
-    assert (nominal.contract.delays_s, about["hiccups left out"]) == ({}, 0)
+    assert (nominal.contract.delays_s, about["timelines drawn again"]) == ({}, 0)
     with pytest.raises(UsageError, match="needs an identification"):
         sim2real.train(had["robot"], config)
     with pytest.raises(UsageError, match="another world, the robot's own, than 'moon'"):

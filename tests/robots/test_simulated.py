@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from small_robot import SHEET
 
+from sim2real.artifacts.noise import Noise
 from sim2real.composer.mjx.environment import State
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import DelayParams
@@ -78,3 +80,49 @@ def test_the_actuator_passes_goals_on_and_holds_the_start_before():
     np.testing.assert_array_equal(at_rest.goal, [0.0, 0.0])
     gs = GraphState(params={"agent": AgentParams(start=jnp.array([0.5, -0.1]))})
     np.testing.assert_array_equal(actuator.init_output(None, gs).goal, np.float32([0.5, -0.1]))
+
+
+@pytest.fixture
+def noisy(pair):
+    """A sensor whose first position and second velocity scatter, and its readings of a joint that stands still."""
+    sensor = SimSensor("sensor", 50.0, pair.make_world())
+    sensor.noise = (Noise("position[0]", "rad", 0.02, 0.05, 0.3), Noise("velocity[1]", "rad/s", 0.4, 0.0, 0.0))
+    still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
+
+    def read(key, seq):
+        own = sensor.init_state(jax.random.fold_in(key, 7))
+        return sensor.step(StepState(key, own, DelayParams(), still, 0, seq, 0.0))[1]
+
+    return sensor, jax.jit(read)
+
+
+def test_readings_scatter_as_the_noise_says(noisy):
+    _, read = noisy
+    rows = jax.vmap(read, (None, 0))(jax.random.key(0), jnp.arange(4000))
+    position, velocity = np.asarray(rows.position), np.asarray(rows.velocity)
+    np.testing.assert_array_equal(position[:, 1], 2.0)
+    np.testing.assert_array_equal(velocity[:, 0], 3.0)
+    steps = position[:, 0] / 0.05
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-3)
+    assert position[:, 0].std() == pytest.approx(np.sqrt(0.02**2 + 0.05**2 / 12), rel=0.15)
+    assert velocity[:, 1].mean() == pytest.approx(4.0, abs=0.03)
+    assert velocity[:, 1].std() == pytest.approx(0.4, rel=0.05)
+    assert abs(np.corrcoef(velocity[1:, 1], velocity[:-1, 1])[0, 1]) < 0.06, "white"
+
+
+def test_a_bias_stays_for_an_episode(noisy):
+    _, read = noisy
+    keys = jax.random.split(jax.random.key(1), 400)
+    first, later = (np.asarray(jax.vmap(read, (0, None))(keys, k).position[:, 0]) for k in (3, 90))
+    assert (first - 1.0).std() == pytest.approx(0.3, rel=0.15)
+    assert np.corrcoef(first, later)[0, 1] > 0.95
+
+
+def test_noise_needs_random_numbers_and_without_it_readings_are_exact(noisy, pair):
+    sensor, _ = noisy
+    still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
+    with pytest.raises(UsageError, match="no random numbers"):
+        sensor.step(StepState(None, sensor.init_state(None), DelayParams(), still, 0, 0, 0.0))
+    exact = SimSensor("sensor", 50.0, pair.make_world())
+    _, message = exact.step(StepState(None, exact.init_state(None), DelayParams(), still, 0, 0, 0.0))
+    np.testing.assert_array_equal(message.position, [1.0, 2.0])

@@ -60,11 +60,15 @@ def test_a_time_limit_is_no_end(done, truncated):
 
 @pytest.mark.parametrize("ends", [(False, False), (True, False), (False, True)])
 def test_a_composed_task_ends_the_episode_of_its_graph(ends):
-    state = SimpleNamespace(step=jnp.int32(1), state={"world": None, "other": None})
+    state = SimpleNamespace(step=jnp.int32(1), eps=jnp.int32(0), state={"world": None, "other": None})
     heard = SimpleNamespace(seq=jnp.int32(0))
     nodes = {"world": SimpleNamespace(ends=lambda state: tuple(map(jnp.bool_, ends))), "other": SimpleNamespace()}
     graph = SimpleNamespace(
-        nodes=nodes, rows=9, advance=lambda *_, **__: state, observe=lambda gs, **_: (gs, heard, None)
+        nodes=nodes,
+        rows=9,
+        last_row=lambda steps: steps - 1,
+        advance=lambda *_, **__: state,
+        observe=lambda gs, **_: (gs, heard, None),
     )
     task = SimpleNamespace(
         observation_size=1,
@@ -75,7 +79,7 @@ def test_a_composed_task_ends_the_episode_of_its_graph(ends):
         reward=lambda gs, action: jnp.float32(0),
         success=lambda gs: jnp.bool_(False),
     )
-    env = GraphEnvironment(graph, task)
+    env = GraphEnvironment(graph, task, np.array([9]))
     before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0)
     step = env._step(before, jnp.zeros(1), jax.random.key(0))
     assert (bool(step.terminated), bool(step.truncated)) == ends

@@ -1,0 +1,119 @@
+"""The robots that training draws: joint, as wide as the recordings leave open, and no wider."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement, Quantity
+from sim2real.artifacts.posterior import Posterior
+from sim2real.errors import UsageError
+from sim2real.train.draws import COUNT, draw_robots, widened
+from sim2real.train.variation import VariationConfig
+
+NAMES = ("gain", "gravity", "sensor_delay", "actuator_delay", "zero")
+KINDS = ("dynamics", "dynamics", "delay", "delay", "measurement")
+SUM_S = 0.0005
+"""Deviation of the sum of both delays [s]; that of each is 10 ms."""
+
+
+@pytest.fixture
+def found():
+    """Gain and gravity are correlated, a log knows only the sum of the delays."""
+    covariance = np.zeros((5, 5))
+    covariance[:2, :2] = np.array([[1.0, 0.65], [0.65, 1.0]]) * 0.005**2
+    covariance[2:4, 2:4] = 0.01**2 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + SUM_S**2 / 4
+    covariance[4, 4] = 1.0
+    mean = np.array([np.log(20.0), np.log(100.0), 0.02, 0.025, 0.0])
+    low, high = mean - np.array([1.0, 1.0, 0.02, 0.025, 9.0]), mean + np.array([1.0, 1.0, 0.04, 0.035, 9.0])
+    transform = ("log", "log", "linear", "linear", "linear")
+    values = dict(zip(NAMES, (20.0, 100.0, 0.02, 0.025, 0.0), strict=True))
+    return Identification(
+        pipeline="pendulum",
+        logs=(),
+        verdict=Judgement("accepted", ()),
+        parameters=tuple(
+            Estimate(n, "1", kind, "", 1.0, values[n], "accepted") for n, kind in zip(NAMES, KINDS, strict=True)
+        ),
+        posterior=Posterior(NAMES, transform, mean, covariance, low, high),
+        widening=3.0,
+    )
+
+
+def drawn(found, randomise=1.0, **options):
+    values = found.values if found else {"gain": 2.0, "payload": 0.0}
+    return draw_robots(values, found, VariationConfig(**options), randomise, np.random.default_rng(0))
+
+
+def test_draws_are_as_correlated_and_as_narrow_as_the_posterior(found):
+    draws = drawn(found, misfit=False)
+    assert set(draws) == set(NAMES[:4]), "what belongs to the measurement is no robot's"
+    gain, gravity = np.log(draws["gain"]), np.log(draws["gravity"])
+    assert gain.std() == pytest.approx(0.005, rel=0.1)
+    assert np.corrcoef(gain, gravity)[0, 1] == pytest.approx(0.65, abs=0.06)
+
+
+def test_the_sum_of_the_delays_is_drawn_as_it_is_known(found):
+    draws = drawn(found, misfit=False)
+    total = draws["sensor_delay"] + draws["actuator_delay"]
+    assert total.mean() == pytest.approx(0.045, abs=1e-4)
+    assert total.std() == pytest.approx(SUM_S, rel=0.1)
+    assert draws["sensor_delay"].std() < SUM_S, "how they share it is left alone"
+
+
+@pytest.mark.parametrize(("options", "randomise", "factor"), [({}, 1.0, 3.0), ({"misfit": False}, 2.0, 2.0)])
+def test_what_the_model_leaves_unexplained_widens_the_draws(found, options, randomise, factor):
+    draws = drawn(found, randomise, **options)
+    assert np.log(draws["gain"]).std() == pytest.approx(factor * 0.005, rel=0.1)
+    assert (draws["sensor_delay"] + draws["actuator_delay"]).std() == pytest.approx(factor * SUM_S, rel=0.1)
+
+
+def test_what_differs_between_recordings_widens_them_too(found):
+    two = np.ones(2)
+    both = tuple(
+        Quantity(n, "1", two, two, mean, 0.0, between, 0.0, 1.0, False)
+        for n, mean, between in (("gain", 20.0, 0.4), (ROUND_TRIP, 0.045, 0.002))
+    )
+    draws = drawn(replace(found, aggregate=both), misfit=False)
+    assert np.log(draws["gain"]).std() == pytest.approx(np.hypot(0.005, 0.4 / 20.0), rel=0.1)
+    total = draws["sensor_delay"] + draws["actuator_delay"]
+    assert total.std() == pytest.approx(np.hypot(SUM_S, 0.002), rel=0.1)
+
+
+def test_a_parameter_that_is_open_is_drawn_from_all_of_its_bounds(found):
+    posterior = found.posterior
+    covariance = posterior.covariance.copy()
+    covariance[0, 0] = (2.0 / np.sqrt(12.0)) ** 2
+    covariance[0, 1] = covariance[1, 0] = 0.0
+    scale = np.log(drawn(replace(found, posterior=replace(posterior, covariance=covariance)))["gain"])
+    low, high = posterior.low[0], posterior.high[0]
+    assert low <= scale.min() < scale.max() <= high
+    shares = np.histogram(scale, 4, (low, high))[0] / COUNT
+    assert shares.min() > 0.18, "no heap at a bound"
+
+
+def test_a_point_estimate_a_uniform_range_and_a_data_sheet(found):
+    assert drawn(found, 0.0) == {}
+    assert drawn(None) == {}
+    uniform = drawn(found, uniform=0.3)
+    for name in NAMES[:4]:
+        value = found.values[name]
+        assert 0.7 * value <= uniform[name].min() < 0.75 * value
+        assert 1.25 * value < uniform[name].max() <= 1.3 * value
+    sheet = drawn(None, uniform=0.3, range={"payload": (0.0, 0.1)})
+    assert set(sheet) == {"gain", "payload"}
+    assert 0.0 <= sheet["payload"].min() < 0.01 < 0.09 < sheet["payload"].max() <= 0.1
+
+
+def test_what_cannot_be_drawn_is_refused(found):
+    with pytest.raises(UsageError, match=r"payload, which this model does not have"):
+        drawn(found, range={"payload": (0.0, 1.0)})
+    for wrong in ({"noise": -1.0}, {"uniform": 1.0}, {"range": {"gain": (2.0, 1.0)}}):
+        with pytest.raises(UsageError, match=r"vary\."):
+            VariationConfig(**wrong)
+
+
+def test_the_posterior_keeps_its_other_numbers(found):
+    wide = widened(found, 1.0)
+    np.testing.assert_array_equal(wide.mean, found.posterior.mean)
+    np.testing.assert_allclose(wide.covariance[:2, :2], found.posterior.covariance[:2, :2])
