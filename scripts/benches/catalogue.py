@@ -75,6 +75,17 @@ BENCHES = {
         ),
     ),
     "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
+    "randomise": Bench(
+        "randomise",
+        "success on hidden robots of policies that were trained on what identification knows, and on less",
+        (
+            *_GRAPH,
+            "sim2real/identify",
+            "sim2real/train",
+            "sim2real/stages/prepared.py",
+            "scripts/benches/hidden_robots.py",
+        ),
+    ),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
 }

@@ -21,7 +21,13 @@ QUICK = {
     "no_nominal": True,
     "flags": [
         *("--record.duration-s=6", "--identify.generations=10", "--identify.population=8"),
-        *("--train.force", "--train.episode-s=2", "--train.timelines=4", "--train.ppo.total-steps=512", "--train.ppo.num-envs=16"),
+        *(
+            "--train.force",
+            "--train.episode-s=2",
+            "--train.timelines=4",
+            "--train.ppo.total-steps=512",
+            "--train.ppo.num-envs=16",
+        ),
         *("--train.ppo.minibatches=2", "--train.ppo.evaluations=1", "--train.ppo.eval-envs=4"),
         *("--deploy.episodes=1", "--deploy.duration-s=1"),
     ],

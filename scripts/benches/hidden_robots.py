@@ -1,0 +1,185 @@
+"""Pendulums that nobody has seen: drawn by chance, simulated without the package on a clock of their own.
+
+A disk on a servo, integrated in steps of 0.5 ms by hand. A loop of 50 Hz measures it late, with jitter, an encoder's
+counts and play, and commands it late; bus answers get lost. What is drawn stays here: the stages get a log, as of any
+robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.graph.episode import MessageRecord, StepRecord
+from sim2real.log.writer import McapRecorder
+
+RATE_HZ, STEP_S = 50.0, 5e-4
+COUNT_RAD, SPEED_COUNT_RAD_S = 2 * math.pi / 4096, 0.229 * 2 * math.pi / 60
+SHEET = {"gain": 26.96, "gravity": 129.5, "damping": 0.99, "friction": 6.1}
+"""About the pendulum's data sheet, around which robots are drawn: [rad/s^2/V], [rad/s^2], [1/s], [rad/s^2]."""
+SPREAD = 0.3
+_RETRY_S = 0.004
+Controller = Callable[[float, float], float]
+"""Angle [rad] and angular velocity [rad/s], as measured -> voltage [V]."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A robot; times in [s].
+
+    Attributes:
+        gain: Acceleration per volt [rad/s^2/V].
+        gravity: Largest acceleration by gravity [rad/s^2].
+        damping: Of the speed [1/s].
+        friction: Coulomb friction [rad/s^2].
+        sensing: Mean age of a measurement.
+        acting: Mean time from a command to the motor.
+        jitter: Deviation of each.
+        lost: Share of the answers that are lost, and asked for again.
+        play: Half of the encoder's backlash [rad].
+        seed: Of jitter and losses.
+    """
+
+    gain: float
+    gravity: float
+    damping: float
+    friction: float
+    sensing: float
+    acting: float
+    jitter: float
+    lost: float
+    play: float
+    seed: int
+
+    @staticmethod
+    def draw(seed: int) -> Hidden:
+        """Draw a robot: within 30 % of the data sheet, 10 to 60 ms late, a third each with losses, play, a payload."""
+        rng = np.random.default_rng([20261123, seed])
+        own = {n: v * rng.uniform(1 - SPREAD, 1 + SPREAD) for n, v in SHEET.items()}
+        total, share = rng.uniform(0.010, 0.060), rng.uniform(0.3, 0.7)
+        losses, play, payload = rng.random(3) < 1 / 3
+        if payload:  # the inertia grows, so that the motor gets weaker
+            own["gain"] *= 0.85
+        return Hidden(
+            **own,
+            sensing=share * total,
+            acting=(1 - share) * total,
+            jitter=rng.uniform(0.0, 0.003),
+            lost=0.02 * losses,
+            play=0.008 * play,
+            seed=seed,
+        )
+
+
+@dataclass(frozen=True)
+class Played:
+    """One session.
+
+    Attributes:
+        t: Shape ``(T,)``: times of the true motion [s].
+        angle: Shape ``(T,)``: true angle [rad]; 0 is upright.
+        speed: Shape ``(T,)`` [rad/s].
+        starts: Node -> starts of its steps ``(N,)`` [s].
+        ends: Node -> ends ``(N,)`` [s].
+        measured: Shape ``(N, 2)``: angle and angular velocity as the sensor sent them.
+        volts: Shape ``(N,)``: commands [V].
+    """
+
+    t: np.ndarray
+    angle: np.ndarray
+    speed: np.ndarray
+    starts: dict[str, np.ndarray]
+    ends: dict[str, np.ndarray]
+    measured: np.ndarray
+    volts: np.ndarray
+
+
+def play(robot: Hidden, controller: Controller, seconds: float, session: int) -> Played:
+    """Run a session from rest, hanging.
+
+    Args:
+        robot: The robot.
+        controller: What decides.
+        seconds: How long.
+        session: Its number: jitter and losses differ from one to the next.
+    """
+    rng = np.random.default_rng([robot.seed, session])
+    count, steps = int(seconds * RATE_HZ), int(seconds / STEP_S) + 1
+    angle, speed, encoder = np.zeros(steps), np.zeros(steps), np.zeros(steps)
+    angle[0] = encoder[0] = math.pi
+    t_step = np.arange(count) / RATE_HZ
+    took = {n: 1e-4 + rng.gamma(4.0, s, count) for n, s in (("sensor", 2e-4), ("agent", 3e-5), ("actuator", 1.5e-4))}
+    took["sensor"] += _RETRY_S * (rng.random(count) < robot.lost)
+    took["actuator"] += _RETRY_S * (rng.random(count) < robot.lost)
+    ages = np.maximum(rng.normal(robot.sensing, robot.jitter, count), 0.0)
+    lags = np.maximum(rng.normal(robot.acting, robot.jitter, count), 0.0)
+    begin_agent = t_step + took["sensor"]
+    begin_actuator = begin_agent + took["agent"]
+    sent = begin_actuator + took["actuator"]
+    acts = np.maximum.accumulate(sent + lags)
+    measured, volts = np.zeros((count, 2)), np.zeros(count)
+    now, done = 0, -1
+    for k in range(count):
+        while now * STEP_S < t_step[k] and now + 1 < steps:
+            while done + 1 < k and acts[done + 1] <= now * STEP_S:
+                done += 1
+            _advance(robot, angle, speed, encoder, now, volts[done] if done >= 0 else 0.0)
+            now += 1
+        at = max(0, min(now, round((t_step[k] - ages[k]) / STEP_S)))
+        measured[k] = (
+            round(encoder[at] / COUNT_RAD) * COUNT_RAD,
+            round(speed[at] / SPEED_COUNT_RAD_S) * SPEED_COUNT_RAD_S,
+        )
+        volts[k] = controller(*measured[k])
+    starts = {"sensor": t_step, "agent": begin_agent, "actuator": begin_actuator}
+    ends = {"sensor": begin_agent, "agent": begin_actuator, "actuator": sent}
+    times = np.arange(now + 1) * STEP_S
+    return Played(times, angle[: now + 1], speed[: now + 1], starts, ends, measured, volts)
+
+
+def _advance(robot: Hidden, angle: np.ndarray, speed: np.ndarray, encoder: np.ndarray, i: int, volts: float) -> None:
+    """Integrate one step: semi-implicit, with friction that stops what it can."""
+    pushed = robot.gain * volts + robot.gravity * math.sin(angle[i]) - robot.damping * speed[i]
+    free = speed[i] + STEP_S * pushed
+    speed[i + 1] = math.copysign(max(abs(free) - STEP_S * robot.friction, 0.0), free)
+    angle[i + 1] = angle[i] + STEP_S * speed[i + 1]
+    encoder[i + 1] = min(max(encoder[i], angle[i + 1] - robot.play), angle[i + 1] + robot.play)
+
+
+def excited(seconds: float, seed: int) -> Controller:
+    """Return a multisine of at most 1.8 V."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    tones, phases = np.linspace(0.2, 3.0, 24), rng.uniform(0, 2 * np.pi, 24)
+    signal = np.sin(2 * np.pi * tones * t[:, None] + phases).sum(axis=1)
+    rows = iter(1.8 * signal / np.abs(signal).max())
+    return lambda angle, speed: float(next(rows))
+
+
+def write(path: Path, session: Played) -> None:
+    """Write a session's log."""
+    nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}
+    graph = {
+        n: {"rate_hz": RATE_HZ, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
+        for n, s in nodes.items()
+    }
+    zero, none = np.float32(0), np.zeros(1, np.float32)
+    outputs = {"sensor": {"th": zero, "thdot": zero}, "agent": {"action": none}, "actuator": {"action": none}}
+    units = {"th": "rad", "thdot": "rad/s", "action": "V"}
+    metadata = {"pipeline": "pendulum", "graph": graph, "units": units}
+    recorder = McapRecorder(path, metadata, {}, outputs, [(n, s) for n, s in nodes.items() if s], {})
+    recorder.start(1_790_000_000_000_000_000, 0)
+    ticks = lambda seconds: round(1e6 * seconds)  # noqa: E731
+    for k, (measured, volts) in enumerate(zip(session.measured, session.volts, strict=True)):
+        sensed = {"th": np.float32(measured[0]), "thdot": np.float32(measured[1])}
+        sent = {"action": np.array([volts], np.float32)}
+        for node, sender in nodes.items():
+            start, end = ticks(session.starts[node][k]), ticks(session.ends[node][k])
+            recorder.step(StepRecord(node, k, start, start, start, -1, end, 0), sensed if node == "sensor" else sent)
+            if sender:
+                recorder.message(MessageRecord(node, sender, k, k, start, start))
+    recorder.close("finished", 0, {})

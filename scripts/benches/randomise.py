@@ -1,0 +1,160 @@
+"""Does identification pay in training? Hidden robots, each trained for in five ways, and judged on the robot itself."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from benches import hidden_robots as hidden
+from benches.figures import row
+
+RECORD_S, UPRIGHT = 40.0, 0.8
+"""Length of the recording [s]; share of the second half in which a deployment that succeeds is upright."""
+WAYS: dict[str, dict[str, Any]] = {
+    "data_sheet": {"model": "nominal"},
+    "uniform": {"model": "nominal", "uniform": 0.3},
+    "point": {"randomise": 0.0, "noise": 0.0, "pauses": False},
+    "posterior": {"misfit": False, "noise": 0.0, "pauses": False},
+    "all": {},
+}
+"""Data sheet; 30 % around it; what was identified; its posterior; that with misfit, timing and noise."""
+QUICK = {"robots": 1, "trials": 1, "seconds": 2.0, "steps": 512, "generations": 5, "record_s": 8.0, "envs": 16}
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--robots", type=int, default=20, help="hidden robots")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of them")
+    parser.add_argument("--trials", type=int, default=10, help="deployments of each policy")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a deployment")
+    parser.add_argument("--record-s", type=float, default=RECORD_S, help="length of the recording")
+    parser.add_argument("--volts", type=float, default=2.0, help="most that a policy may command")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps of a training")
+    parser.add_argument("--envs", type=int, default=256, help="copies of a training")
+    parser.add_argument("--generations", type=int, default=80, help="generations of the search")
+    parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS), help="what is trained on")
+    parser.add_argument("--jobs", type=int, default=1, help="robots at the same time, one process each")
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Record, identify, train and deploy for each robot."""
+    numbers = list(range(options.first, options.first + options.robots))
+    begin = time.perf_counter()
+    if options.jobs == 1:
+        found = [one_robot(n, options) for n in numbers]
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
+            found = list(pool.map(one_robot, numbers, [options] * len(numbers)))
+    return {"rows": rows(found, options, time.perf_counter() - begin), "robots": found}
+
+
+def rows(found: list[dict[str, Any]], options: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
+    """Return each way's share of success with its exact 95 % interval, all deployments of all robots together."""
+    lines = []
+    for way in options.ways:
+        good = np.array([np.array(robot["ways"][way]["success"]) >= UPRIGHT for robot in found])
+        test = binomtest(int(good.sum()), good.size).proportion_ci(method="exact")
+        name = f"randomise/{way}"
+        lines += [
+            row(f"{name}/success", good.mean(), f"of {good.size} deployments", "", ">= 0.95" if way == "all" else ""),
+            row(f"{name}/low95", test.low, "share"),
+            row(f"{name}/high95", test.high, "share"),
+            row(f"{name}/robots", int((good.mean(axis=1) >= 0.95).sum()), f"of {len(found)} with 95 %"),
+        ]
+    accepted = sum(robot["verdict"] == "accepted" for robot in found)
+    lines.append(row("randomise/accepted", accepted, f"of {len(found)} identifications"))
+    lines.append(row("randomise/robot_s", seconds * options.jobs / max(len(found), 1), "s"))
+    return lines
+
+
+def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Return what became of one robot.
+
+    Args:
+        number: Its number.
+        options: Flags of the bench.
+    """
+    import sim2real
+    from sim2real.artifacts.recording import Recording
+    from sim2real.stages.pipeline import load_pipeline
+
+    robot, pipeline = hidden.Hidden.draw(number), load_pipeline("pendulum")
+    session = hidden.play(robot, hidden.excited(options.record_s, number), options.record_s, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.mcap"
+        hidden.write(path, session)
+        config = replace(pipeline.identify, folds=0, generations=options.generations, seed=number)
+        identified = sim2real.identify(Recording.load(path), pipeline, config)
+    ways = {}
+    for way in options.ways:
+        begin = time.perf_counter()
+        bundle, about = sim2real.train(pipeline, train_config(pipeline, way, number, options), identified)
+        ways[way] = {
+            "success": [deployed(robot, bundle, options, 1 + trial) for trial in range(options.trials)],
+            "in simulation": about["success in simulation"],
+            "seconds": time.perf_counter() - begin,
+        }
+        print(f"robot {number}, {way}: {np.round(ways[way]['success'], 2)}", flush=True)
+    estimates = {p.name: p.estimate for p in identified.parameters}
+    return {
+        "number": number,
+        "verdict": identified.verdict.status,
+        "widening": identified.widening,
+        "identified": estimates,
+        "truth": vars(robot),
+        "ways": ways,
+    }
+
+
+def train_config(pipeline: Any, way: str, seed: int, options: argparse.Namespace) -> Any:
+    """Return the training's configuration for one of ``WAYS``."""
+    told = dict(WAYS[way])
+    top = {n: told.pop(n) for n in ("model", "randomise") if n in told}
+    ppo = replace(pipeline.train.ppo, total_steps=options.steps, num_envs=options.envs)
+    if options.envs < ppo.minibatches:
+        ppo = replace(ppo, minibatches=2, evaluations=1, eval_envs=4)
+    vary = replace(pipeline.train.vary, **told)
+    return replace(pipeline.train, seed=seed, force=True, vary=vary, ppo=ppo, **top)
+
+
+def deployed(robot: hidden.Hidden, bundle: Any, options: argparse.Namespace, session: int) -> float:
+    """Return the share of the second half in which the robot is upright under a policy."""
+    played = hidden.play(robot, controller(bundle, options.volts), options.seconds, session)
+    half = played.t >= options.seconds / 2
+    up = (np.cos(played.angle) > 0.95) & (np.abs(played.speed) < 0.5)
+    return float(up[half].mean())
+
+
+def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
+    """Return the policy as the robot runs it: cos, sin and speed, and the last four steps of these and of its voltage.
+
+    Args:
+        bundle: The trained policy.
+        volts: Its commands are cut off here [V].
+    """
+    from sim2real.policy.runner import NumpyBackend
+
+    backend = NumpyBackend(bundle.weights)
+    history = int(next(t.history for t in bundle.contract.observation if t.history > 1))
+    seen, sent = np.zeros((history, 3)), np.zeros(history)
+
+    def act(angle: float, speed: float) -> float:
+        now = np.array([np.cos(angle), np.sin(angle), speed / 10.0])
+        observation = np.concatenate([now, seen.ravel(), sent]).astype(np.float32)
+        command = float(np.clip(backend(observation)[0], -volts, volts))
+        seen[1:], sent[1:] = seen[:-1].copy(), sent[:-1].copy()
+        seen[0], sent[0] = now, command
+        return command
+
+    return act
