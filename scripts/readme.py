@@ -24,6 +24,7 @@ TABLES = {
     "so101": ("so101_cpu",),
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
     "league": ("league",),
+    "randomise": ("randomise",),
 }
 """Tables of README.md, and the reports that each is made of; one whose reports are not all there is left out."""
 LEAGUE_SETS = {
@@ -39,6 +40,13 @@ LEAGUE_ENTRANTS = {
     "pace": "PACE",
     "bam_m1": "BAM M1",
     "bam_m6": "BAM M6",
+}
+TRAINED_ON = {
+    "data_sheet": "the data sheet, without delays",
+    "uniform": "the data sheet, parameters 30 % up and down",
+    "point": "what was identified",
+    "posterior": "its posterior",
+    "all": "all that the log knows: posterior, misfit, timing, noise",
 }
 CLOSE_M = 0.02
 """How near the arm's tip must come to its target [m]."""
@@ -124,6 +132,21 @@ def league(report: Mapping[str, Any]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
+def randomise(report: Mapping[str, Any]) -> str:
+    """Return the table of the hidden robots: a line for what was trained on, with exact 95 % intervals."""
+    v = {r["name"].removeprefix("randomise/"): r["value"] for r in report["rows"]}
+    count, trials = len(report["robots"]), report["flags"]["trials"]
+    lines = [
+        (f"trained on, {count} hidden robots with {trials} deployments each", "upright", "95 %"),
+        ("---", "---:", "---:"),
+    ]
+    for way, about in TRAINED_ON.items():
+        if f"{way}/success" in v:
+            share, low, high = (100 * v[f"{way}/{n}"] for n in ("success", "low95", "high95"))
+            lines.append((about, f"{share:.0f} %", f"{low:.0f} to {high:.0f} %"))
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
 def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> str:
     """Return the table of an arm: the first seed of the run on a CPU, and training on an accelerator if measured."""
     seed = cpu["seeds"][0]
@@ -182,6 +205,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "so101": lambda own: arm("the SO-101: six servos with the parameters of a real one", *own.values()),
         "real": real_motors,
         "league": lambda own: league(own["league"]),
+        "randomise": lambda own: randomise(own["randomise"]),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
     own = {table: {name: reports[name] for name in names} for table, names in there.items()}

@@ -85,6 +85,16 @@ def test_train(run):
     assert report["machine"]["devices"]
 
 
+def test_randomise(run):
+    report = run("randomise", "--ways", "all")
+    found = {row["name"]: row["value"] for row in report["rows"]}
+    low, share, high = (found[f"randomise/all/{n}"] for n in ("low95", "success", "high95"))
+    assert 0.0 <= low <= share <= high <= 1.0
+    (robot,) = report["robots"]
+    assert 0.7 * 26 < robot["truth"]["gain"] < 1.3 * 28
+    assert robot["identified"]["gain"] == pytest.approx(robot["truth"]["gain"], rel=0.3)
+
+
 def test_async(run):
     assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
 
