@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
@@ -99,6 +100,11 @@ class LoopRobot(Robot):
     @abstractmethod
     def success(self, state: Any) -> jax.Array:
         """Return whether what ``judged`` returns is what the task wants, bool."""
+
+    def terminated(self, state: Any) -> jax.Array:
+        """Return whether what ``judged`` returns ends the episode, such as a fall, bool; default: nothing does."""
+        del state
+        return jnp.bool_(False)
 
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:

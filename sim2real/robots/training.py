@@ -49,6 +49,10 @@ class TrainableLoop(Protocol):
         """Return whether a state of the world is one that the task wants, bool."""
         ...
 
+    def terminated(self, state: Any) -> jax.Array:
+        """Return whether a state of the world ends the episode, bool."""
+        ...
+
 
 class LoopTask:
     """The training task of a robot in a loop; see ``sim2real.train.env.TrainingTask``.
@@ -96,6 +100,10 @@ class LoopTask:
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
         return self.robot.success(self.robot.judged(graph_state))
+
+    def terminated(self, graph_state: GraphState) -> jax.Array:
+        """Return whether the robot's episode ended."""
+        return self.robot.terminated(self.robot.judged(graph_state))
 
     def _draw(self, key: jax.Array) -> dict[str, Any]:
         return draw_values(key, self.values, self.draws, self.delay_spread_s)

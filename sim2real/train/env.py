@@ -11,6 +11,7 @@ import numpy as np
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
+from sim2real.train.tasks import EndingTask
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 class TrainingTask(Protocol):
     """The training task of a pipeline: observation, action, reward and success.
+
+    It may have more: ``sim2real.train.tasks`` has what.
 
     Attributes:
         supervisor: Name of the node whose steps the policy makes.
@@ -71,8 +74,9 @@ class EnvState(NamedTuple):
 class GraphEnvironment:
     """A graph as an environment; each episode has a random one of the graph's timelines, and its own parameters.
 
-    An episode is truncated at the end of its timeline. If the graph has a world of a composed task, that task may end
-    the episode earlier.
+    An episode is truncated at the end of its timeline: the value of what would have followed counts. A task with a
+    method ``terminated``, or a composed task in the graph's world, may end it earlier: nothing follows then. In what is
+    left of such an episode the task counts as not fulfilled.
 
     Args:
         graph: The compiled graph, with the task's supervisor.
@@ -96,6 +100,7 @@ class GraphEnvironment:
             name: getattr(node, "ends", None) for name, node in graph.nodes.items()
         }
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
+        self._terminated = task.terminated if isinstance(task, EndingTask) else None
 
     def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode on a random timeline."""
@@ -117,7 +122,8 @@ class GraphEnvironment:
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
-        terminated = jnp.any(jnp.array([e[0] for e in ended], bool))
+        fallen = [] if self._terminated is None else [self._terminated(gs)]
+        terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (self.length - self.length // 2)}

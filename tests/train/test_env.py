@@ -1,0 +1,78 @@
+"""A graph as an environment: what ends an episode, and what its end is worth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from advantages import slow
+
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.train.env import GraphEnvironment
+from sim2real.train.rollout import Rows
+from sim2real.train.update import gae
+
+FAST = 8.0
+"""A pendulum that turns faster has failed [rad/s]."""
+COPIES = 16
+
+
+@pytest.fixture(scope="module")
+def robot():
+    kind = type(load_pipeline("pendulum").load())
+
+    class Careful(kind):
+        def terminated(self, state):
+            return jnp.abs(state.thdot) > FAST
+
+    return Careful()
+
+
+@pytest.fixture(scope="module")
+def env(robot):
+    nodes, task = robot.training(robot.nominal(), {}, {}, False)
+    return GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, draw(nodes, 0.6)), task)
+
+
+@pytest.fixture(scope="module")
+def played(env):
+    """Episodes at full voltage, played on to the last row whatever ends them; and the speeds after each row."""
+
+    def play(key):
+        def row(state, _):
+            step = env.step(state, jnp.array([2.0]), key)
+            return step.state, (step._replace(state=step.state.graph.state["world"].thdot))
+
+        return jax.lax.scan(row, env.reset(key)[0], length=env.length)[1]
+
+    steps = jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(1), COPIES))
+    return jax.tree.map(lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1), steps)
+
+
+def test_a_robot_says_when_an_episode_has_ended(played):
+    fast = np.abs(played.state) > FAST
+    np.testing.assert_array_equal(played.terminated, fast)
+    assert 0.05 < fast.mean() < 0.95
+    np.testing.assert_array_equal(np.flatnonzero(played.truncated.all(1)), [len(played.truncated) - 1])
+
+
+def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
+    """Advantages of the environment's own rows, by the trainer and by the definition."""
+    rows, shape = played, played.reward.shape
+    value, following = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
+    ended = rows.terminated | rows.truncated
+    following[:-1][~ended[:-1]] = value[1:][~ended[:-1]]
+    empty = np.zeros((*shape, 0))
+    flags = (rows.terminated, rows.truncated, rows.valid)
+    made = Rows(empty, empty, *map(jnp.asarray, (rows.reward, *flags)), following=empty)
+    found = np.asarray(gae(made, jnp.asarray(value), jnp.asarray(following), 0.9, 0.8))
+    for i in range(COPIES):
+        expected = slow(*(leaf[:, i] for leaf in (rows.reward, *flags, value, following)), 0.9, 0.8)
+        valid = rows.valid[:, i]
+        np.testing.assert_allclose(found[valid, i], expected[valid], rtol=1e-4, atol=1e-4)
+
+
+def test_a_robot_that_says_nothing_never_ends_an_episode():
+    robot = load_pipeline("pendulum").load()
+    assert not robot.terminated(None)
