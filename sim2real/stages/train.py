@@ -86,6 +86,7 @@ def train(
         "model": config.model,
         "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
         "policy steps": int(result.env_steps[-1]) * ppo.num_seeds,
+        **({} if ppo.target is None else {"target": _target_reached(result, ppo.target)}),
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
         "train": f"{result.train_s:.1f} s",
@@ -258,6 +259,13 @@ def _report(bar: Any, p: Progress) -> None:
     bar.set_description_str("train")
     bar.update(1)
     bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
+
+
+def _target_reached(result: TrainResult, target: float) -> str:
+    best = result.history["success"][-1].max()
+    if best < target:
+        return f"{target:g} not reached: {best:.2f} at the end"
+    return f"{target:g} reached after {int(result.env_steps[-1]):,} policy steps of each seed"
 
 
 def _history(result: TrainResult) -> History:

@@ -105,6 +105,13 @@ def check_environment(env: TrainingEnvironment) -> None:
     _check_state(start, step.state)
 
 
+def metric_names(env: TrainingEnvironment) -> set[str]:
+    """Return the names of an environment's metrics, by tracing it."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    action = jax.ShapeDtypeStruct(np.shape(env.action_low), np.float32)
+    return set(jax.eval_shape(env.step, jax.eval_shape(env.reset, key)[0], action, key).metrics)
+
+
 def _check_state(start: object, after: object) -> None:
     """Compare the states that ``reset`` and ``step`` return, leaf by leaf."""
     if jax.tree.structure(start) != jax.tree.structure(after):

@@ -32,8 +32,8 @@ def test_gae_equals_the_definition(valid_share):
         following[t][pending] = following[t + 1][pending]
     rows = make_rows(reward, terminated, truncated, valid)
     found = np.asarray(gae(rows, jnp.asarray(value), jnp.asarray(following), GAMMA, LAMBDA))
-    expected = np.stack([slow(*(a[:, i] for a in (reward, terminated, truncated, valid, value, following)), GAMMA, LAMBDA)
-                         for i in range(shape[1])], axis=1)  # fmt: skip
+    rows_of = [[a[:, i] for a in (reward, terminated, truncated, valid, value, following)] for i in range(shape[1])]
+    expected = np.stack([slow(*copy, GAMMA, LAMBDA) for copy in rows_of], axis=1)
     assert terminated.any()
     assert truncated.any()
     np.testing.assert_allclose(found[valid], expected[valid], rtol=1e-4, atol=1e-5)
