@@ -12,7 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from sim2real.errors import UsageError
 from sim2real.hardware.config import GateLimits as GateLimits
 from sim2real.identify.config import FitConfig
-from sim2real.train.config import PPOConfig
+from sim2real.stages.learning import LearningConfig
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class IdentifyConfig(FitConfig):
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(LearningConfig):
     """Train a policy on the identified model with the robot's timing."""
 
     model: Literal["identified", "nominal"] = "identified"
@@ -137,8 +137,6 @@ class TrainConfig:
     """Copies differ in their parameters by this many standard errors of the identification, and at least by 2 %."""
     seed: int = 0
     """Seed of training."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """The learning algorithm."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything is compiled."""

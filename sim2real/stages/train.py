@@ -29,6 +29,7 @@ from sim2real.stages.console import note, progress, table
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
 from sim2real.stages.robot import moving_robot
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
@@ -48,15 +49,19 @@ def train(
     config: TrainConfig | None = None,
     identification: Identification | None = None,
     timing: Timing | None = None,
+    checkpoint: Path | None = None,
+    resume: Path | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
     Args:
         robot: The robot, or its pipeline.
-        config: How; default: that of the pipeline that loaded the robot. The file that it may name is not read.
+        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
         identification: What identify found; the nominal model needs none.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
             nominal model has no delays.
+        checkpoint: File that holds all of the training after each evaluation; None: none is written.
+        resume: Such a file, of the same training, to go on from.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -80,7 +85,8 @@ def train(
     env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
-        result = patiently(lambda: learn(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
+        key = jax.random.key(config.seed)
+        result = patiently(lambda: learn(env, ppo, key, lambda p: _report(bar, p), checkpoint, resume))
     bundle = Bundle(_contract(robot, task, values), result.best.to_weights(), _history(result))
     about = {
         "model": config.model,
@@ -106,13 +112,19 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
     """
     moving_robot(pipeline)  # before anything is read
+    interrupted = find_interrupted(pipeline.name, config, root)
+    run_dir = run_dir if interrupted is None else interrupted.run_dir
     path, run_dir = _find_parameters(pipeline, config, root, run_dir)
+    if interrupted is not None:
+        check_same_parameters(interrupted, path)
     identification = None if path is None else open_identification(path, pipeline)
     if identification is not None:
         _timing_of(identification)  # without it a folder is not made
     inputs = {} if path is None else {"parameters": path}
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
-        bundle, about = train(pipeline, config, identification)
+        resume = None if interrupted is None else interrupted.folder / CHECKPOINT
+        with resumable(stage.folder) as checkpoint:
+            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256

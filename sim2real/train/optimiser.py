@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from sim2real.train.config import PPOConfig
@@ -32,7 +33,7 @@ def get_rate(state: optax.OptState) -> jax.Array:
     return optax.tree_utils.tree_get(state, "learning_rate")
 
 
-def set_rate(state: optax.OptState, rate: jax.Array) -> optax.OptState:
+def set_rate(state: optax.OptState, rate: jax.Array | np.floating) -> optax.OptState:
     """Return an optimiser's state with another adaptive step size."""
     return optax.tree_utils.tree_set(state, learning_rate=rate)
 
