@@ -106,6 +106,10 @@ class LoopRobot(Robot):
         del state
         return jnp.bool_(False)
 
+    def true_state(self, state: Any) -> Any:
+        """Return what of ``judged`` a value function may see in simulation, a pytree of arrays; default: all of it."""
+        return state
+
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return parameters of world, sensor and actuator for an episode that begins in the middle of a recording.

@@ -121,6 +121,10 @@ class ServoRobot(LoopRobot):
         """Return the reward of a policy step: the task's, less a little for speed of the goals."""
         return state.reward - 0.01 * jnp.mean((action / self.servos.speed) ** 2)
 
+    def true_state(self, state: Any) -> Any:
+        """Return positions and velocities of all that moves in the model, and the task's variables."""
+        return state.data.qpos, state.data.qvel, state.variables
+
     def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
         """Return what the policy sees of the present, in the order of ``features``.
 

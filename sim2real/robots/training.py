@@ -53,6 +53,10 @@ class TrainableLoop(Protocol):
         """Return whether a state of the world ends the episode, bool."""
         ...
 
+    def true_state(self, state: Any) -> Any:
+        """Return what of a state of the world is worth knowing, a pytree of arrays."""
+        ...
+
 
 class LoopTask:
     """The training task of a robot in a loop; see ``sim2real.train.env.TrainingTask``.
@@ -104,6 +108,12 @@ class LoopTask:
     def terminated(self, graph_state: GraphState) -> jax.Array:
         """Return whether the robot's episode ended."""
         return self.robot.terminated(self.robot.judged(graph_state))
+
+    def privileged(self, graph_state: GraphState) -> jax.Array:
+        """Return what is true: the world's state, and the parameters that the episode has, shape ``(P,)``."""
+        known = (self.robot.true_state(self.robot.judged(graph_state)), graph_state.params)
+        numbers = [x for x in map(jnp.asarray, jax.tree.leaves(known)) if jnp.issubdtype(x.dtype, jnp.inexact)]
+        return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
 
     def _draw(self, key: jax.Array) -> dict[str, Any]:
         return draw_values(key, self.values, self.draws, self.delay_spread_s)

@@ -128,6 +128,9 @@ class _LoopInWorld(LoopRobot):
     def make_world(self, resumed: bool = False) -> BaseNode:
         return self.model.make_world(resumed)
 
+    def true_state(self, state: Any) -> Any:
+        return state  # of another kind than the robot's own
+
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
         del values  # of another model than the robot's own
 

@@ -58,6 +58,9 @@ class PPOConfig:
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of actor and value network."""
+    privileged: bool = False
+    """The value function sees the world's true state and the episode's parameters besides the observation, as it is
+    needed in simulation only; the policy sees the observation alone."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10

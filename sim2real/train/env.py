@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
-from sim2real.train.tasks import EndingTask
+from sim2real.train.tasks import EndingTask, PrivilegedTask
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -101,6 +102,19 @@ class GraphEnvironment:
         }
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
         self._terminated = task.terminated if isinstance(task, EndingTask) else None
+
+    def privileged(self, state: EnvState) -> jax.Array:
+        """Return what is true in a state, shape ``(P,)``.
+
+        Raises:
+            UsageError: The task does not say.
+        """
+        if not isinstance(self.task, PrivilegedTask):
+            raise UsageError(
+                f"a value function cannot see more than the policy in a {type(self.task).__name__}",
+                hint="give the task a method privileged(graph_state) -> (P,), or train without --ppo.privileged",
+            )
+        return self.task.privileged(state.graph)
 
     def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode on a random timeline."""

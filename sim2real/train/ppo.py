@@ -60,7 +60,7 @@ def train(
     _check_target(env, config)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jax.random.wrap_key_data(key)
-    state = make_start(env, config, key)
+    state = make_start(env, [config], key)
     lowered = jax.jit(jax.vmap(lambda state: _epoch(env, config, state)), donate_argnums=0).lower(state)
     now = Checkpoint(state, None, None, [])
     identity = TrainingIdentity.of(config, key, lowered) if checkpoint or resume else None

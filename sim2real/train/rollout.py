@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment
+from sim2real.train.protocol import TrainingEnvironment, get_privileged
 
 
 class Copies(NamedTuple):
@@ -38,6 +38,8 @@ class Rows(NamedTuple):
         truncated: Shape ``(T, N)``.
         valid: Shape ``(T, N)``.
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
+        privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
+        privileged_following: Shape ``(T, N, P)``: the same after the row.
     """
 
     observation: jax.Array
@@ -47,6 +49,8 @@ class Rows(NamedTuple):
     truncated: jax.Array
     valid: jax.Array
     following: jax.Array
+    privileged: jax.Array | None = None
+    privileged_following: jax.Array | None = None
 
 
 _Carry = tuple[Copies, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]
@@ -95,6 +99,7 @@ def collect(
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
     spread = jnp.exp(policy.log_std)
+    see = get_privileged(env, config)
     cut = 1 + jnp.arange(count) * config.eval_steps // count
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
@@ -111,6 +116,8 @@ def collect(
             truncated=truncated,
             valid=step.valid,
             following=step.observation,
+            privileged=None if see is None else jax.vmap(see)(now.state),
+            privileged_following=None if see is None else jax.vmap(see)(step.state),
         )
         return select(step.terminated | truncated, fresh, following), out
 

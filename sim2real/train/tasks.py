@@ -16,3 +16,12 @@ class EndingTask(Protocol):
     def terminated(self, graph_state: GraphState) -> jax.Array:
         """Return whether the episode ended in the graph's state after a row, bool of shape ``()``."""
         ...
+
+
+@runtime_checkable
+class PrivilegedTask(Protocol):
+    """A task that knows what a value function may see besides the policy's observation."""
+
+    def privileged(self, graph_state: GraphState) -> jax.Array:
+        """Return what is true in the graph's state, shape ``(P,)``, in any units."""
+        ...

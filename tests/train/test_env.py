@@ -73,6 +73,18 @@ def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
         np.testing.assert_allclose(found[valid, i], expected[valid], rtol=1e-4, atol=1e-4)
 
 
+def test_a_value_function_may_see_the_true_state_and_the_parameters(env):
+    state = jax.eval_shape(lambda key: env.reset(key)[0], jax.random.key(0))
+    made = {name: jax.tree.map(lambda x: jnp.full(x.shape, 3, x.dtype), p) for name, p in state.graph.params.items()}
+    graph = state.graph.replace(params=made)
+    world = graph.state["world"].replace(th=jnp.float32(0.5), thdot=jnp.float32(-2.0))
+    shown = env.privileged(state._replace(graph=graph.replace(state={**graph.state, "world": world})))
+    np.testing.assert_array_equal(shown[:2], [0.5, -2.0])
+    parameters = [leaf for leaf in jax.tree.leaves(graph.params) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert len(shown) == 2 + sum(leaf.size for leaf in parameters)
+    np.testing.assert_array_equal(shown[2:], 3.0)
+
+
 def test_a_robot_that_says_nothing_never_ends_an_episode():
     robot = load_pipeline("pendulum").load()
     assert not robot.terminated(None)
