@@ -140,6 +140,7 @@ class TrainConfig(LearningConfig):
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything is compiled."""
+        super().__post_init__()
         _check_seed(self.seed)
         if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
             raise UsageError(

@@ -34,6 +34,7 @@ from sim2real.stages.robot import moving_robot
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
+from sim2real.train.sweep import Sweep, named
 
 _LONGEST_GAP = 1.25
 """Timelines with a pause between policy steps longer than this many times the median are drawn again."""
@@ -85,13 +86,14 @@ def train(
     env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
-        key = jax.random.key(config.seed)
-        result = patiently(lambda: learn(env, ppo, key, lambda p: _report(bar, p), checkpoint, resume))
+        key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
+        result = patiently(lambda: learn(env, ppo, key, lambda p: _report(bar, p), checkpoint, resume, sweep))
     bundle = Bundle(_contract(robot, task, values), result.best.to_weights(), _history(result))
+    kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
-        "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
-        "policy steps": int(result.env_steps[-1]) * ppo.num_seeds,
+        "success in simulation": f"{result.history['success'].max():.2f} ({kept})",
+        "policy steps": int(result.env_steps[-1]) * len(result.members),
         **({} if ppo.target is None else {"target": _target_reached(result, ppo.target)}),
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
@@ -133,6 +135,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
             stage.output(name, file)
         if bundle.history is not None:
             print(table(*_rows(bundle.history)))
+            if bundle.history.settings:
+                print(table(*_tried(bundle.history)))
         stage.summary(about)
     return stage.result
 
@@ -273,6 +277,18 @@ def _report(bar: Any, p: Progress) -> None:
     bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
 
 
+def _tried(history: History) -> tuple[list[list[Any]], list[str]]:
+    """Return a row for each of the settings that were swept: success over its seeds, and return."""
+    rows = []
+    for setting in dict.fromkeys(history.settings):
+        own = [i for i, name in enumerate(history.settings) if name == setting]
+        success, returns = history.success[:, own], history.returns[:, own]
+        kept = "*" if history.best_seed in own else ""
+        last = success[-1]
+        rows.append([setting, *map(float, (last.mean(), last.min(), success.max(), returns[-1].mean())), kept])
+    return rows, ["settings", "success", "worst seed", "best so far", "return", "kept"]
+
+
 def _target_reached(result: TrainResult, target: float) -> str:
     best = result.history["success"][-1].max()
     if best < target:
@@ -291,6 +307,7 @@ def _history(result: TrainResult) -> History:
         compile_s=result.compile_s,
         train_s=result.train_s,
         env_steps_per_s=result.env_steps_per_s,
+        settings=tuple(map(named, result.members)) if any(result.members) else (),
         others=curves,
     )
 

@@ -24,6 +24,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
 from sim2real.train.result import Progress
+from sim2real.train.sweep import Sweep
 from sim2real.train.update import TrainState
 
 _ABOUT = "training"
@@ -62,15 +63,17 @@ class TrainingIdentity:
     program: str
 
     @staticmethod
-    def of(config: PPOConfig, key: jax.Array, lowered: Any) -> TrainingIdentity:
+    def of(config: PPOConfig, key: jax.Array, lowered: Any, sweep: Sweep) -> TrainingIdentity:
         """Describe a training.
 
         Args:
             config: Its settings.
             key: Its source of randomness.
             lowered: Its program, traced.
+            sweep: The settings that are swept.
         """
         settings = {n: v for n, v in dataclasses.asdict(config).items() if n not in _MAY_DIFFER}
+        settings |= {"sweep": dict(sweep.values)}
         digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()
         plain = json.loads(json.dumps(settings))  # as a file has them: lists for tuples
         return TrainingIdentity(plain, np.asarray(jax.random.key_data(key)).tolist(), digest)

@@ -8,20 +8,21 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
 
 
-def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig) -> None:
+def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig, names: list[str]) -> None:
     """Raise if a value is not finite or no episode ended; causes are checked before their consequences.
 
     Args:
         values: Name -> shape ``(num_seeds,)``, and ``finite_observation``, ``(num_seeds, O)``.
         env_steps: Number of rows so far.
         config: Settings.
+        names: Who is who, such as ``seed 0``.
 
     Raises:
         Sim2RealError: A value is not finite.
         UsageError: No evaluation episode ended.
     """
-    for seed in range(config.num_seeds):
-        when = f"(seed {seed}, within {env_steps} rows)"
+    for seed, name in enumerate(names):
+        when = f"({name}, within {env_steps} rows)"
         entries = np.flatnonzero(~values["finite_observation"][seed])
         if entries.size:
             raise Sim2RealError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,9 @@ from sim2real.train.result import Progress as Progress
 from sim2real.train.result import TrainResult as TrainResult
 from sim2real.train.result import best_of, history_of
 from sim2real.train.rollout import evaluate
-from sim2real.train.start import make_start
+from sim2real.train.start import make_start, swept_numbers
+from sim2real.train.sweep import Sweep as Sweep
+from sim2real.train.sweep import with_numbers
 from sim2real.train.update import TrainState, keys, make_policy, update
 
 
@@ -37,8 +40,9 @@ def train(
     on_progress: Callable[[Progress], None] | None = None,
     checkpoint: Path | None = None,
     resume: Path | None = None,
+    sweep: Sweep | None = None,
 ) -> TrainResult:
-    """Train ``num_seeds`` policies.
+    """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
     Args:
         env: One copy of the environment.
@@ -49,6 +53,7 @@ def train(
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
         resume: Such a file to go on from. The result is that of a training that was never interrupted, bit for bit on
             one machine.
+        sweep: Settings to try side by side; None: those of ``config``.
 
     Raises:
         UsageError: The environment breaks its protocol, no evaluation episode ended within ``eval_steps``, or what is
@@ -60,40 +65,61 @@ def train(
     _check_target(env, config)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jax.random.wrap_key_data(key)
-    state = make_start(env, [config], key)
-    lowered = jax.jit(jax.vmap(lambda state: _epoch(env, config, state)), donate_argnums=0).lower(state)
+    sweep = sweep or Sweep({})
+    state, numbers = make_start(env, sweep.configs(config), key), swept_numbers(sweep, config.num_seeds)
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), state))
+    lowered = jax.jit(one, donate_argnums=0).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
-    identity = TrainingIdentity.of(config, key, lowered) if checkpoint or resume else None
+    identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume else None
     if resume and identity:
         now = load_checkpoint(resume, identity, now.state, lowered.out_info[1])
     first, before_s = len(now.log), now.log[-1].elapsed_s if now.log else 0.0
-    epoch = lowered.compile()
+    epoch = partial(_advance, lowered.compile(), numbers, config, sweep.names(config.num_seeds), before_s - start)
     compiled = time.perf_counter()
     report = on_progress or (lambda _: None)
     for progress in now.log:
         report(progress)
     while not _is_over(config, now.log):
-        now = _advance(epoch, config, now, before_s - start)
+        now = epoch(now)
         if checkpoint and identity:
             save_checkpoint(checkpoint, identity, now)
         report(now.log[-1])
-    return _result(config, now, first, compiled - start, time.perf_counter() - compiled)
+    members = [point for point in sweep.grid for _ in range(config.num_seeds)]
+    return _result(members, now, first, compiled - start, time.perf_counter() - compiled)
 
 
-def _advance(epoch: Callable[[TrainState], Any], config: PPOConfig, now: Checkpoint, offset_s: float) -> Checkpoint:
-    """Return the training after its next evaluation; ``offset_s`` turns the clock into the time it took so far."""
-    state, policies, values = epoch(now.state)
+def _advance(
+    program: Callable[..., Any],
+    numbers: dict[str, np.ndarray],
+    config: PPOConfig,
+    names: list[str],
+    offset_s: float,
+    now: Checkpoint,
+) -> Checkpoint:
+    """Return the training after its next evaluation.
+
+    Args:
+        program: What ``_epoch`` was compiled to.
+        numbers: Its settings that are swept.
+        config: All settings.
+        names: Who is who on the leading axis.
+        offset_s: Turns the clock into the time that training took so far.
+        now: The training before.
+    """
+    state, policies, values = program(now.state, numbers)
     policies, values = jax.device_get((policies, values))
     count = len(now.log) + 1
     env_steps = count * config.updates_per_evaluation * config.steps_per_update
-    check_values(values, env_steps, config)
+    check_values(values, env_steps, config, names)
     del values["finite_observation"]
     log = [*now.log, Progress(count, config.evaluations, env_steps, time.perf_counter() + offset_s, values)]
     evaluation, seed = best_of(history_of(log))
     return Checkpoint(state, policies, policies[seed] if evaluation == count - 1 else now.best, log)
 
 
-def _result(config: PPOConfig, now: Checkpoint, first: int, compile_s: float, train_s: float) -> TrainResult:
+def _result(
+    members: list[dict[str, float]], now: Checkpoint, first: int, compile_s: float, train_s: float
+) -> TrainResult:
     """Return the result; ``first`` evaluations were made before this process."""
     log, history = now.log, history_of(now.log)
     trained = log[-1].env_steps - (log[first - 1].env_steps if first else 0)
@@ -101,10 +127,11 @@ def _result(config: PPOConfig, now: Checkpoint, first: int, compile_s: float, tr
         policies=jax.tree.map(jnp.asarray, now.policies),
         best=jax.tree.map(jnp.asarray, now.best),
         best_seed=best_of(history)[1],
+        members=members,
         history=history,
         env_steps=np.array([progress.env_steps for progress in log]),
         elapsed_s=np.array([progress.elapsed_s for progress in log]),
-        env_steps_per_s=config.num_seeds * trained / train_s,
+        env_steps_per_s=len(members) * trained / train_s,
         compile_s=compile_s,
         train_s=train_s,
     )

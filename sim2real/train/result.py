@@ -35,7 +35,9 @@ class TrainResult:
     Attributes:
         policies: The policies at the end; leaves have a leading seed axis.
         best: The policy with the highest success rate over all seeds and evaluations; of equals, the highest return.
-        best_seed: Its seed.
+        best_seed: Its seed; of a sweep, its place on the seed axis.
+        members: For each place on the seed axis, the settings that were swept; empty ones where none were. All seeds of
+            the first settings come first.
         history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; fewer evaluations than were
             asked for where the target was reached.
         env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
@@ -48,6 +50,7 @@ class TrainResult:
     policies: Policy
     best: Policy
     best_seed: int
+    members: list[dict[str, float]]
     history: dict[str, np.ndarray]
     env_steps: np.ndarray
     elapsed_s: np.ndarray

@@ -16,6 +16,7 @@ from sim2real.train.normaliser import Normaliser
 from sim2real.train.optimiser import make_optimiser, set_rate
 from sim2real.train.protocol import TrainingEnvironment, get_privileged
 from sim2real.train.rollout import Copies
+from sim2real.train.sweep import Sweep
 from sim2real.train.update import TrainState
 
 if TYPE_CHECKING:
@@ -46,6 +47,11 @@ def make_start(env: TrainingEnvironment, configs: Sequence[PPOConfig], key: jax.
     copies = _blank(Copies(*shapes), (members, first.num_envs))
     keys = keys if len(configs) == 1 else jnp.tile(keys, len(configs))
     return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys)
+
+
+def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, np.ndarray]:
+    """Return setting -> its value for each place on the leading axis, float32."""
+    return {n: np.repeat(np.array([point[n] for point in sweep.grid], np.float32), num_seeds) for n in sweep.values}
 
 
 def _networks(

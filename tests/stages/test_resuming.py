@@ -100,3 +100,19 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     found = stage.find_interrupted("pendulum", settings(own, own), runs)
     with pytest.raises(stage.UsageError, match="trains on other parameters than"):
         stage.check_same_parameters(found, other)
+
+
+def test_a_sweep_names_what_it_tried(tmp_path, capsys):
+    assert cli.main([*TINY, "--runs", str(tmp_path), "--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "gamma=0.9 " in said
+    assert "gamma=0.99 " in said
+    history = Bundle.load(folder(tmp_path)).history
+    assert history.settings == ("gamma=0.9",) * 2 + ("gamma=0.99",) * 2
+    assert history.returns.shape == (3, 4)
+    assert f"({history.settings[history.best_seed]}, seed {history.best_seed % 2})" in said
+
+
+def test_what_cannot_be_swept_is_refused_at_once(capsys):
+    assert cli.main([*TINY, "--sweep", "hidden=3,4"]) == 2
+    assert "hidden cannot be swept" in capsys.readouterr().err
