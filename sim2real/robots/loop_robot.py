@@ -27,6 +27,7 @@ from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, in_a_loop, simulated_loop
 from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
+from sim2real.train.tasks import Rewards
 
 
 class LoopRobot(Robot):
@@ -94,8 +95,11 @@ class LoopRobot(Robot):
         return graph_state.state[self.roles.world]
 
     @abstractmethod
-    def reward(self, state: Any, action: jax.Array) -> jax.Array:
-        """Return the reward of a policy step, from what ``judged`` returns after it and the action ``(actions,)``."""
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step, from what ``judged`` returns after it and the action ``(actions,)``.
+
+        A number, or terms by name whose sum it is: training shows what each of them adds up to.
+        """
 
     @abstractmethod
     def success(self, state: Any) -> jax.Array:

@@ -13,6 +13,7 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.policy.contract import ActionTerm
 from sim2real.robots.loop import draw_values
 from sim2real.robots.roles import Roles
+from sim2real.train.tasks import Rewards
 
 Draw = Callable[[jax.Array], dict[str, Any]]
 """Draws dynamics and delays of an episode, by name."""
@@ -41,8 +42,8 @@ class TrainableLoop(Protocol):
         """Return what reward and success are functions of."""
         ...
 
-    def reward(self, state: Any, action: jax.Array) -> jax.Array:
-        """Return the reward of a policy step."""
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step, or its terms by name."""
         ...
 
     def success(self, state: Any) -> jax.Array:
@@ -97,7 +98,7 @@ class LoopTask:
         """Return the agent's new step state and its message for an action."""
         return self.agent.act(step_state, action)
 
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
         """Return the robot's reward of a row."""
         return self.robot.reward(self.robot.judged(graph_state), action)
 

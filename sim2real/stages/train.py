@@ -35,6 +35,7 @@ from sim2real.train.env import GraphEnvironment
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 from sim2real.train.sweep import Sweep, named
+from sim2real.train.tasks import REWARD
 
 _LONGEST_GAP = 1.25
 """Timelines with a pause between policy steps longer than this many times the median are drawn again."""
@@ -135,6 +136,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
             stage.output(name, file)
         if bundle.history is not None:
             print(table(*_rows(bundle.history)))
+            if terms := _terms(bundle.history):
+                print(table(*terms))
             if bundle.history.settings:
                 print(table(*_tried(bundle.history)))
         stage.summary(about)
@@ -275,6 +278,17 @@ def _report(bar: Any, p: Progress) -> None:
     bar.set_description_str("train")
     bar.update(1)
     bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
+
+
+def _terms(history: History) -> tuple[list[list[Any]], list[str]] | None:
+    """Return what each named term of the reward added to the return of the kept policy's seed, at each evaluation."""
+    names = [name for name in history.others if name.startswith(REWARD)]
+    if not names:
+        return None
+    own = history.best_seed or 0
+    columns = [history.steps.astype(int), history.returns[:, own], *(history.others[name][:, own] for name in names)]
+    rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    return rows, ["steps", "return", *(f"of it {name.removeprefix(REWARD)}" for name in names)]
 
 
 def _tried(history: History) -> tuple[list[list[Any]], list[str]]:

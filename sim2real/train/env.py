@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
-from sim2real.train.tasks import EndingTask, PrivilegedTask
+from sim2real.train.tasks import REWARD, EndingTask, PrivilegedTask, Rewards, terms_of, total_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,8 +47,13 @@ class TrainingTask(Protocol):
         """Return the supervisor's new step state and its output for an action, shape ``(A,)``."""
         ...
 
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        """Return the reward of a row, shape ``()``, from the graph's state after it and the action."""
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
+        """Return the reward of a row, or its terms by name, each of shape ``()``.
+
+        Args:
+            graph_state: The graph's state after the row.
+            action: Shape ``(A,)``.
+        """
         ...
 
     def success(self, graph_state: GraphState) -> jax.Array:
@@ -63,12 +68,14 @@ class EnvState(NamedTuple):
         graph: The graph's state, run up to the supervisor's step of this row.
         step_state: What the supervisor sees.
         total: Sum of the rewards so far.
+        terms: The same of each term of the reward that has a name.
         good: Number of rows in the second half of the episode in which the task was fulfilled.
     """
 
     graph: GraphState
     step_state: StepState
     total: jax.Array
+    terms: dict[str, jax.Array]
     good: jax.Array
 
 
@@ -122,7 +129,8 @@ class GraphEnvironment:
         eps = jax.random.randint(k_eps, (), 0, self.graph.episodes)
         gs = self.graph.init(k_init, params=self.task.params(k_params), eps=eps)
         gs, step_state, _ = self.graph.observe(gs, inside=True)
-        state = EnvState(gs, step_state, jnp.float32(0.0), jnp.float32(0.0))
+        terms = terms_of(jax.eval_shape(self.task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
+        state = EnvState(gs, step_state, jnp.float32(0.0), {n: jnp.float32(0.0) for n in terms}, jnp.float32(0.0))
         return state, self.task.observe(step_state)
 
     def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
@@ -131,15 +139,18 @@ class GraphEnvironment:
         valid: Any = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)
         gs = self.graph.advance(state.graph, step_state, output, inside=True)
-        reward = self.task.reward(gs, action)
+        made = self.task.reward(gs, action)
+        reward = total_of(made)
         second_half = gs.step > self.length // 2
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
+        terms = {name: state.terms[name] + term for name, term in terms_of(made).items()}
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
         fallen = [] if self._terminated is None else [self._terminated(gs)]
         terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= self.length) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (self.length - self.length // 2)}
-        new = EnvState(gs, step_state, total, good)
+        metrics |= {f"{REWARD}{name}": term for name, term in terms.items()}
+        new = EnvState(gs, step_state, total, terms, good)
         return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)

@@ -52,7 +52,10 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
     for name, weights in whole.weights.items():
         np.testing.assert_array_equal(found.weights[name], weights)
     np.testing.assert_array_equal(found.history.returns, whole.history.returns)
-    assert "96" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "of it angle" in said
+    terms = [found.history.others[f"reward/{name}"] for name in ("angle", "speed", "voltage")]
+    np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
 
 
 def test_a_stage_folder_and_a_run_name_it_too(runs):

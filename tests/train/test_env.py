@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from advantages import slow
 
+from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.rollout import Rows
+from sim2real.train.tasks import terms_of, total_of
 from sim2real.train.update import gae
 
 FAST = 8.0
@@ -71,6 +73,26 @@ def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
         expected = slow(*(leaf[:, i] for leaf in (rows.reward, *flags, value, following)), 0.9, 0.8)
         valid = rows.valid[:, i]
         np.testing.assert_allclose(found[valid, i], expected[valid], rtol=1e-4, atol=1e-4)
+
+
+def test_named_terms_of_the_reward_add_up_to_the_return(played):
+    terms = {n.removeprefix("reward/"): v for n, v in played.metrics.items() if n.startswith("reward/")}
+    assert set(terms) == {"angle", "speed", "voltage"}
+    np.testing.assert_allclose(sum(terms.values()), played.metrics["return"], rtol=1e-5)
+    np.testing.assert_allclose(np.cumsum(played.reward, axis=0), played.metrics["return"], rtol=1e-5)
+    rows = np.arange(1, len(played.reward) + 1)[:, None]
+    np.testing.assert_allclose(terms["voltage"], np.broadcast_to(-0.04 * rows, played.reward.shape), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("reward", "total"), [(2.0, 2.0), ({"a": 2.0, "b": -3.0}, -1.0)])
+def test_a_reward_is_a_number_or_its_terms(reward, total):
+    assert total_of(reward) == total
+    assert terms_of(reward) == (reward if isinstance(reward, dict) else {})
+
+
+def test_a_reward_without_terms_is_refused():
+    with pytest.raises(UsageError, match=r"no terms[\s\S]*hint: return a number"):
+        total_of({})
 
 
 def test_a_value_function_may_see_the_true_state_and_the_parameters(env):
