@@ -20,6 +20,8 @@ class LearningConfig:
     sweep: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
     every seed, the best policy of all is kept."""
+    tensorboard: bool = False
+    """Write the curves for TensorBoard while training goes on, into the stage's folder 'tensorboard'."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
+from sim2real.artifacts.run_folder import OpenStage, StageFolder, newest, open_stage
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.delays import DelayDistribution
@@ -26,6 +27,7 @@ from sim2real.robots.base import Robot
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
+from sim2real.stages.events import event_files
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
@@ -53,6 +55,7 @@ def train(
     timing: Timing | None = None,
     checkpoint: Path | None = None,
     resume: Path | None = None,
+    watch: Callable[[Progress], None] | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
@@ -64,6 +67,7 @@ def train(
             nominal model has no delays.
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
         resume: Such a file, of the same training, to go on from.
+        watch: Called after each evaluation.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -88,7 +92,7 @@ def train(
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
         key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
-        result = patiently(lambda: learn(env, ppo, key, lambda p: _report(bar, p), checkpoint, resume, sweep))
+        result = patiently(lambda: learn(env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep))
     bundle = Bundle(_contract(robot, task, values), result.best.to_weights(), _history(result))
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
@@ -126,8 +130,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     inputs = {} if path is None else {"parameters": path}
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         resume = None if interrupted is None else interrupted.folder / CHECKPOINT
-        with resumable(stage.folder) as checkpoint:
-            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume)
+        with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
+            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume, watch=watch)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256
@@ -142,6 +146,14 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
                 print(table(*_tried(bundle.history)))
         stage.summary(about)
     return stage.result
+
+
+def _watching(stage: OpenStage, config: TrainConfig) -> AbstractContextManager[Callable[[Progress], None] | None]:
+    """Return what is called after each evaluation."""
+    if not config.tensorboard:
+        return nullcontext()
+    names = Sweep.parse(config.sweep).names(config.ppo.num_seeds)
+    return event_files(stage.output("tensorboard", "tensorboard"), names)
 
 
 def _world(config: TrainConfig, identified: Identification | None) -> str | None:
@@ -274,7 +286,9 @@ def _contract(robot: Robot, task: Any, values: Mapping[str, float]) -> PolicyCon
     )
 
 
-def _report(bar: Any, p: Progress) -> None:
+def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> None:
+    if watch is not None:
+        watch(p)
     bar.set_description_str("train")
     bar.update(1)
     bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")

@@ -23,8 +23,8 @@ def runs(tmp_path_factory):
     """Two runs: one that was interrupted after its second evaluation, and one that was not."""
     root, report = tmp_path_factory.mktemp("runs"), stage._report
 
-    def stop(bar, progress):
-        report(bar, progress)
+    def stop(bar, progress, watch):
+        report(bar, progress, watch)
         if progress.evaluation == 2:
             raise KeyboardInterrupt
 
