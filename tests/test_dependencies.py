@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "interop": {"sim2real.composer.interop.brax_env", "sim2real.composer.interop.vector_env"},
     "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.foreign"},
+    "tensorboard": {"sim2real.stages.events"},
     "warp": set(),  # MJX imports Warp itself
 }
 """Extra -> modules that import its packages. A scene is called by ``view.recording``, which has checked by then."""

@@ -98,10 +98,14 @@ class PendulumRobot(LoopRobot):
         hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
         return self.resumed_params(drawn, jnp.where(jax.random.bernoulli(k_where), hanging, anywhere))
 
-    def reward(self, state: Measurement, action: jax.Array) -> jax.Array:
+    def reward(self, state: Measurement, action: jax.Array) -> dict[str, jax.Array]:
         """Return minus the seed's cost: angle, speed that matters only near the top, and voltage."""
         th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
-        return -(th**2 + 0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2 + 0.01 * action[0] ** 2)
+        return {
+            "angle": -(th**2),
+            "speed": -0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2,
+            "voltage": -0.01 * action[0] ** 2,
+        }
 
     def success(self, state: Measurement) -> jax.Array:
         """Return whether the pendulum is upright."""

@@ -30,6 +30,7 @@ class History:
         compile_s: Time to compile [s].
         train_s: Time to train and evaluate [s].
         env_steps_per_s: Steps of all seeds per second.
+        settings: What was tried, for each curve, in words; empty: all have the same settings.
         others: Further curves ``(K, seeds)`` by name.
     """
 
@@ -41,6 +42,7 @@ class History:
     compile_s: float | None = None
     train_s: float | None = None
     env_steps_per_s: float | None = None
+    settings: tuple[str, ...] = ()
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -52,6 +54,7 @@ class History:
             check(curve.ndim == 2 and curve.shape == self.returns.shape, "curves of mixed sizes")
             check(len(curve) == count, f"curves of {len(curve)} for {count} evaluations")
         best = self.best_seed
+        check(len(self.settings) in (0, self.returns.shape[1]), f"{len(self.settings)} settings of the curves")
         check(best is None or 0 <= best < self.returns.shape[1], f"no curve of seed {best}")
 
     def save(self, path: Path) -> None:

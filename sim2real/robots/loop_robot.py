@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
@@ -26,6 +27,7 @@ from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, drawn_in_a_loop, in_a_loop, simulated_loop
 from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
+from sim2real.train.tasks import Rewards
 
 
 class LoopRobot(Robot):
@@ -94,12 +96,24 @@ class LoopRobot(Robot):
         return graph_state.state[self.roles.world]
 
     @abstractmethod
-    def reward(self, state: Any, action: jax.Array) -> jax.Array:
-        """Return the reward of a policy step, from what ``judged`` returns after it and the action ``(actions,)``."""
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step, from what ``judged`` returns after it and the action ``(actions,)``.
+
+        A number, or terms by name whose sum it is: training shows what each of them adds up to.
+        """
 
     @abstractmethod
     def success(self, state: Any) -> jax.Array:
         """Return whether what ``judged`` returns is what the task wants, bool."""
+
+    def terminated(self, state: Any) -> jax.Array:
+        """Return whether what ``judged`` returns ends the episode, such as a fall, bool; default: nothing does."""
+        del state
+        return jnp.bool_(False)
+
+    def true_state(self, state: Any) -> Any:
+        """Return what of ``judged`` a value function may see in simulation, a pytree of arrays; default: all of it."""
+        return state
 
     @abstractmethod
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from sim2real.robots.parts import GoalTask
 from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
 from sim2real.robots.training import Draw
+from sim2real.train.tasks import Rewards
 
 _AT_HOME_RAD, _HOME_RAD_S, _HOLD_S, _AFTER_S = 0.1, 1.0, 0.5, 1.0
 
@@ -117,9 +118,13 @@ class ServoRobot(LoopRobot):
         emulator = replace(emulator, model_number=s.sheet.model_number)
         return Embedded("sim2real.hardware.twin:TwinPlant", emulator, arguments)
 
-    def reward(self, state: Any, action: jax.Array) -> jax.Array:
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
         """Return the reward of a policy step: the task's, less a little for speed of the goals."""
-        return state.reward - 0.01 * jnp.mean((action / self.servos.speed) ** 2)
+        return {"task": state.reward, "speed": -0.01 * jnp.mean((action / self.servos.speed) ** 2)}
+
+    def true_state(self, state: Any) -> Any:
+        """Return positions and velocities of all that moves in the model, and the task's variables."""
+        return state.data.qpos, state.data.qvel, state.variables
 
     def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
         """Return what the policy sees of the present, in the order of ``features``.

@@ -13,6 +13,7 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.policy.contract import ActionTerm
 from sim2real.robots.loop import draw_values
 from sim2real.robots.roles import Roles
+from sim2real.train.tasks import Rewards
 
 Draw = Callable[[jax.Array], dict[str, Any]]
 """Draws dynamics and delays of an episode, by name."""
@@ -41,12 +42,20 @@ class TrainableLoop(Protocol):
         """Return what reward and success are functions of."""
         ...
 
-    def reward(self, state: Any, action: jax.Array) -> jax.Array:
-        """Return the reward of a policy step."""
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step, or its terms by name."""
         ...
 
     def success(self, state: Any) -> jax.Array:
         """Return whether a state of the world is one that the task wants, bool."""
+        ...
+
+    def terminated(self, state: Any) -> jax.Array:
+        """Return whether a state of the world ends the episode, bool."""
+        ...
+
+    def true_state(self, state: Any) -> Any:
+        """Return what of a state of the world is worth knowing, a pytree of arrays."""
         ...
 
 
@@ -86,13 +95,23 @@ class LoopTask:
         """Return the agent's new step state and its message for an action."""
         return self.agent.act(step_state, action)
 
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
         """Return the robot's reward of a row."""
         return self.robot.reward(self.robot.judged(graph_state), action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
         return self.robot.success(self.robot.judged(graph_state))
+
+    def terminated(self, graph_state: GraphState) -> jax.Array:
+        """Return whether the robot's episode ended."""
+        return self.robot.terminated(self.robot.judged(graph_state))
+
+    def privileged(self, graph_state: GraphState) -> jax.Array:
+        """Return what is true: the world's state, and the parameters that the episode has, shape ``(P,)``."""
+        known = (self.robot.true_state(self.robot.judged(graph_state)), graph_state.params)
+        numbers = [x for x in map(jnp.asarray, jax.tree.leaves(known)) if jnp.issubdtype(x.dtype, jnp.inexact)]
+        return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
 
     def _draw(self, key: jax.Array) -> dict[str, Any]:
         return draw_values(key, self.values, self.draws)

@@ -26,6 +26,7 @@ from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.recorded import LoggedRobot
 from sim2real.robots.training import Draw
 from sim2real.train.env import TrainingTask
+from sim2real.train.tasks import EndingTask
 from sim2real.worlds.recorded import RecordedActuator
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)
@@ -127,6 +128,9 @@ class _LoopInWorld(LoopRobot):
     def make_world(self, resumed: bool = False) -> BaseNode:
         return self.model.make_world(resumed)
 
+    def true_state(self, state: Any) -> Any:
+        return state  # of another kind than the robot's own
+
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
         del values  # of another model than the robot's own
 
@@ -163,7 +167,8 @@ class _LoopInWorld(LoopRobot):
         def judged() -> Any:
             gs = GraphState(params=task.params(jax.random.key(0)))
             gs = gs.replace(state={node.name: node.init_state(None, gs)})
-            return task.reward(gs, jnp.asarray(task.action_low)), task.success(gs)
+            ended = task.terminated(gs) if isinstance(task, EndingTask) else None
+            return task.reward(gs, jnp.asarray(task.action_low)), task.success(gs), ended
 
         try:
             jax.eval_shape(judged)

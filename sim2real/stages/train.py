@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,22 +12,26 @@ import jax
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle, History
-from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
+from sim2real.artifacts.run_folder import OpenStage, StageFolder, newest, open_stage
 from sim2real.artifacts.timing import Timing
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
+from sim2real.stages.events import event_files
+from sim2real.stages.explaining import explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.prepared import prepare, require_accepted, timing_of
+from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
 from sim2real.stages.robot import moving_robot
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
+from sim2real.train.sweep import Sweep, named
+from sim2real.train.tasks import REWARD
 
 
 def train(
@@ -34,15 +39,21 @@ def train(
     config: TrainConfig | None = None,
     identification: Identification | None = None,
     timing: Timing | None = None,
+    checkpoint: Path | None = None,
+    resume: Path | None = None,
+    watch: Callable[[Progress], None] | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
     Args:
         robot: The robot, or its pipeline.
-        config: How; default: that of the pipeline that loaded the robot. The file that it may name is not read.
+        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
         identification: What identify found; the nominal model needs none.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
             nominal model has no delays.
+        checkpoint: File that holds all of the training after each evaluation; None: none is written.
+        resume: Such a file, of the same training, to go on from.
+        watch: Called after each evaluation.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -57,13 +68,18 @@ def train(
     made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
-        result = patiently(lambda: learn(made.env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
+        key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
+        result = patiently(
+            lambda: learn(made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep)
+        )
     contract = _contract(made.robot, made.env.task, made.values)
     bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes)
+    kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
-        "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
-        "policy steps": int(result.env_steps[-1]) * ppo.num_seeds,
+        "success in simulation": f"{result.history['success'].max():.2f} ({kept})",
+        "policy steps": int(result.env_steps[-1]) * len(result.members),
+        **({} if ppo.target is None else {"target": _target_reached(result, ppo.target)}),
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
         "train": f"{result.train_s:.1f} s",
@@ -83,7 +99,11 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
     """
     moving_robot(pipeline)  # before anything is read
+    interrupted = find_interrupted(pipeline.name, config, root)
+    run_dir = run_dir if interrupted is None else interrupted.run_dir
     path, run_dir = _find_parameters(pipeline, config, root, run_dir)
+    if interrupted is not None:
+        check_same_parameters(interrupted, path)
     identification = None if path is None else open_identification(path, pipeline)
     if identification is not None:  # what is refused is refused before a folder is made
         timing_of(identification)
@@ -92,9 +112,11 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
             note(f"trains on an identification that is not accepted: {identification.verdict.status}")
     inputs = {} if path is None else {"parameters": path}
     if config.explain:
-        return _explain(pipeline, config, identification, inputs, root, run_dir)
+        return explain(pipeline, config, identification, inputs, root, run_dir)
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
-        bundle, about = train(pipeline, config, identification)
+        resume = None if interrupted is None else interrupted.folder / CHECKPOINT
+        with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
+            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume, watch=watch)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256
@@ -103,56 +125,20 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
             stage.output(name, file)
         if bundle.history is not None:
             print(table(*_rows(bundle.history)))
+            if terms := _terms(bundle.history):
+                print(table(*terms))
+            if bundle.history.settings:
+                print(table(*_tried(bundle.history)))
         stage.summary(about)
     return stage.result
 
 
-def _explain(
-    pipeline: Pipeline,
-    config: TrainConfig,
-    identification: Identification | None,
-    inputs: Mapping[str, Path],
-    root: Path,
-    run_dir: Path | None,
-) -> StageFolder:
-    """Show what episodes are drawn from, in a folder of its own, and train nothing."""
-    with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:
-        episodes = prepare(pipeline, config, identification).episodes
-        for name, file in episodes.save(stage.folder).items():
-            stage.output(name, file)
-        from sim2real.view.episodes import picture  # matplotlib takes 0.5 s to import
-
-        picture(stage.output("picture", "episodes.png"), episodes)
-        print(table(*parameter_rows(episodes)))
-        if episodes.noise:
-            print(table(*noise_rows(episodes)))
-        stage.summary(
-            {
-                "posterior": f"deviations times {episodes.widening:.1f}, for what the model leaves unexplained",
-                "timelines": episodes.timelines,
-                "episodes that end at a pause": episodes.cut,
-                "timelines drawn again": episodes.again,
-                "longest pause": f"{1e3 * episodes.longest_pause_s:.1f} ms",
-            }
-        )
-    return stage.result
-
-
-def parameter_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
-    """Return the table of what is drawn of each parameter: rows and headers."""
-    rows = []
-    for p in episodes.parameters:
-        drawn = episodes.draws[p.name]
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        known = "" if p.low95 is None or p.high95 is None else f"[{p.low95:.4g}, {p.high95:.4g}]"
-        rows.append([p.name, p.value, known, f"[{low:.4g}, {high:.4g}]", p.unit, "left open by the log" * p.open])
-    return rows, ["parameter", "value", "95 % identified", "95 % drawn", "unit", ""]
-
-
-def noise_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
-    """Return the table of what readings have on top of the motion: rows and headers."""
-    rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in episodes.noise]
-    return rows, ["reading", "deviation", "step", "bias", "unit"]
+def _watching(stage: OpenStage, config: TrainConfig) -> AbstractContextManager[Callable[[Progress], None] | None]:
+    """Return what is called after each evaluation."""
+    if not config.tensorboard:
+        return nullcontext()
+    names = Sweep.parse(config.sweep).names(config.ppo.num_seeds)
+    return event_files(stage.output("tensorboard", "tensorboard"), names)
 
 
 def _find_parameters(
@@ -180,10 +166,42 @@ def _contract(robot: Robot, task: Any, values: Mapping[str, float]) -> PolicyCon
     )
 
 
-def _report(bar: Any, p: Progress) -> None:
+def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> None:
+    if watch is not None:
+        watch(p)
     bar.set_description_str("train")
     bar.update(1)
     bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
+
+
+def _terms(history: History) -> tuple[list[list[Any]], list[str]] | None:
+    """Return what each named term of the reward added to the return of the kept policy's seed, at each evaluation."""
+    names = [name for name in history.others if name.startswith(REWARD)]
+    if not names:
+        return None
+    own = history.best_seed or 0
+    columns = [history.steps.astype(int), history.returns[:, own], *(history.others[name][:, own] for name in names)]
+    rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    return rows, ["steps", "return", *(f"of it {name.removeprefix(REWARD)}" for name in names)]
+
+
+def _tried(history: History) -> tuple[list[list[Any]], list[str]]:
+    """Return a row for each of the settings that were swept: success over its seeds, and return."""
+    rows = []
+    for setting in dict.fromkeys(history.settings):
+        own = [i for i, name in enumerate(history.settings) if name == setting]
+        success, returns = history.success[:, own], history.returns[:, own]
+        kept = "*" if history.best_seed in own else ""
+        last = success[-1]
+        rows.append([setting, *map(float, (last.mean(), last.min(), success.max(), returns[-1].mean())), kept])
+    return rows, ["settings", "success", "worst seed", "best so far", "return", "kept"]
+
+
+def _target_reached(result: TrainResult, target: float) -> str:
+    best = result.history["success"][-1].max()
+    if best < target:
+        return f"{target:g} not reached: {best:.2f} at the end"
+    return f"{target:g} reached after {int(result.env_steps[-1]):,} policy steps of each seed"
 
 
 def _history(result: TrainResult) -> History:
@@ -197,6 +215,7 @@ def _history(result: TrainResult) -> History:
         compile_s=result.compile_s,
         train_s=result.train_s,
         env_steps_per_s=result.env_steps_per_s,
+        settings=tuple(map(named, result.members)) if any(result.members) else (),
         others=curves,
     )
 

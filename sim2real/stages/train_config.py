@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
+from sim2real.stages.learning import LearningConfig
 from sim2real.train.variation import VariationConfig
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(LearningConfig):
     """Train a policy on the identified model with the robot's timing."""
 
     model: Literal["identified", "nominal"] = "identified"
@@ -34,11 +34,10 @@ class TrainConfig:
     """In what they differ."""
     seed: int = 0
     """Seed of training."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """The learning algorithm."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything is compiled."""
+        super().__post_init__()
         check_seed(self.seed)
         if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
             raise UsageError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 from sim2real.errors import UsageError
 
@@ -24,12 +25,21 @@ class PPOConfig:
     """Number of rows (environment steps) that each copy plays between two updates."""
     total_steps: int = 1_000_000
     """Total number of rows per seed, over all copies; rounded up to whole updates and evaluations."""
+    target: float | None = None
+    """Success, 0 to 1, at which training ends: at the first evaluation where the best seed, whose policy is kept,
+    reaches it; default: train to the end."""
     epochs: int = 4
     """Number of passes over the rows of a rollout in one update."""
     minibatches: int = 32
     """Number of minibatches in a pass; the copies are divided among them, so it must divide num_envs."""
     learning_rate: float = 2e-3
-    """Adam's step size at the start; it falls linearly to 5 % of this value."""
+    """Adam's step size at the start."""
+    schedule: Literal["linear", "adaptive"] = "linear"
+    """How the step size goes on: linearly down to 5 % of it, or adapted after each minibatch so that the policy moves
+    by about target_kl from the one that played: divided by 1.5 above twice that, multiplied below half of it, within
+    1e-5 and 1e-2."""
+    target_kl: float = 0.01
+    """KL divergence from the policy that played, within an update, that an adaptive step size aims at [nat]."""
     gamma: float = 0.99
     """Discount per policy step."""
     gae_lambda: float = 0.95
@@ -48,6 +58,9 @@ class PPOConfig:
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of actor and value network."""
+    privileged: bool = False
+    """The value function sees the world's true state and the episode's parameters besides the observation, as it is
+    needed in simulation only; the policy sees the observation alone."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10
@@ -61,16 +74,20 @@ class PPOConfig:
         """Check that all values are in their ranges."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(field.default, int) and (not isinstance(value, int) or value < 1):
+            if type(field.default) is int and (not isinstance(value, int) or value < 1):
                 raise UsageError(f"{field.name} must be an integer of at least 1, got {value!r}")
             if isinstance(field.default, float) and not math.isfinite(value):
                 raise UsageError(f"{field.name} must be finite, got {value!r}")
-        for name in ("learning_rate", "clip", "value_clip", "max_grad_norm", "reward_scale"):
+        for name in ("learning_rate", "target_kl", "clip", "value_clip", "max_grad_norm", "reward_scale"):
             if getattr(self, name) <= 0:
                 raise UsageError(f"{name} must be above 0, got {getattr(self, name)}")
         for name in ("gamma", "gae_lambda"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        if self.schedule not in ("linear", "adaptive"):
+            raise UsageError(f"schedule must be 'linear' or 'adaptive', got {self.schedule!r}")
+        if self.target is not None and not 0 < self.target <= 1:
+            raise UsageError(f"target must lie in (0, 1], got {self.target}", hint="it is a share of success")
         for name in ("entropy_coef", "value_coef"):
             if getattr(self, name) < 0:
                 raise UsageError(f"{name} must be at least 0, got {getattr(self, name)}")

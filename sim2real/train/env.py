@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
+from sim2real.train.tasks import REWARD, EndingTask, PrivilegedTask, Rewards, terms_of, total_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 
 class TrainingTask(Protocol):
     """The training task of a pipeline: observation, action, reward and success.
+
+    It may have more: ``sim2real.train.tasks`` has what.
 
     Attributes:
         supervisor: Name of the node whose steps the policy makes.
@@ -43,8 +47,13 @@ class TrainingTask(Protocol):
         """Return the supervisor's new step state and its output for an action, shape ``(A,)``."""
         ...
 
-    def reward(self, graph_state: GraphState, action: jax.Array) -> jax.Array:
-        """Return the reward of a row, shape ``()``, from the graph's state after it and the action."""
+    def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
+        """Return the reward of a row, or its terms by name, each of shape ``()``.
+
+        Args:
+            graph_state: The graph's state after the row.
+            action: Shape ``(A,)``.
+        """
         ...
 
     def success(self, graph_state: GraphState) -> jax.Array:
@@ -59,20 +68,23 @@ class EnvState(NamedTuple):
         graph: The graph's state, run up to the supervisor's step of this row.
         step_state: What the supervisor sees.
         total: Sum of the rewards so far.
+        terms: The same of each term of the reward that has a name.
         good: Number of rows in the second half of the episode in which the task was fulfilled.
     """
 
     graph: GraphState
     step_state: StepState
     total: jax.Array
+    terms: dict[str, jax.Array]
     good: jax.Array
 
 
 class GraphEnvironment:
     """A graph as an environment; each episode has a random one of the graph's timelines, and its own parameters.
 
-    An episode is truncated at the end of its timeline, or after as many policy steps as it is told. If the graph has a
-    world of a composed task, that task may end the episode earlier.
+    An episode is truncated at the end of its timeline, or after as many policy steps as it is told: the value of what
+    would have followed counts. A task with a method ``terminated``, or a composed task in the graph's world, may end it
+    earlier: nothing follows then. In what is left of such an episode the task counts as not fulfilled.
 
     Args:
         graph: The compiled graph, with the task's supervisor.
@@ -100,6 +112,20 @@ class GraphEnvironment:
             name: getattr(node, "ends", None) for name, node in graph.nodes.items()
         }
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
+        self._terminated = task.terminated if isinstance(task, EndingTask) else None
+
+    def privileged(self, state: EnvState) -> jax.Array:
+        """Return what is true in a state, shape ``(P,)``.
+
+        Raises:
+            UsageError: The task does not say.
+        """
+        if not isinstance(self.task, PrivilegedTask):
+            raise UsageError(
+                f"a value function cannot see more than the policy in a {type(self.task).__name__}",
+                hint="give the task a method privileged(graph_state) -> (P,), or train without --ppo.privileged",
+            )
+        return self.task.privileged(state.graph)
 
     def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode on a random timeline."""
@@ -107,7 +133,8 @@ class GraphEnvironment:
         eps = jax.random.randint(k_eps, (), 0, self.graph.episodes)
         gs = self.graph.init(k_init, params=self.task.params(k_params), eps=eps)
         gs, step_state, _ = self.graph.observe(gs, inside=True)
-        state = EnvState(gs, step_state, jnp.float32(0.0), jnp.float32(0.0))
+        terms = terms_of(jax.eval_shape(self.task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
+        state = EnvState(gs, step_state, jnp.float32(0.0), {n: jnp.float32(0.0) for n in terms}, jnp.float32(0.0))
         return state, self.task.observe(step_state)
 
     def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
@@ -116,15 +143,19 @@ class GraphEnvironment:
         valid: Any = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)
         gs = self.graph.advance(state.graph, step_state, output, inside=True)
-        reward = self.task.reward(gs, action)
+        made = self.task.reward(gs, action)
+        reward = total_of(made)
         last = self._last[gs.eps]
         second_half = gs.step > last // 2
         good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
         total = state.total + reward
+        terms = {name: state.terms[name] + term for name, term in terms_of(made).items()}
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
-        terminated = jnp.any(jnp.array([e[0] for e in ended], bool))
+        fallen = [] if self._terminated is None else [self._terminated(gs)]
+        terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (last - last // 2)}
-        new = EnvState(gs, step_state, total, good)
+        metrics |= {f"{REWARD}{name}": term for name, term in terms.items()}
+        new = EnvState(gs, step_state, total, terms, good)
         return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)

@@ -15,12 +15,14 @@ observation that is returned in that row). If both are set, the row counts as te
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
 
 
 class Step(NamedTuple):
@@ -78,6 +80,31 @@ class TrainingEnvironment(Protocol):
         ...
 
 
+@runtime_checkable
+class PrivilegedEnvironment(Protocol):
+    """An environment that can show a value function more than the policy sees."""
+
+    def privileged(self, state: Any) -> jax.Array:
+        """Return what is true in a state, shape ``(P,)``: the world's, and the episode's parameters."""
+        ...
+
+
+def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[Any], jax.Array] | None:
+    """Return what shows the value function more than the policy sees; None: it is not asked for.
+
+    Raises:
+        UsageError: It is asked for, and the environment cannot.
+    """
+    if not config.privileged:
+        return None
+    if not isinstance(env, PrivilegedEnvironment):
+        raise UsageError(
+            f"a value function cannot see more than the policy in a {type(env).__name__}: it has no `privileged`",
+            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged",
+        )
+    return env.privileged
+
+
 def check_environment(env: TrainingEnvironment) -> None:
     """Check shapes and dtypes of everything that ``env`` returns, by tracing it; nothing is compiled or run.
 
@@ -103,6 +130,13 @@ def check_environment(env: TrainingEnvironment) -> None:
             kind = "a bool" if name in flags else "a number"
             raise UsageError(f"step's {name} must be {kind} of shape (), got {leaf.dtype} of shape {leaf.shape}")
     _check_state(start, step.state)
+
+
+def metric_names(env: TrainingEnvironment) -> set[str]:
+    """Return the names of an environment's metrics, by tracing it."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    action = jax.ShapeDtypeStruct(np.shape(env.action_low), np.float32)
+    return set(jax.eval_shape(env.step, jax.eval_shape(env.reset, key)[0], action, key).metrics)
 
 
 def _check_state(start: object, after: object) -> None:

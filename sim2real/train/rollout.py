@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment
+from sim2real.train.protocol import TrainingEnvironment, get_privileged
 
 
 class Copies(NamedTuple):
@@ -38,6 +38,8 @@ class Rows(NamedTuple):
         truncated: Shape ``(T, N)``.
         valid: Shape ``(T, N)``.
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
+        privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
+        privileged_following: Shape ``(T, N, P)``: the same after the row.
     """
 
     observation: jax.Array
@@ -47,10 +49,12 @@ class Rows(NamedTuple):
     truncated: jax.Array
     valid: jax.Array
     following: jax.Array
+    privileged: jax.Array | None = None
+    privileged_following: jax.Array | None = None
 
 
-_Carry = tuple[Copies, jax.Array, jax.Array, dict[str, jax.Array]]
-"""Copies, which of them run, their returns, and their metrics."""
+_Carry = tuple[Copies, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]
+"""Copies, which of them run, which ended by themselves, their returns, and their metrics."""
 
 
 def select(mask: jax.Array, new: T, old: T) -> T:
@@ -95,6 +99,7 @@ def collect(
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
     spread = jnp.exp(policy.log_std)
+    see = get_privileged(env, config)
     cut = 1 + jnp.arange(count) * config.eval_steps // count
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
@@ -111,6 +116,8 @@ def collect(
             truncated=truncated,
             valid=step.valid,
             following=step.observation,
+            privileged=None if see is None else jax.vmap(see)(now.state),
+            privileged_following=None if see is None else jax.vmap(see)(step.state),
         )
         return select(step.terminated | truncated, fresh, following), out
 
@@ -129,24 +136,28 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
 
     Returns:
         ``return`` (sum of the unscaled rewards, unless the environment's metrics have one), the environment's metrics,
-        and ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows. Each of shape ``()``.
+        ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the
+        fraction of those that ended by themselves. Each of shape ``()``.
     """
     key_reset, key_step = jax.random.split(key)
     copies = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs)))
     names = jax.eval_shape(lambda key: env.step(env.reset(key)[0], policy.low, key).metrics, key)
     zeros = jnp.zeros(config.eval_envs)
-    start = (copies, jnp.ones(config.eval_envs, bool), zeros, {name: zeros for name in names})
+    running = jnp.ones(config.eval_envs, bool)
+    start = (copies, running, ~running, zeros, {name: zeros for name in names})
 
     def row(carry: _Carry, key: jax.Array) -> tuple[_Carry, None]:
-        copies, running, total, metrics = carry
+        copies, running, fallen, total, metrics = carry
         keys = jax.random.split(key, config.eval_envs)
         step = jax.vmap(env.step)(copies.state, jax.vmap(policy.get_action)(copies.observation), keys)
         ends = running & (step.terminated | step.truncated)
         total = total + jnp.where(running, step.reward, 0.0)
         metrics = {name: jnp.where(ends, value, metrics[name]) for name, value in step.metrics.items()}
-        return (Copies(step.state, step.observation), running & ~ends, total, metrics), None
+        fallen = fallen | (ends & step.terminated)
+        return (Copies(step.state, step.observation), running & ~ends, fallen, total, metrics), None
 
-    (_, running, total, metrics), _ = jax.lax.scan(row, start, jax.random.split(key_step, config.eval_steps))
+    (_, running, fallen, total, metrics), _ = jax.lax.scan(row, start, jax.random.split(key_step, config.eval_steps))
     share = jnp.mean(jnp.where(running, 0.0, 1.0))
-    mean = {name: jnp.mean(jnp.where(running, 0.0, v)) / share for name, v in ({"return": total} | metrics).items()}
+    figures = {"terminated": jnp.where(fallen, 1.0, 0.0), "return": total} | metrics
+    mean = {name: jnp.mean(jnp.where(running, 0.0, v)) / share for name, v in figures.items()}
     return mean | {"finished": share}

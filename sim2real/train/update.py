@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,22 +12,10 @@ import optax
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy, apply_mlp, entropy, log_prob
+from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
+from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.protocol import TrainingEnvironment
 from sim2real.train.rollout import Copies, Rows, collect
-
-
-class Normaliser(NamedTuple):
-    """Running mean and variance of the observations.
-
-    Attributes:
-        seen: Shape ``()``: number of observations so far.
-        mean: Shape ``(O,)``.
-        var: Shape ``(O,)``.
-    """
-
-    seen: jax.Array
-    mean: jax.Array
-    var: jax.Array
 
 
 class TrainState(NamedTuple):
@@ -36,6 +25,7 @@ class TrainState(NamedTuple):
         params: ``{"actor": Layers, "log_std": (A,), "value": Layers}``.
         optimiser: State of the optimiser.
         normaliser: Statistics of the observations so far.
+        privileged: Statistics of what the value function sees besides; None: it sees the observation alone.
         copies: The environments.
         update: Shape ``()``, int32: number of updates so far.
         key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
@@ -44,6 +34,7 @@ class TrainState(NamedTuple):
     params: dict[str, Any]
     optimiser: optax.OptState
     normaliser: Normaliser
+    privileged: Normaliser | None
     copies: Copies
     update: jax.Array
     key: jax.Array
@@ -58,6 +49,7 @@ class Batch(NamedTuple):
 
     Attributes:
         x: Shape ``(..., O)``: normalised observations.
+        critic: Shape ``(..., O + P)``: what the value function is given; None: it is ``x``.
         u: Shape ``(..., A)``: the policy's samples.
         log_prob: Shape ``(...)``: log density of ``u`` under the policy that drew it.
         value: Shape ``(...)``: value estimates before the update.
@@ -66,21 +58,12 @@ class Batch(NamedTuple):
     """
 
     x: jax.Array
+    critic: jax.Array | None
     u: jax.Array
     log_prob: jax.Array
     value: jax.Array
     advantage: jax.Array
     weight: jax.Array
-
-
-def make_optimiser(config: PPOConfig) -> optax.GradientTransformation:
-    """Return Adam with gradient clipping and a step size that falls linearly to 5 %.
-
-    It acts on one flat vector, which compiles and runs faster than a dozen small arrays.
-    """
-    steps = config.updates * config.epochs * config.minibatches
-    rate = optax.linear_schedule(config.learning_rate, 0.05 * config.learning_rate, steps)
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5)))
 
 
 def make_policy(env: TrainingEnvironment, params: dict[str, Any], normaliser: Normaliser) -> Policy:
@@ -99,18 +82,6 @@ def make_policy(env: TrainingEnvironment, params: dict[str, Any], normaliser: No
         low=jnp.asarray(env.action_low, jnp.float32),
         high=jnp.asarray(env.action_high, jnp.float32),
     )
-
-
-def update_normaliser(normaliser: Normaliser, rows: Rows) -> Normaliser:
-    """Return the statistics with the valid rows' observations added (parallel variance, Chan et al. 1979)."""
-    weight = rows.valid.astype(jnp.float32)[..., None]
-    count = jnp.maximum(weight.sum(), 1.0)
-    mean = (weight * rows.observation).sum((0, 1), keepdims=True) / count
-    var = (weight * (rows.observation - mean) ** 2).sum((0, 1)) / count
-    total = normaliser.seen + count
-    delta = mean[0, 0] - normaliser.mean
-    spread = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
-    return Normaliser(total, normaliser.mean + delta * count / total, spread / total)
 
 
 def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_lambda: float) -> jax.Array:
@@ -171,7 +142,8 @@ def loss(params: dict[str, Any], batch: Batch, config: PPOConfig) -> tuple[jax.A
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     policy_loss = -jnp.sum(weight * jnp.minimum(advantage * ratio, advantage * clipped))
-    moved = jax.vmap(lambda x: apply_mlp(params["value"], x)[0])(batch.x) - batch.value
+    critic = batch.x if batch.critic is None else batch.critic
+    moved = jax.vmap(lambda x: apply_mlp(params["value"], x)[0])(critic) - batch.value
     held = jnp.clip(moved, -config.value_clip, config.value_clip)
     # The target is value + advantage, so its distance from value + moved is moved - advantage.
     error = jnp.maximum((moved - batch.advantage) ** 2, (held - batch.advantage) ** 2)
@@ -187,11 +159,11 @@ def loss(params: dict[str, Any], batch: Batch, config: PPOConfig) -> tuple[jax.A
     return policy_loss + config.value_coef * value_loss - config.entropy_coef * bonus, parts
 
 
-def prepare(params: dict[str, Any], policy: Policy, rows: Rows, config: PPOConfig) -> Batch:
+def prepare(state: TrainState, policy: Policy, rows: Rows, config: PPOConfig) -> Batch:
     """Return the batch of a rollout: normalised observations, values, log densities and advantages.
 
     Args:
-        params: As in ``TrainState``; the value network is used.
+        state: Its value network and normalisers are used.
         policy: The policy that played the rows.
         rows: T rows of N copies.
         config: Discount and lambda.
@@ -203,11 +175,20 @@ def prepare(params: dict[str, Any], policy: Policy, rows: Rows, config: PPOConfi
     def over_rows(function: Callable[..., jax.Array], *leaves: jax.Array) -> jax.Array:
         return jax.vmap(jax.vmap(function))(*leaves)
 
+    def judged(x: jax.Array, privileged: jax.Array | None) -> jax.Array:
+        """Return what the value function is given."""
+        if privileged is None or state.privileged is None:
+            return x
+        known = over_rows(partial(normalise_parameters, state.privileged), privileged)
+        return jnp.concatenate([x, known], axis=-1)
+
     x, x_following = over_rows(policy.normalise, rows.observation), over_rows(policy.normalise, rows.following)
-    value = over_rows(lambda x: apply_mlp(params["value"], x)[0], x)
-    following = over_rows(lambda x: apply_mlp(params["value"], x)[0], x_following)
+    critic, critic_following = judged(x, rows.privileged), judged(x_following, rows.privileged_following)
+    value = over_rows(lambda x: apply_mlp(state.params["value"], x)[0], critic)
+    following = over_rows(lambda x: apply_mlp(state.params["value"], x)[0], critic_following)
     batch = Batch(
         x=x,
+        critic=None if state.privileged is None else critic,
         u=rows.u,
         log_prob=over_rows(lambda u, x: log_prob(u, apply_mlp(policy.layers, x), policy.log_std), rows.u, x),
         value=value,
@@ -243,13 +224,16 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
     key_play, key_shuffle, _ = keys(state)
     policy = make_policy(env, state.params, state.normaliser)
     copies, rows = collect(env, config, policy, state.copies, state.update, key_play)
-    batch = prepare(state.params, policy, rows, config)
+    batch = prepare(state, policy, rows, config)
     optimiser = make_optimiser(config)
 
     def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
         params, optimiser_state = carry
         part = jax.tree.map(lambda leaf: leaf[index].reshape(-1, *leaf.shape[2:]), batch)
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config)
+        if config.schedule == "adaptive":
+            rate = adapt_rate(get_rate(optimiser_state), parts["kl"], config.target_kl)
+            optimiser_state, parts = set_rate(optimiser_state, rate), parts | {"learning_rate": rate}
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
@@ -263,5 +247,7 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
         "value": jnp.sum(batch.weight * batch.value) / jnp.maximum(batch.weight.sum(), 1.0) / config.reward_scale,
         "finite_observation": jnp.isfinite(rows.following).all((0, 1)),
     }
-    normaliser = update_normaliser(state.normaliser, rows)
-    return TrainState(params, optimiser_state, normaliser, copies, state.update + 1, state.key), stats
+    normaliser, privileged = update_normaliser(state.normaliser, rows.observation, rows.valid), None
+    if state.privileged is not None and rows.privileged is not None:
+        privileged = update_normaliser(state.privileged, rows.privileged, rows.valid)
+    return TrainState(params, optimiser_state, normaliser, privileged, copies, state.update + 1, state.key), stats

@@ -37,10 +37,12 @@ def trained(pair):
             return made.state, {**kept, "joints": world.data.qpos, "of_task": world.reward}
 
         first, seen = env.reset(key)
-        return first.graph.params, seen, jax.lax.scan(step, first, length=env.length)[1]
+        return first.graph.params, (seen, env.privileged(first)), jax.lax.scan(step, first, length=env.length)[1]
 
-    params, first, rows = jax.jit(run)(jax.random.key(5))
-    return SimpleNamespace(nodes=nodes, task=task, params=params, first=first, rows=jax.tree.map(np.asarray, rows))
+    params, (first, true), rows = jax.jit(run)(jax.random.key(5))
+    return SimpleNamespace(
+        nodes=nodes, task=task, params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +103,13 @@ def test_the_first_observation_is_of_the_start(trained):
     np.testing.assert_allclose(trained.first[:2], start, atol=1e-4)
     np.testing.assert_allclose(trained.first[4:6], start, atol=1e-6)
     assert not np.asarray(trained.first[7:]).any(), "no history yet"
+
+
+def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(trained):
+    true = np.asarray(trained.true)
+    np.testing.assert_allclose(true[:2], trained.params["agent"].start, atol=1e-6)
+    for name in ("gain", "damping"):
+        assert np.isin(np.asarray(trained.params["world"].values[name]).ravel(), true).all()
 
 
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):

@@ -102,6 +102,25 @@ class Bandit:
         return Step(state, state["wanted"], -jnp.sum(error**2), yes, ~yes, yes, metrics)
 
 
+class Coin:
+    """Each row's reward is a coin, tossed at the start, which the policy does not see."""
+
+    observation_size = 1
+    action_low = np.array([-1.0], np.float32)
+    action_high = np.array([1.0], np.float32)
+
+    def reset(self, key):
+        return {"coin": jnp.sign(jax.random.uniform(key, minval=-1.0)), "row": jnp.int32(0)}, jnp.zeros(1)
+
+    def step(self, state, action, key):
+        new = {**state, "row": state["row"] + 1}
+        no = jnp.bool_(False)
+        return Step(new, jnp.zeros(1), state["coin"], no, new["row"] >= 8, ~no, {})
+
+    def privileged(self, state):
+        return 1e-4 * jnp.stack([3.0 + state["coin"], 7.0])
+
+
 class Constant:
     """Reward 1 per policy step, spread over ``rows_per_step`` rows; ends after ``length`` policy steps."""
 

@@ -1,8 +1,9 @@
-"""Advantages against a loop that follows the definition forward, one policy step at a time."""
+"""Advantages against a loop in numpy that follows the definition."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from advantages import slow
 
 from sim2real.train.rollout import Rows
 from sim2real.train.update import gae
@@ -13,28 +14,6 @@ GAMMA, LAMBDA = 0.9, 0.8
 def make_rows(reward, terminated, truncated, valid):
     empty = jnp.zeros((*reward.shape, 0))
     return Rows(empty, empty, *map(jnp.asarray, (reward, terminated, truncated, valid)), following=empty)
-
-
-def slow(reward, terminated, truncated, valid, value, following):
-    """One copy: the sum of discounted one-step errors, from each policy step up to the end of its episode."""
-    rows = len(reward)
-    advantages = np.full(rows, np.nan)
-    for first in np.flatnonzero(valid):
-        total, weight, t = 0.0, 1.0, int(first)
-        while True:
-            collected, baseline = reward[t], value[t]
-            while not (terminated[t] or truncated[t]) and t + 1 < rows and not valid[t + 1]:
-                t += 1
-                collected += reward[t]
-            over = terminated[t] or truncated[t] or t + 1 == rows
-            after = (0.0 if terminated[t] else following[t]) if over else value[t + 1]
-            total += weight * (collected + GAMMA * after - baseline)
-            if over:
-                break
-            weight *= GAMMA * LAMBDA
-            t += 1
-        advantages[first] = total
-    return advantages
 
 
 @pytest.mark.parametrize("valid_share", [1.0, 0.6])
@@ -53,8 +32,8 @@ def test_gae_equals_the_definition(valid_share):
         following[t][pending] = following[t + 1][pending]
     rows = make_rows(reward, terminated, truncated, valid)
     found = np.asarray(gae(rows, jnp.asarray(value), jnp.asarray(following), GAMMA, LAMBDA))
-    expected = np.stack([slow(*(a[:, i] for a in (reward, terminated, truncated, valid, value, following)))
-                         for i in range(shape[1])], axis=1)  # fmt: skip
+    rows_of = [[a[:, i] for a in (reward, terminated, truncated, valid, value, following)] for i in range(shape[1])]
+    expected = np.stack([slow(*copy, GAMMA, LAMBDA) for copy in rows_of], axis=1)
     assert terminated.any()
     assert truncated.any()
     np.testing.assert_allclose(found[valid], expected[valid], rtol=1e-4, atol=1e-5)

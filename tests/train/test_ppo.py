@@ -157,6 +157,9 @@ def test_a_broken_environment_is_refused_before_compiling(env, message):
         ({"gamma": 1.5}, r"gamma must lie in \[0, 1\]"),
         ({"entropy_coef": -0.1}, "entropy_coef must be at least 0"),
         ({"hidden": (0,)}, "hidden must hold integers"),
+        ({"schedule": "cosine"}, "schedule must be 'linear' or 'adaptive'"),
+        ({"target_kl": 0.0}, "target_kl must be above 0"),
+        ({"target": 95.0}, r"target must lie in \(0, 1\], got 95"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):
@@ -172,3 +175,26 @@ def test_pendulum_with_delays_swings_up():
     config = PPOConfig(total_steps=500_000, evaluations=5)
     result = train(Pendulum(), config, jax.random.key(0))
     assert result.history["success"].max() > 0.7
+
+
+def test_training_ends_where_the_best_seed_reaches_the_target(bandit):
+    full, _, config = bandit
+    at = int(np.flatnonzero(full.history["success"].max(1) >= 0.5)[0])
+    assert at + 1 < config.evaluations, "the bandit learns too slowly for this test"
+    found = train(Bandit(), dataclasses.replace(config, target=0.5), jax.random.key(0))
+    assert found.env_steps.tolist() == full.env_steps[: at + 1].tolist()
+    np.testing.assert_array_equal(found.history["success"], full.history["success"][: at + 1])
+
+
+def test_a_target_without_a_success_is_refused():
+    with pytest.raises(UsageError, match=r"target=0.5 is a share of success.*\['policy_steps'\]"):
+        train(Constant(), dataclasses.replace(TINY, target=0.5), jax.random.key(0))
+
+
+def test_an_adaptive_step_size_keeps_the_policy_near_its_target():
+    config = dataclasses.replace(SMALL, schedule="adaptive", target_kl=0.02, learning_rate=1e-5, epochs=8)
+    result = train(Bandit(), config, jax.random.key(0))
+    assert (result.history["kl"] > 0.005).all()
+    assert (result.history["kl"] < 0.08).all()
+    assert result.history["learning_rate"].min() > 1e-4
+    assert result.history["success"][-1] > 0.8

@@ -72,4 +72,4 @@ def test_the_final_observation_is_kept_and_the_next_one_is_a_start(rows):
 
 def test_evaluation_counts_one_episode_per_copy(config, policy):
     values = jax.jit(lambda key: evaluate(Counter(length=5), config, policy, key))(jax.random.key(0))
-    assert values == {"return": 10.0, "rows": 5.0, "finished": 1.0}
+    assert values == {"return": 10.0, "rows": 5.0, "finished": 1.0, "terminated": 1.0}

@@ -1,0 +1,30 @@
+"""What training can be told about learning; what it learns from is told by ``TrainConfig``. Imports no JAX."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from tyro.conf import UseAppendAction
+
+from sim2real.train.config import PPOConfig
+from sim2real.train.sweep import Sweep
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """How a policy is learnt."""
+
+    resume: str | None = None
+    """Interrupted training to go on with: its folder, its run, or 'newest' for the pipeline's newest."""
+    sweep: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
+    every seed, the best policy of all is kept."""
+    tensorboard: bool = False
+    """Write the curves for TensorBoard while training goes on, into the stage's folder 'tensorboard'."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """The learning algorithm."""
+
+    def __post_init__(self) -> None:
+        """Check that what is swept can be."""
+        Sweep.parse(self.sweep).configs(self.ppo)

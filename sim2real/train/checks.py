@@ -1,0 +1,49 @@
+"""What may be wrong with the figures of a training, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.train.config import PPOConfig
+
+
+def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig, names: list[str]) -> None:
+    """Raise if a value is not finite or no episode ended; causes are checked before their consequences.
+
+    Args:
+        values: Name -> shape ``(num_seeds,)``, and ``finite_observation``, ``(num_seeds, O)``.
+        env_steps: Number of rows so far.
+        config: Settings.
+        names: Who is who, such as ``seed 0``.
+
+    Raises:
+        Sim2RealError: A value is not finite.
+        UsageError: No evaluation episode ended.
+    """
+    for seed, name in enumerate(names):
+        when = f"({name}, within {env_steps} rows)"
+        entries = np.flatnonzero(~values["finite_observation"][seed])
+        if entries.size:
+            raise Sim2RealError(
+                f"entries {entries.tolist()} of the observation are not finite {when}",
+                hint="the environment's reset or step makes them: check what these entries divide by or integrate",
+            )
+        if not np.isfinite(values["reward"][seed]):
+            raise Sim2RealError(
+                f"the reward is not finite {when}", hint="check what the environment's reward divides by"
+            )
+        lost = sorted(name for name in ("loss", "kl", "entropy") if not np.isfinite(values[name][seed]))
+        if lost:
+            raise Sim2RealError(
+                f"the training's {' and '.join(lost)} is not finite {when}, observations and rewards are",
+                hint=f"lower learning_rate (now {config.learning_rate}) or reward_scale (now {config.reward_scale})",
+            )
+        if values["finished"][seed] == 0:
+            raise UsageError(
+                f"no evaluation episode ended within eval_steps={config.eval_steps} rows",
+                hint="raise eval_steps above the longest episode, or let the environment truncate",
+            )
+        bad = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
+        if bad:
+            raise Sim2RealError(f"metrics {', '.join(bad)} of finished episodes are not finite {when}")

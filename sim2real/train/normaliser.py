@@ -1,0 +1,52 @@
+"""Running statistics of what networks are given."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.policy.runner import OBSERVATION_CLIP
+
+
+class Normaliser(NamedTuple):
+    """Running mean and variance of the observations, or of what the value function sees besides.
+
+    Attributes:
+        seen: Shape ``()``: number of observations so far.
+        mean: Shape ``(O,)``.
+        var: Shape ``(O,)``.
+    """
+
+    seen: jax.Array
+    mean: jax.Array
+    var: jax.Array
+
+
+def update_normaliser(normaliser: Normaliser, seen: jax.Array, valid: jax.Array) -> Normaliser:
+    """Return the statistics with more observations added (parallel variance, Chan et al. 1979).
+
+    Args:
+        normaliser: The statistics before.
+        seen: Shape ``(T, N, O)``.
+        valid: Shape ``(T, N)``, bool: which of them count.
+    """
+    weight = valid.astype(jnp.float32)[..., None]
+    count = jnp.maximum(weight.sum(), 1.0)
+    mean = (weight * seen).sum((0, 1), keepdims=True) / count
+    var = (weight * (seen - mean) ** 2).sum((0, 1)) / count
+    total = normaliser.seen + count
+    delta = mean[0, 0] - normaliser.mean
+    spread = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
+    return Normaliser(total, normaliser.mean + delta * count / total, spread / total)
+
+
+def normalise_parameters(normaliser: Normaliser, seen: jax.Array) -> jax.Array:
+    """Return ``seen``, shape ``(O,)``, in deviations from its mean.
+
+    Physical parameters are of any size, and some are the same in all episodes: a deviation counts from a thousandth of
+    the mean on.
+    """
+    std = jnp.sqrt(normaliser.var + (1e-3 * normaliser.mean) ** 2 + 1e-20)
+    return jnp.clip((seen - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)

@@ -1,0 +1,93 @@
+"""Settings that are tried side by side in one program: every one with every seed. Imports no JAX, nor numpy."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
+
+if TYPE_CHECKING:
+    import jax
+
+SWEPT = tuple(f.name for f in fields(PPOConfig) if type(f.default) is float)
+"""Settings that are numbers in the program. The others set its shapes or its parts."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A grid of settings.
+
+    Attributes:
+        values: Setting -> the values to try.
+    """
+
+    values: Mapping[str, tuple[float, ...]]
+
+    @staticmethod
+    def parse(texts: Sequence[str]) -> Sweep:
+        """Return the grid of texts such as ``learning_rate=1e-3,3e-3``, one for each setting.
+
+        Raises:
+            UsageError: A setting cannot be swept, or a value is no number.
+        """
+        values: dict[str, tuple[float, ...]] = {}
+        for text in texts:
+            name, sign, listed = text.partition("=")
+            name = name.strip().replace("-", "_").removeprefix("ppo.")
+            try:
+                found = tuple(float(word) for word in listed.split(","))
+            except ValueError:
+                sign, found = "", ()
+            if not sign or len(set(found)) < len(found) or name in values:
+                raise UsageError(
+                    f"sweep {text!r} is no list of different numbers for one setting",
+                    hint="write NAME=VALUE,VALUE..., one --sweep a setting, such as --sweep learning_rate=1e-3,3e-3",
+                )
+            if name not in SWEPT:
+                known = any(f.name == name for f in fields(PPOConfig))
+                why = "sets the shape or the parts of the program" if known else "is no setting of PPO"
+                raise UsageError(f"{name} cannot be swept: it {why}", hint=f"settings that can: {', '.join(SWEPT)}")
+            values[name] = found
+        return Sweep(values)
+
+    @property
+    def grid(self) -> list[dict[str, float]]:
+        """The settings to try: all combinations, in order; one without any where nothing is swept."""
+        names = list(self.values)
+        return [dict(zip(names, numbers, strict=True)) for numbers in itertools.product(*self.values.values())]
+
+    def names(self, num_seeds: int) -> list[str]:
+        """Return who is who on the seed axis, such as ``learning_rate=0.001, seed 0``."""
+        points = [f"{named(point)}, " if point else "" for point in self.grid]
+        return [f"{point}seed {seed}" for point in points for seed in range(num_seeds)]
+
+    def configs(self, config: PPOConfig) -> list[PPOConfig]:
+        """Return the settings of each point of the grid.
+
+        Raises:
+            UsageError: A value is out of its range, or does nothing.
+        """
+        if "target_kl" in self.values and config.schedule != "adaptive":
+            raise UsageError("target_kl does nothing with a linear step size", hint="add --ppo.schedule adaptive")
+        return [replace(config, **point) for point in self.grid]
+
+
+def named(point: Mapping[str, float]) -> str:
+    """Return a point of the grid in words, such as ``learning_rate=0.001``."""
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+
+
+def with_numbers(config: PPOConfig, numbers: Mapping[str, jax.Array]) -> PPOConfig:
+    """Return settings some of which are arguments of the program, in place of constants.
+
+    ``dataclasses.replace`` would compare them with their bounds, which is done before the program is made.
+    """
+    own = copy.copy(config)
+    for name, value in numbers.items():
+        object.__setattr__(own, name, value)
+    return own

@@ -1,0 +1,54 @@
+"""What a training task may say besides what ``TrainingTask`` asks of each: its end, the truth, a reward's terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import reduce
+from operator import add
+from typing import Protocol, runtime_checkable
+
+import jax
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState
+
+REWARD = "reward/"
+"""Before the name of a term in the metrics: the term's sum over an episode."""
+Rewards = jax.Array | Mapping[str, jax.Array]
+"""The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
+
+
+def terms_of(reward: Rewards) -> dict[str, jax.Array]:
+    """Return the terms of a reward by name; none where it is a single number."""
+    return dict(reward) if isinstance(reward, Mapping) else {}
+
+
+def total_of(reward: Rewards) -> jax.Array:
+    """Return a reward, shape ``()``: the sum of its terms, in their order.
+
+    Raises:
+        UsageError: There are no terms.
+    """
+    if not isinstance(reward, Mapping):
+        return reward
+    if not reward:
+        raise UsageError("the task's reward has no terms", hint="return a number, or terms by name")
+    return reduce(add, reward.values())
+
+
+@runtime_checkable
+class EndingTask(Protocol):
+    """A task that may end an episode before its time, such as a fall."""
+
+    def terminated(self, graph_state: GraphState) -> jax.Array:
+        """Return whether the episode ended in the graph's state after a row, bool of shape ``()``."""
+        ...
+
+
+@runtime_checkable
+class PrivilegedTask(Protocol):
+    """A task that knows what a value function may see besides the policy's observation."""
+
+    def privileged(self, graph_state: GraphState) -> jax.Array:
+        """Return what is true in the graph's state, shape ``(P,)``, in any units."""
+        ...

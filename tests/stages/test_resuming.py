@@ -1,0 +1,122 @@
+"""A training that is interrupted goes on from its last evaluation, by the command line."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from sim2real import cli
+from sim2real.artifacts.bundle import Bundle
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.stages import train as stage
+from sim2real.stages.resuming import CHECKPOINT
+
+TINY = [
+    *("train", "pendulum", "--model", "nominal", "--episode-s", "0.5", "--timelines", "2", "--seed", "1"),
+    *("--ppo.total-steps", "96", "--ppo.num-envs", "4", "--ppo.minibatches", "1", "--ppo.evaluations", "3"),
+    *("--ppo.rollout-steps", "4", "--ppo.eval-envs", "2", "--ppo.epochs", "1", "--ppo.hidden", "4"),
+]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs: one that was interrupted after its second evaluation, and one that was not."""
+    root, report = tmp_path_factory.mktemp("runs"), stage._report
+
+    def stop(bar, progress, watch):
+        report(bar, progress, watch)
+        if progress.evaluation == 2:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "_report", stop)
+        assert cli.main([*TINY, "--runs", str(root)]) == 130
+    assert cli.main([*TINY, "--runs", str(root / "whole")]) == 0
+    return root
+
+
+def folder(root, name="train"):
+    return next((root / "pendulum").glob(f"*/{name}"))
+
+
+def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_path, capsys):
+    root = tmp_path / "runs"
+    shutil.copytree(runs, root)
+    first = folder(root)
+    assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
+    assert (first / CHECKPOINT).is_file()
+    assert cli.main([*TINY, "--runs", str(root), "--resume", "newest"]) == 0
+    found, whole = Bundle.load(folder(root, "train.2")), Bundle.load(folder(root / "whole"))
+    assert not list(root.glob(f"whole/*/*/*/{CHECKPOINT}"))
+    assert found.weights.keys() == whole.weights.keys()
+    for name, weights in whole.weights.items():
+        np.testing.assert_array_equal(found.weights[name], weights)
+    np.testing.assert_array_equal(found.history.returns, whole.history.returns)
+    said = capsys.readouterr().out
+    assert "of it angle" in said
+    terms = [found.history.others[f"reward/{name}"] for name in ("angle", "speed", "voltage")]
+    np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
+
+
+def test_a_stage_folder_and_a_run_name_it_too(runs):
+    own = folder(runs)
+    for target in (own, own.parent):
+        assert stage.find_interrupted("pendulum", settings(own, target), runs).folder == own
+
+
+def settings(own, target, **changes):
+    from sim2real.stages import flags
+    from sim2real.stages.pipeline import load_pipeline
+
+    words = [*TINY[2:], "--resume", str(target)]
+    words += [word for name, value in changes.items() for word in (f"--{name}", value)]
+    config = load_pipeline("pendulum").train
+    return flags.parse(config, words, "", "")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": "2"}, r"other settings: seed = 1 there and 2 here[\s\S]*hint: .*it was: sim2real "),
+        ({"ppo.gamma": "0.5"}, r"ppo.gamma = 0.99 there and 0.5 here"),
+    ],
+)
+def test_other_settings_are_refused(runs, change, message):
+    own = folder(runs)
+    with pytest.raises(UsageError, match=message):
+        stage.find_interrupted("pendulum", settings(own, own, **change), runs)
+
+
+def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
+    own, whole = folder(runs), folder(runs / "whole")
+    with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):
+        stage.find_interrupted("arm", settings(own, own), runs)
+    with pytest.raises(UsageError, match="there is no interrupted training of 'pendulum'"):
+        stage.find_interrupted("pendulum", settings(own, whole), runs)
+    early = tmp_path / "train"
+    early.mkdir()
+    shutil.copy(own / "manifest.json", early)
+    with pytest.raises(Sim2RealError, match="interrupted before its first evaluation"):
+        stage.find_interrupted("pendulum", settings(own, early), runs)
+    other = tmp_path / "parameters.json"
+    other.write_text("{}")
+    found = stage.find_interrupted("pendulum", settings(own, own), runs)
+    with pytest.raises(UsageError, match="trains on other parameters than"):
+        stage.check_same_parameters(found, other)
+
+
+def test_a_sweep_names_what_it_tried(tmp_path, capsys):
+    assert cli.main([*TINY, "--runs", str(tmp_path), "--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "gamma=0.9 " in said
+    assert "gamma=0.99 " in said
+    history = Bundle.load(folder(tmp_path)).history
+    assert history.settings == ("gamma=0.9",) * 2 + ("gamma=0.99",) * 2
+    assert history.returns.shape == (3, 4)
+    assert f"({history.settings[history.best_seed]}, seed {history.best_seed % 2})" in said
+
+
+def test_what_cannot_be_swept_is_refused_at_once(capsys):
+    assert cli.main([*TINY, "--sweep", "hidden=3,4"]) == 2
+    assert "hidden cannot be swept" in capsys.readouterr().err

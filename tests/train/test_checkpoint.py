@@ -1,0 +1,81 @@
+"""A training that was interrupted and went on is the one that was not."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from environments import Bandit, Constant
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.train.config import PPOConfig
+from sim2real.train.ppo import train
+
+CONFIG = PPOConfig(
+    num_seeds=2, num_envs=8, minibatches=2, rollout_steps=4, total_steps=256, hidden=(4,), evaluations=4, eval_steps=3,
+    eval_envs=8, epochs=1,
+)  # fmt: skip
+KEY = jax.random.key(3)
+
+
+def interrupted(path, after, env=None, config=CONFIG):
+    def stop(progress):
+        if progress.evaluation == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(env or Bandit(), config, KEY, stop, checkpoint=path)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return train(Bandit(), CONFIG, KEY)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
+    interrupted(path, 2)
+    return path
+
+
+def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(whole, saved, tmp_path):
+    seen = []
+    found = train(Bandit(), CONFIG, KEY, seen.append, checkpoint=tmp_path / "next", resume=saved)
+    assert [progress.evaluation for progress in seen] == [1, 2, 3, 4]
+    jax.tree.map(np.testing.assert_array_equal, (found.policies, found.best), (whole.policies, whole.best))
+    assert found.history.keys() == whole.history.keys()
+    for name, values in whole.history.items():
+        np.testing.assert_array_equal(found.history[name], values)
+    assert found.best_seed == whole.best_seed
+    assert found.env_steps.tolist() == whole.env_steps.tolist()
+    assert (np.diff(found.elapsed_s) > 0).all()
+    again = train(Bandit(), CONFIG, KEY, resume=tmp_path / "next")
+    np.testing.assert_array_equal(again.best.log_std, whole.best.log_std)
+
+
+def test_the_target_alone_may_be_another(saved):
+    found = train(Bandit(), dataclasses.replace(CONFIG, target=1e-9), KEY, resume=saved)
+    assert len(found.env_steps) in (2, 3, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": dataclasses.replace(CONFIG, gamma=0.5)}, "other settings: gamma = 0.99 there and 0.5 here"),
+        ({"key": jax.random.key(4)}, "a training with another seed"),
+        ({"env": Constant(length=3)}, "of another program: of another robot"),
+    ],
+)
+def test_another_training_is_refused(saved, change, message):
+    asked = {"env": Bandit(), "config": CONFIG, "key": KEY} | change
+    with pytest.raises(UsageError, match=rf"{message}[\s\S]*hint: "):
+        train(**asked, resume=saved)
+
+
+def test_a_file_that_is_damaged_or_missing_is_named(saved, tmp_path):
+    damaged = tmp_path / "damaged"
+    damaged.write_bytes(saved.read_bytes()[:300])
+    for path in (damaged, tmp_path / "missing"):
+        with pytest.raises(Sim2RealError, match=rf"cannot go on from {path}[\s\S]*hint: train again"):
+            train(Bandit(), CONFIG, KEY, resume=path)

@@ -1,0 +1,112 @@
+"""A graph as an environment: what ends an episode, and what its end is worth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from advantages import slow
+
+from sim2real.errors import UsageError
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.train.env import GraphEnvironment
+from sim2real.train.rollout import Rows
+from sim2real.train.tasks import terms_of, total_of
+from sim2real.train.update import gae
+
+FAST = 8.0
+"""A pendulum that turns faster has failed [rad/s]."""
+COPIES = 16
+
+
+@pytest.fixture(scope="module")
+def robot():
+    kind = type(load_pipeline("pendulum").load())
+
+    class Careful(kind):
+        def terminated(self, state):
+            return jnp.abs(state.thdot) > FAST
+
+    return Careful()
+
+
+@pytest.fixture(scope="module")
+def env(robot):
+    nodes, task = robot.training(robot.nominal(), {}, {}, False)
+    return GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, draw(nodes, 0.6)), task)
+
+
+@pytest.fixture(scope="module")
+def played(env):
+    """Episodes at full voltage, played on to the last row whatever ends them; and the speeds after each row."""
+
+    def play(key):
+        def row(state, _):
+            step = env.step(state, jnp.array([2.0]), key)
+            return step.state, (step._replace(state=step.state.graph.state["world"].thdot))
+
+        return jax.lax.scan(row, env.reset(key)[0], length=env.length)[1]
+
+    steps = jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(1), COPIES))
+    return jax.tree.map(lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1), steps)
+
+
+def test_a_robot_says_when_an_episode_has_ended(played):
+    fast = np.abs(played.state) > FAST
+    np.testing.assert_array_equal(played.terminated, fast)
+    assert 0.05 < fast.mean() < 0.95
+    np.testing.assert_array_equal(np.flatnonzero(played.truncated.all(1)), [len(played.truncated) - 1])
+
+
+def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
+    """Advantages of the environment's own rows, by the trainer and by the definition."""
+    rows, shape = played, played.reward.shape
+    value, following = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
+    ended = rows.terminated | rows.truncated
+    following[:-1][~ended[:-1]] = value[1:][~ended[:-1]]
+    empty = np.zeros((*shape, 0))
+    flags = (rows.terminated, rows.truncated, rows.valid)
+    made = Rows(empty, empty, *map(jnp.asarray, (rows.reward, *flags)), following=empty)
+    found = np.asarray(gae(made, jnp.asarray(value), jnp.asarray(following), 0.9, 0.8))
+    for i in range(COPIES):
+        expected = slow(*(leaf[:, i] for leaf in (rows.reward, *flags, value, following)), 0.9, 0.8)
+        valid = rows.valid[:, i]
+        np.testing.assert_allclose(found[valid, i], expected[valid], rtol=1e-4, atol=1e-4)
+
+
+def test_named_terms_of_the_reward_add_up_to_the_return(played):
+    terms = {n.removeprefix("reward/"): v for n, v in played.metrics.items() if n.startswith("reward/")}
+    assert set(terms) == {"angle", "speed", "voltage"}
+    np.testing.assert_allclose(sum(terms.values()), played.metrics["return"], rtol=1e-5)
+    np.testing.assert_allclose(np.cumsum(played.reward, axis=0), played.metrics["return"], rtol=1e-5)
+    rows = np.arange(1, len(played.reward) + 1)[:, None]
+    np.testing.assert_allclose(terms["voltage"], np.broadcast_to(-0.04 * rows, played.reward.shape), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("reward", "total"), [(2.0, 2.0), ({"a": 2.0, "b": -3.0}, -1.0)])
+def test_a_reward_is_a_number_or_its_terms(reward, total):
+    assert total_of(reward) == total
+    assert terms_of(reward) == (reward if isinstance(reward, dict) else {})
+
+
+def test_a_reward_without_terms_is_refused():
+    with pytest.raises(UsageError, match=r"no terms[\s\S]*hint: return a number"):
+        total_of({})
+
+
+def test_a_value_function_may_see_the_true_state_and_the_parameters(env):
+    state = jax.eval_shape(lambda key: env.reset(key)[0], jax.random.key(0))
+    made = {name: jax.tree.map(lambda x: jnp.full(x.shape, 3, x.dtype), p) for name, p in state.graph.params.items()}
+    graph = state.graph.replace(params=made)
+    world = graph.state["world"].replace(th=jnp.float32(0.5), thdot=jnp.float32(-2.0))
+    shown = env.privileged(state._replace(graph=graph.replace(state={**graph.state, "world": world})))
+    np.testing.assert_array_equal(shown[:2], [0.5, -2.0])
+    parameters = [leaf for leaf in jax.tree.leaves(graph.params) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert len(shown) == 2 + sum(leaf.size for leaf in parameters)
+    np.testing.assert_array_equal(shown[2:], 3.0)
+
+
+def test_a_robot_that_says_nothing_never_ends_an_episode():
+    robot = load_pipeline("pendulum").load()
+    assert not robot.terminated(None)

@@ -1,0 +1,35 @@
+"""The step size: down a line, or as far as the policy moves."""
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from sim2real.train.config import PPOConfig
+from sim2real.train.optimiser import LEAST_RATE, MOST_RATE, adapt_rate, get_rate, make_optimiser, set_rate
+
+
+@pytest.mark.parametrize(
+    ("rate", "kl", "expected"),
+    [
+        (1e-3, 0.021, 1e-3 / 1.5),
+        (1e-3, 0.02, 1e-3),
+        (1e-3, 0.005, 1e-3),
+        (1e-3, 0.0049, 1.5e-3),
+        (1e-3, 0.0, 1e-3),
+        (1.2e-5, 1.0, LEAST_RATE),
+        (9e-3, 1e-4, MOST_RATE),
+    ],
+)
+def test_the_rate_moves_by_half_of_it_within_bounds(rate, kl, expected):
+    assert adapt_rate(jnp.float32(rate), jnp.float32(kl), 0.01) == pytest.approx(expected)
+
+
+def test_an_adaptive_step_is_adams_of_the_rate_in_its_state():
+    config = PPOConfig(schedule="adaptive", learning_rate=1e-3, max_grad_norm=1e9)
+    ours, params, gradient = make_optimiser(config), jnp.array([1.0, -2.0]), jnp.array([0.3, 0.1])
+    state = set_rate(ours.init(params), jnp.float32(4e-3))
+    assert get_rate(state) == pytest.approx(4e-3)
+    adam = optax.adam(4e-3, eps=1e-5)
+    expected = adam.update(gradient, adam.init(params))[0]
+    np.testing.assert_allclose(ours.update(gradient, state)[0], expected, rtol=1e-4)
