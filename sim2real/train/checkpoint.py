@@ -1,7 +1,8 @@
 """All of a training in one file, to go on from.
 
-A safetensors file, not orbax: importing orbax takes 0.5 s and a save 45 ms, where a training of the pendulum takes 8 s;
-this takes 1 ms. It is replaced as a whole: whoever is interrupted while writing leaves the one before.
+A safetensors file, not orbax: importing orbax takes 0.5 s and a save 45 ms, where a training of the pendulum takes 8 s
+with ten evaluations; this takes 6 ms and imports nothing. It is replaced as a whole: whoever is interrupted while
+writing leaves the one before.
 """
 
 from __future__ import annotations

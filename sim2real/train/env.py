@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
-from sim2real.train.tasks import REWARD, EndingTask, PrivilegedTask, Rewards, terms_of, total_of
+from sim2real.train.tasks import REWARD, EndingTask, PrivilegedTask, Rewards, checked_end, terms_of, total_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -151,7 +151,7 @@ class GraphEnvironment:
         total = state.total + reward
         terms = {name: state.terms[name] + term for name, term in terms_of(made).items()}
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
-        fallen = [] if self._terminated is None else [self._terminated(gs)]
+        fallen = [] if self._terminated is None else [checked_end(self._terminated(gs), self.task)]
         terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in ended], bool))
         gs, step_state, _ = self.graph.observe(gs, inside=True)

@@ -55,7 +55,8 @@ def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
 def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """Return the log density of ``u`` under a normal distribution with a diagonal covariance.
 
-    Written out, as importing a distribution library takes longer than compiling the trainer.
+    Written out: importing distrax takes 1.7 s, a fifth of a training of the pendulum, which compiles and runs as fast
+    with it.
 
     Args:
         u: Shape ``(A,)``.

@@ -8,6 +8,7 @@ from operator import add
 from typing import Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
@@ -16,6 +17,22 @@ REWARD = "reward/"
 """Before the name of a term in the metrics: the term's sum over an episode."""
 Rewards = jax.Array | Mapping[str, jax.Array]
 """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
+
+
+def checked_end(ended: jax.Array, task: object) -> jax.Array:
+    """Return what a task's ``terminated`` returned, if it is one bool.
+
+    Raises:
+        UsageError: It is a number or a vector, which would end episodes that have not ended.
+    """
+    ended = jnp.asarray(ended)
+    if ended.shape != () or ended.dtype != jnp.bool_:
+        raise UsageError(
+            f"`terminated` of {type(task).__name__} must return a bool of shape (), got {ended.dtype} of shape "
+            f"{ended.shape}",
+            hint="compare with a limit, and join several by jnp.any",
+        )
+    return ended
 
 
 def terms_of(reward: Rewards) -> dict[str, jax.Array]:

@@ -12,7 +12,7 @@ from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.rollout import Rows
-from sim2real.train.tasks import terms_of, total_of
+from sim2real.train.tasks import checked_end, terms_of, total_of
 from sim2real.train.update import gae
 
 FAST = 8.0
@@ -105,6 +105,12 @@ def test_a_value_function_may_see_the_true_state_and_the_parameters(env):
     parameters = [leaf for leaf in jax.tree.leaves(graph.params) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert len(shown) == 2 + sum(leaf.size for leaf in parameters)
     np.testing.assert_array_equal(shown[2:], 3.0)
+
+
+@pytest.mark.parametrize("ended", [jnp.float32(0.3), jnp.zeros(2, bool)])
+def test_an_end_that_is_no_bool_is_refused(ended):
+    with pytest.raises(UsageError, match=r"`terminated` of list must return a bool of shape \(\), got"):
+        checked_end(ended, [])
 
 
 def test_a_robot_that_says_nothing_never_ends_an_episode():
