@@ -94,6 +94,11 @@ class CompiledGraph:
         """Number of the supervisor's steps in the shortest episode; ``reset`` returns the first."""
         return int(self._walk.counts.min())
 
+    @property
+    def turns(self) -> np.ndarray:
+        """Where the supervisor makes a step, bool of shape ``(episodes, rows)``."""
+        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self._walk.turns], axis=0)
+
     def init(
         self,
         rng: jax.Array,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
+from sim2real.robots.loop import DELAYS
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
@@ -30,7 +31,7 @@ from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.robot import moving_robot
-from sim2real.train.env import GraphEnvironment
+from sim2real.train.env import GraphEnvironment, TrainingTask
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 
@@ -67,21 +68,11 @@ def train(
     """
     pipeline = pipeline_of(robot)
     config = config or pipeline.train
-    delays = config.model == "identified"
-    if delays and identification is None:
-        raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
-    if identification is not None and delays:
-        check_parameters(identification, pipeline)
-    robot = moving_robot(pipeline, _world(config, identification if delays else None))
-    values, draws = model_values(robot, identification, config)
-    computation, dropped = _computation(robot, identification, timing) if delays else ({}, {})
-    nodes, task = robot.training(values, draws, computation, delays)
-    timeline, redrawn = draw_timelines(nodes, robot.roles.supervisor, config)
-    env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
+    robot, env, values, dropped, redrawn = playground(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
         result = patiently(lambda: learn(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
-    bundle = Bundle(_contract(robot, task, values), result.best.to_weights(), _history(result))
+    bundle = Bundle(contract_of(robot, env.task, values), result.best.to_weights(), _history(result))
     about = {
         "model": config.model,
         "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
@@ -89,10 +80,72 @@ def train(
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
         "train": f"{result.train_s:.1f} s",
-        "hiccups left out": sum(dropped.values()),
+        "hiccups left out": dropped,
         "timelines drawn again": redrawn,
     }
     return bundle, about
+
+
+class Playground(NamedTuple):
+    """What policies are trained in.
+
+    Attributes:
+        robot: The robot, in its world.
+        env: The graph with its delays as an environment.
+        values: Parameter -> what the model has, without an episode's own deviation.
+        dropped: Steps that were left out of the timing as hiccups.
+        redrawn: Timelines that were drawn again.
+    """
+
+    robot: Robot
+    env: GraphEnvironment
+    values: dict[str, float]
+    dropped: int
+    redrawn: int
+
+
+def playground(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None = None,
+    timing: Timing | None = None,
+    changed: Mapping[str, float] | None = None,
+) -> Playground:
+    """Return the environment that a policy is trained in.
+
+    Args:
+        pipeline: The robot.
+        config: Model, world, timelines, randomisation and seed.
+        identification: What identify found; the nominal model needs none.
+        timing: How long everything takes; default: as in the recording that was identified from.
+        changed: Parameters with other values than the model's; the nominal model has delays where both are among them.
+
+    Raises:
+        UsageError: When the identified model is asked for without an identification, in another world, or a parameter
+            is not known.
+        Sim2RealError: When the identification is of another robot, or its timing cannot be trained with.
+    """
+    identified = config.model == "identified"
+    if identified and identification is None:
+        raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
+    if identification is not None and identified:
+        check_parameters(identification, pipeline)
+    robot = moving_robot(pipeline, _world(config, identification if identified else None))
+    values, draws = model_values(robot, identification, config)
+    if unknown := sorted(set(changed or ()) - {*values, *DELAYS}):
+        raise UsageError(
+            f"there is no parameter {unknown[0]!r}. Available: {', '.join(dict.fromkeys([*values, *DELAYS]))}"
+        )
+    values = {**values, **(changed or {})}
+    given = set(DELAYS) & set(values)
+    if not identified and len(given) == 1:
+        raise UsageError(f"only {given.pop()!r} was given: a loop has {' and '.join(DELAYS)}")
+    draws = {name: draw for name, draw in draws.items() if name not in (changed or ())}
+    computation, dropped = _computation(robot, identification, timing) if identified else ({}, {})
+    nodes, task = robot.training(values, draws, computation, identified or bool(given))
+    timeline, redrawn = draw_timelines(nodes, robot.roles.supervisor, config)
+    env = GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, timeline), task)
+    return Playground(robot, env, values, sum(dropped.values()), redrawn)
 
 
 def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -105,7 +158,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
     """
     moving_robot(pipeline)  # before anything is read
-    path, run_dir = _find_parameters(pipeline, config, root, run_dir)
+    path, run_dir = find_parameters(pipeline, config, root, run_dir)
     identification = None if path is None else open_identification(path, pipeline)
     if identification is not None:
         _timing_of(identification)  # without it a folder is not made
@@ -229,10 +282,17 @@ def _hiccups(timeline: Timeline, supervisor: str) -> np.ndarray:
     return gaps.max(axis=1) > _LONGEST_GAP * np.median(gaps)
 
 
-def _find_parameters(
+def find_parameters(
     pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None
 ) -> tuple[Path | None, Path | None]:
-    """Return the identification to train on, None for the nominal model, and the run folder to write into."""
+    """Return the identification to train on, None for the nominal model, and the run folder to write into.
+
+    Args:
+        pipeline: The robot.
+        config: The stage's configuration.
+        root: Folder of all runs.
+        run_dir: Run folder; None: the newest one with an identification.
+    """
     if config.model == "nominal":
         return None, run_dir
     if config.parameters is not None:
@@ -241,7 +301,14 @@ def _find_parameters(
     return found.output("parameters"), run_dir or found.run_dir
 
 
-def _contract(robot: Robot, task: Any, values: Mapping[str, float]) -> PolicyContract:
+def contract_of(robot: Robot, task: TrainingTask, values: Mapping[str, float]) -> PolicyContract:
+    """Return what a policy of a robot sees and does.
+
+    Args:
+        robot: The robot.
+        task: Its task, with the actions' bounds.
+        values: Parameters by name, whose delays the policy is trained with.
+    """
     return PolicyContract(
         observation=robot.observation,
         action=tuple(
