@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
 from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 
@@ -77,6 +78,7 @@ class Bundle:
         contract: What it sees, what it sends, at which rate, and what it was trained from.
         weights: Name -> array, as ``Policy.from_weights`` takes them.
         history: How training went; None where only the policy was copied.
+        sensitivity: How the policy does where a parameter is wrong; None where that was not simulated.
         path: Its folder; None before it was saved.
     """
 
@@ -84,6 +86,7 @@ class Bundle:
     weights: Mapping[str, np.ndarray]
     history: History | None = None
     path: Path | None = None
+    sensitivity: Sensitivity | None = None
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into the folder of a train stage.
@@ -96,6 +99,9 @@ class Bundle:
         if self.history is not None:
             self.history.save(folder / HISTORY)
             written["history"] = HISTORY
+        if self.sensitivity is not None:
+            self.sensitivity.save(folder / SENSITIVITY)
+            written["sensitivity"] = SENSITIVITY
         return written
 
     @staticmethod
@@ -112,4 +118,6 @@ class Bundle:
         contract = load_bundle(folder).contract
         beside = folder.with_name(HISTORY)
         history = History.load(beside) if beside.is_file() else None
-        return Bundle(contract, read_weights(folder), history, folder)
+        other = folder.with_name(SENSITIVITY)
+        weak = Sensitivity.load(other) if other.is_file() else None
+        return Bundle(contract, read_weights(folder), history, folder, weak)

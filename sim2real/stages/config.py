@@ -137,6 +137,8 @@ class TrainConfig:
     """Copies differ in their parameters by this many standard errors of the identification, and at least by 2 %."""
     seed: int = 0
     """Seed of training."""
+    sensitivity: bool = True
+    """Afterwards, simulate which parameter breaks the policy if it is wrong by multiples of its uncertainty."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
 
@@ -144,9 +146,8 @@ class TrainConfig:
         """Check what can be checked before anything is compiled."""
         _check_seed(self.seed)
         if self.timelines < 1 or not 0.5 <= self.episode_s <= 600.0:
-            raise UsageError(
-                f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
-            )
+            given = f"{self.timelines} of {self.episode_s} s"
+            raise UsageError(f"training needs at least one timeline of 0.5 to 600 s, got {given}")
         if not 0.0 <= self.randomise <= 10.0:
             raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
 
@@ -299,8 +300,7 @@ MODEL_IDENTIFY = IdentifyConfig(
     jacobian="finite",
     max_delay_s=0.05,
 )
-"""How a robot of a model is identified: rough values are known, so there is no search; short segments, whose starts are
-read off the log."""
+"""How a robot of a model is identified: rough values are known, so there is no search; starts are read off the log."""
 
 
 @dataclass(frozen=True)

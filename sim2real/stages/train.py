@@ -15,6 +15,7 @@ from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
+from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.delays import DelayDistribution
@@ -24,6 +25,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
 from sim2real.robots.loop import DELAYS
+from sim2real.robots.loop_robot import LoopRobot
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
@@ -31,7 +33,9 @@ from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.robot import moving_robot
+from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitivity, with_room
 from sim2real.train.env import GraphEnvironment, TrainingTask
+from sim2real.train.networks import Policy
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 
@@ -72,7 +76,8 @@ def train(
     ppo = replace(config.ppo, eval_steps=env.length + 1)
     with progress(ppo.evaluations, "train (compiling)") as bar:
         result = patiently(lambda: learn(env, ppo, jax.random.key(config.seed), lambda p: _report(bar, p)))
-    bundle = Bundle(contract_of(robot, env.task, values), result.best.to_weights(), _history(result))
+    weak = _sensitivity(pipeline, config, identification, timing, robot, result.best) if config.sensitivity else None
+    bundle = Bundle(contract_of(robot, env.task, values), result.best.to_weights(), _history(result), sensitivity=weak)
     about = {
         "model": config.model,
         "success in simulation": f"{result.history['success'].max():.2f} (seed {result.best_seed})",
@@ -83,7 +88,26 @@ def train(
         "hiccups left out": dropped,
         "timelines drawn again": redrawn,
     }
-    return bundle, about
+    return bundle, about if weak is None else {**about, "what breaks it": weak.said}
+
+
+def _sensitivity(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None,
+    timing: Timing | None,
+    robot: Robot,
+    policy: Policy,
+) -> Sensitivity | None:
+    """Return how the policy does where one parameter is wrong; None where nothing says by how much it may be."""
+    if config.model == "nominal" or identification is None or not isinstance(robot, LoopRobot):
+        return None
+    moves = moves_of(identification)
+    models = models_of(identification.values, moves)
+    wide = with_room(robot, models)
+    few = replace(config, timelines=TIMELINES)
+    env = playground(pipeline, few, identification, timing, robot=wide).env
+    return sensitivity(wide, env, policy, moves, models, config.seed)
 
 
 class Playground(NamedTuple):
@@ -110,6 +134,7 @@ def playground(
     identification: Identification | None = None,
     timing: Timing | None = None,
     changed: Mapping[str, float] | None = None,
+    robot: Robot | None = None,
 ) -> Playground:
     """Return the environment that a policy is trained in.
 
@@ -119,6 +144,7 @@ def playground(
         identification: What identify found; the nominal model needs none.
         timing: How long everything takes; default: as in the recording that was identified from.
         changed: Parameters with other values than the model's; the nominal model has delays where both are among them.
+        robot: The pipeline's robot in its world, with changes of its own; default: without.
 
     Raises:
         UsageError: When the identified model is asked for without an identification, in another world, or a parameter
@@ -130,7 +156,7 @@ def playground(
         raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
     if identification is not None and identified:
         check_parameters(identification, pipeline)
-    robot = moving_robot(pipeline, _world(config, identification if identified else None))
+    robot = robot or moving_robot(pipeline, _world(config, identification if identified else None))
     values, draws = model_values(robot, identification, config)
     if unknown := sorted(set(changed or ()) - {*values, *DELAYS}):
         raise UsageError(
