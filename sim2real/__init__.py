@@ -130,6 +130,8 @@ _HOMES = {
 }
 _ROOMS = ("identify", "train")
 """Rooms that are called like the stage that does their work: ``sim2real.identify(...)`` runs it, see ``room``."""
+_MODULES = ("interop",)
+"""Modules whose functions people call as ``sim2real.interop.vector_env(...)``, without importing them."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
@@ -155,7 +157,7 @@ def __getattr__(name: str) -> Any:
         from importlib import metadata
 
         value: Any = metadata.version("sim2real")
-    elif name in _ROOMS:
+    elif name in (*_ROOMS, *_MODULES):
         value = importlib.import_module(f"sim2real.{name}")
     elif name in _HOME_OF:
         value = getattr(importlib.import_module(_HOME_OF[name]), name)

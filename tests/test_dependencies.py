@@ -20,7 +20,7 @@ IMPORTED_AS = {
 MAY_IMPORT = {
     "view": {"sim2real.view.recording", "pipelines.arm.scene", "pipelines.pendulum.scene"},
     "hardware": {"sim2real.policy.runner"},
-    "interop": {"sim2real.composer.interop.brax_env", "sim2real.composer.interop.vector_env"},
+    "interop": {"sim2real.composer.interop.copies", "sim2real.composer.interop.counted"},
     "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.foreign"},
     "tensorboard": {"sim2real.stages.events"},

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "sim2real"
 ROOMS = [
     "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "artifacts", "identify", "train", "robots",
-    "view", "stages", "cli",
+    "view", "stages", "interop", "cli",
 ]  # fmt: skip
 EVERYWHERE = {"errors", "room"}
 STAGES = {"record", "identify", "train", "deploy", "check"}

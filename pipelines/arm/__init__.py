@@ -17,6 +17,6 @@ PIPELINE = Pipeline(
     identify=IdentifyConfig(
         initial_state="measured", skip_s=0.3, jacobian="finite", population=24, generations=30, refine=2
     ),
-    train=TrainConfig(episode_s=3.0, ppo=PPOConfig(num_envs=256, total_steps=1_500_000)),
+    train=TrainConfig(episode_s=3.0, sensitivity=False, ppo=PPOConfig(num_envs=256, total_steps=1_500_000)),
     deploy=DeployConfig(episodes=10, duration_s=4.0, gate=GATE),
 )

@@ -49,6 +49,8 @@ class Link(composer.Entity):
 class Arm(ServoDriven):
     """Three servos and three links."""
 
+    low, high = (-1.4, -1.4, -1.6), (1.4, 1.4, 1.6)
+
     def _build(self, name: str = "arm") -> None:
         self._model = mjcf.RootElement(model=name)
         forward, down = SHOULDER_M
@@ -91,3 +93,13 @@ class Gantry(composer.Arena):
         world.add("geom", name="plate", type="box", size=[0.06, 0.05, 0.005], pos=[0, 0, GANTRY_M + 0.03], **look)
         self.mount = world.add("site", name="mount", pos=[0, 0, GANTRY_M])
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.25], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
+
+    def _build_observables(self) -> composer.Observables:
+        found = super()._build_observables()
+        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
+        return found
+
+    @composer.observable
+    def target_position(self, physics: Any) -> Any:
+        """Return where the target is ``(3,)`` [m]."""
+        return physics.bind(self.target).xpos

@@ -15,7 +15,7 @@ from sim2real.robots.hardware import Embedded
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
-from .parts import JOINTS, SHEET
+from .parts import JOINTS, SHEET, Arm
 from .task import CLOSE_M, HIGH, LOW, Reach, tip_of
 
 
@@ -25,17 +25,17 @@ class ArmRobot(ServoRobot):
     servos = Servos(
         joints=JOINTS,
         ids=(1, 2, 3),
-        low=(-1.4, -1.4, -1.6),
-        high=(1.4, 1.4, 1.6),
+        low=Arm.low,
+        high=Arm.high,
         sheet=SHEET,
         speed=2.0,
     )
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"))
     features = (
-        ("position", ("rad",) * 3),
-        ("velocity / 5", ("rad/s",) * 3),
-        ("goal less position", ("rad",) * 3),
-        ("10 x target less tip: outwards, sideways, up", ("m",) * 3),
+        ("position", ("rad",) * 3, 5.0),
+        ("velocity / 5", ("rad/s",) * 3, 6.0),
+        ("goal less position", ("rad",) * 3, 6.0),
+        ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
     )
 
     @property

@@ -38,6 +38,8 @@ LIMIT_V = 2.0
 WORLD_HZ = 100.0
 HINGE = Joint("hinge", zero_rad=0.0)
 """Angle 0 is upright."""
+_UNITS, _LOW, _HIGH = ("1", "1", "rad/s"), (-1.0, -1.0, -6.0), (1.0, 1.0, 6.0)
+"""What is seen of a measurement: its units and bounds; the model limits the speed to 60 rad/s."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 
 
@@ -55,9 +57,9 @@ class PendulumRobot(LoopRobot):
     message = Command
     joints = {HINGE.name: {"position": "th", "velocity": "thdot"}}
     observation = (
-        ObservationTerm("cos(th), sin(th), thdot / 10", ("1", "1", "rad/s")),
-        ObservationTerm("past cos(th), sin(th), thdot / 10", ("1", "1", "rad/s"), HISTORY),
-        ObservationTerm("past voltage", ("V",), HISTORY),
+        ObservationTerm("cos(th), sin(th), thdot / 10", _UNITS, low=_LOW, high=_HIGH),
+        ObservationTerm("past cos(th), sin(th), thdot / 10", _UNITS, HISTORY, _LOW, _HIGH),
+        ObservationTerm("past voltage", ("V",), HISTORY, (-LIMIT_V,), (LIMIT_V,)),
     )
     action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
     mounting = (HINGE,)

@@ -26,6 +26,6 @@ PIPELINE = Pipeline(
         max_delay_s=0.04,
         free_run_s=0.0,
     ),
-    train=TrainConfig(episode_s=3.0, ppo=PPOConfig(num_envs=256, total_steps=2_000_000)),
+    train=TrainConfig(episode_s=3.0, sensitivity=False, ppo=PPOConfig(num_envs=256, total_steps=2_000_000)),
     deploy=DeployConfig(episodes=10, duration_s=4.0, gate=GATE),
 )

@@ -76,7 +76,9 @@ class Link(composer.Entity):
 
 
 class Arm(ServoDriven):
-    """Six servos and what they carry."""
+    """Six servos and what they carry; between its goals' bounds it stays above the table."""
+
+    low, high = (-1.4, -1.65, 0.2, -1.6, -1.5, -0.8), (1.4, -0.3, 1.6, -1.0, 1.5, 0.8)
 
     def _build(self, name: str = "so101") -> None:
         self._model = mjcf.RootElement(model=name)
@@ -114,3 +116,18 @@ class Table(composer.Arena):
         world.add("geom", name="top", type="plane", size=[0.6, 0.6, 0.05], rgba=[0.8, 0.82, 0.85, 1], **look)
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.2], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
         self.opening = world.add("site", name="opening")  # x holds the jaw's angle [rad]
+
+    def _build_observables(self) -> composer.Observables:
+        found = super()._build_observables()
+        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
+        return found
+
+    @composer.observable
+    def target_position(self, physics: Any) -> Any:
+        """Return where the target is ``(3,)`` [m]."""
+        return physics.bind(self.target).xpos
+
+    @composer.observable
+    def target_opening(self, physics: Any) -> Any:
+        """Return how far the jaws shall be open there, ``(1,)`` [rad]."""
+        return physics.bind(self.opening).pos[:1]

@@ -25,7 +25,7 @@ from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.messages import JointReading
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
-from .parts import JOINTS, SHEET
+from .parts import JOINTS, SHEET, Arm
 from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
 LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
@@ -47,8 +47,8 @@ class SO101Robot(ServoRobot):
     servos = Servos(
         joints=JOINTS,
         ids=(1, 2, 3, 4, 5, 6),
-        low=(-1.4, -1.65, 0.2, -1.6, -1.5, -0.8),
-        high=(1.4, -0.3, 1.6, -1.0, 1.5, 0.8),
+        low=Arm.low,
+        high=Arm.high,
         sheet=SHEET,
         speed=1.5,
         rest=(0.0, -1.65, 1.6, -1.4, 0.0, -0.6),
@@ -57,11 +57,11 @@ class SO101Robot(ServoRobot):
     )
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
-        ("position", ("rad",) * 6),
-        ("velocity / 5", ("rad/s",) * 6),
-        ("goal less position", ("rad",) * 6),
-        ("10 x target less tip: outwards, sideways, up", ("m",) * 3),
-        ("opening less the jaw's", ("rad",)),
+        ("position", ("rad",) * 6, 5.0),
+        ("velocity / 5", ("rad/s",) * 6, 5.0),
+        ("goal less position", ("rad",) * 6, 6.0),
+        ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
+        ("opening less the jaw's", ("rad",), 6.0),
     )
 
     @property

@@ -55,6 +55,11 @@ BENCHES = {
             *("scripts/benches/recordings.py", "scripts/benches/sysid.py", "scripts/benches/sysid_rows.py"),
         ),
     ),
+    "interop": Bench(
+        "interop",
+        "our PPO against brax's, in the same environment",
+        (*_GRAPH, "sim2real/train", "sim2real/interop", "sim2real/composer/interop", "scripts/benches/train.py"),
+    ),
     "league": Bench(
         "league",
         "every recording, held out in parts, against mujoco.sysid, PACE and BAM",

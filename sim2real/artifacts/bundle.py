@@ -10,6 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
 from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 
@@ -82,6 +83,7 @@ class Bundle:
         weights: Name -> array, as ``Policy.from_weights`` takes them.
         history: How training went; None where only the policy was copied.
         episodes: What its episodes were drawn from; None where only the policy was copied.
+        sensitivity: How the policy does where a parameter is wrong; None where that was not simulated.
         path: Its folder; None before it was saved.
     """
 
@@ -90,6 +92,7 @@ class Bundle:
     history: History | None = None
     episodes: Episodes | None = None
     path: Path | None = None
+    sensitivity: Sensitivity | None = None
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into the folder of a train stage.
@@ -102,7 +105,12 @@ class Bundle:
         if self.history is not None:
             self.history.save(folder / HISTORY)
             written["history"] = HISTORY
-        return written if self.episodes is None else {**written, **self.episodes.save(folder)}
+        if self.episodes is not None:
+            written |= self.episodes.save(folder)
+        if self.sensitivity is not None:
+            self.sensitivity.save(folder / SENSITIVITY)
+            written["sensitivity"] = SENSITIVITY
+        return written
 
     @staticmethod
     def load(path: Path) -> Bundle:
@@ -119,4 +127,6 @@ class Bundle:
         beside = folder.with_name(HISTORY)
         history = History.load(beside) if beside.is_file() else None
         episodes = Episodes.load(folder.parent) if folder.with_name(EPISODES).is_file() else None
-        return Bundle(contract, read_weights(folder), history, episodes, folder)
+        other = folder.with_name(SENSITIVITY)
+        weak = Sensitivity.load(other) if other.is_file() else None
+        return Bundle(contract, read_weights(folder), history, episodes, folder, weak)

@@ -18,11 +18,15 @@ class ObservationTerm:
         name: Its name, e.g. ``"past_actions"``.
         units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` stands for no unit.
         history: Number of steps that the vector has of it, newest step first.
+        low: Lower bound of each entry [its unit]; empty: not known. No policy is clipped to it.
+        high: Upper bound of each entry [its unit]; empty: not known.
     """
 
     name: str
     units: tuple[str, ...]
     history: int = 1
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the term has at least one entry."""
@@ -32,6 +36,26 @@ class ObservationTerm:
                 f"got units={self.units!r} and history={self.history!r}",
                 hint="units is a tuple with one unit per entry, e.g. ('rad/s',)",
             )
+        bounds = len(self.low), len(self.high)
+        if bounds not in ((0, 0), (self.size, self.size)) or any(
+            not -math.inf < low < high < math.inf for low, high in zip(self.low, self.high, strict=True)
+        ):
+            raise UsageError(
+                f"observation term {self.name!r} of {self.size} entries has bounds low={self.low}, high={self.high}",
+                hint="give each entry both, finite and with low < high, or none of them any",
+            )
+
+    @classmethod
+    def within(cls, name: str, units: tuple[str, ...], most: float = math.inf) -> ObservationTerm:
+        """Return a term of the present whose entries are at most ``most`` away from 0.
+
+        Args:
+            name: Its name.
+            units: The unit of each entry.
+            most: The largest magnitude [their units]; infinite: not known.
+        """
+        known = math.isfinite(most)
+        return cls(name, units, 1, (-most,) * len(units) * known, (most,) * len(units) * known)
 
     @property
     def size(self) -> int:
@@ -116,7 +140,11 @@ class PolicyContract:
     def to_dict(self) -> dict[str, Any]:
         """Return the contract as plain data for JSON."""
         data = dataclasses.asdict(self)
-        data["observation"] = [dataclasses.asdict(term) | {"size": term.size} for term in self.observation]
+        data["observation"] = [
+            {name: v for name, v in dataclasses.asdict(term).items() if v or name not in ("low", "high")}
+            | {"size": term.size}
+            for term in self.observation
+        ]
         data["delays_s"], data["limits"], data["hashes"] = dict(self.delays_s), dict(self.limits), dict(self.hashes)
         return data
 
@@ -130,7 +158,10 @@ class PolicyContract:
         try:
             return cls(
                 observation=tuple(
-                    ObservationTerm(term["name"], tuple(term["units"]), int(term["history"]))
+                    ObservationTerm(
+                        *(term["name"], tuple(term["units"]), int(term["history"])),
+                        *(tuple(map(float, term.get(bound, ()))) for bound in ("low", "high")),
+                    )
                     for term in data["observation"]
                 ),
                 action=tuple(

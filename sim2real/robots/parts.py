@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from dm_env import specs
 
+from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.robot import Robot
 from sim2real.composer.task import Task
@@ -68,9 +71,13 @@ class ServoDriven(Robot):
 
     Attributes:
         servos: The servos.
+        low: Lowest goals [rad]; default: half a turn below 0.
+        high: Highest goals [rad]; default: half a turn above 0.
     """
 
     servos: tuple[Servo, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
 
     @property
     def joints(self) -> list[Any]:
@@ -81,6 +88,21 @@ class ServoDriven(Robot):
     def actuators(self) -> list[Any]:
         """The motors of the servos."""
         return [s.actuator for s in self.servos]
+
+    def _build_observables(self) -> composer.Observables:
+        found = super()._build_observables()
+        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
+        return found
+
+    @composer.observable
+    def joint_positions(self, physics: Any) -> Any:
+        """Return the joints' angles ``(joints,)`` [rad]."""
+        return physics.bind(self.joints).qpos
+
+    @composer.observable
+    def joint_velocities(self, physics: Any) -> Any:
+        """Return the joints' speeds ``(joints,)`` [rad/s]."""
+        return physics.bind(self.joints).qvel
 
     def initialize_episode(self, physics: Any, random_state: Any) -> None:
         """Set goals and setpoints to the joints' positions."""
@@ -110,6 +132,14 @@ class GoalTask(Task):
     def joints(self) -> list[Any]:
         """The joints of the robot's servos."""
         return self.robot.joints
+
+    def action_spec(self, physics: Any) -> specs.BoundedArray:
+        """Return shape ``(joints,)`` and bounds of the goals [rad]; its name lists the joints, separated by tabs."""
+        del physics
+        count = len(self.robot.servos)
+        names = "\t".join(servo.mjcf_model.model for servo in self.robot.servos)
+        low, high = self.robot.low or (-math.pi,) * count, self.robot.high or (math.pi,) * count
+        return specs.BoundedArray((count,), float, low, high, name=names)
 
     def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
         """Set the goals.

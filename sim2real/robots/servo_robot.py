@@ -32,6 +32,7 @@ from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import GoalTask
+from sim2real.robots.seen import Feature, servo_terms
 from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
 from sim2real.robots.training import Draw
@@ -46,7 +47,8 @@ class ServoRobot(LoopRobot):
     Attributes:
         servos: The servos.
         aim: What an episode is about: names and units of its entries.
-        features: What the policy sees of the present: names and units; see ``observe``.
+        features: What the policy sees of the present: names and units; see ``observe``. A third entry is the largest
+            magnitude that its values can have, where that is known.
         history: Past steps that the policy sees.
         position_sigma_rad: Deviation of a measured position.
         velocity_sigma_rad_s: Deviation of a measured velocity.
@@ -60,7 +62,7 @@ class ServoRobot(LoopRobot):
 
     servos: Servos
     aim: tuple[tuple[str, str], ...] = ()
-    features: tuple[tuple[str, tuple[str, ...]], ...] | None = None
+    features: tuple[Feature, ...] | None = None
     history: int = 3
     position_sigma_rad: float = 0.002
     velocity_sigma_rad_s: float = 0.05
@@ -158,17 +160,7 @@ class ServoRobot(LoopRobot):
     @property
     def observation(self) -> tuple[ObservationTerm, ...]:
         """Terms of the policy's observation."""
-        n = len(self.servos.joints)
-        default = (
-            ("position", ("rad",) * n),
-            ("velocity", ("rad/s",) * n),
-            ("goal", ("rad",) * n),
-            ("aim", tuple(unit for _, unit in self.aim)),
-        )
-        present = tuple(ObservationTerm(name, units) for name, units in self.features or default if units)
-        units = ("rad",) * n + ("rad/s",) * n + ("rad",) * n
-        past = (ObservationTerm("past position, velocity, goal", units, self.history),) if self.history else ()
-        return present + past
+        return servo_terms(self.servos, self.aim, self.features, self.history)
 
     @property
     def action(self) -> tuple[ActionTerm, ...]:

@@ -98,6 +98,11 @@ class CompiledGraph:
         """Return the row of the last of the supervisor's first ``steps (E,)`` steps in each episode, ``(E,)``."""
         return self._walk.last_row(steps)
 
+    @property
+    def turns(self) -> np.ndarray:
+        """Where the supervisor makes a step, bool of shape ``(episodes, rows)``."""
+        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self._walk.turns], axis=0)
+
     def init(
         self,
         rng: jax.Array,

@@ -263,8 +263,7 @@ MODEL_IDENTIFY = IdentifyConfig(
     jacobian="finite",
     max_delay_s=0.05,
 )
-"""How a robot of a model is identified: rough values are known, so there is no search; short segments, whose starts are
-read off the log."""
+"""How a robot of a model is identified: rough values are known, so there is no search; starts are read off the log."""
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.noise import Noise
+from sim2real.artifacts.run_folder import newest
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
 from sim2real.robots.devices import SimSensor
 from sim2real.robots.loop import DELAYS
@@ -23,7 +26,7 @@ from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.train_config import TrainConfig
 from sim2real.train.draws import draw_robots
-from sim2real.train.env import GraphEnvironment
+from sim2real.train.env import GraphEnvironment, TrainingTask
 from sim2real.train.timelines import Drawn, Recorded, draw_timelines
 
 _SHOWN = 5000
@@ -48,7 +51,12 @@ class Prepared:
 
 
 def prepare(
-    pipeline: Pipeline, config: TrainConfig, found: Identification | None = None, timing: Timing | None = None
+    pipeline: Pipeline,
+    config: TrainConfig,
+    found: Identification | None = None,
+    timing: Timing | None = None,
+    changed: Mapping[str, float] | None = None,
+    robot: Robot | None = None,
 ) -> Prepared:
     """Make the environment.
 
@@ -58,9 +66,12 @@ def prepare(
         found: What identify found; the nominal model needs none.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
             nominal model has no delays.
+        changed: Parameters with other values than the model's; the nominal model has delays where both are among them.
+        robot: The pipeline's robot in its world, with changes of its own; default: without.
 
     Raises:
-        UsageError: When the identified model is asked for without an identification, or in another world.
+        UsageError: When the identified model is asked for without an identification, in another world, or a parameter
+            is not known.
         Sim2RealError: When the identification is of another robot or was not accepted, or its timing cannot be trained
             with.
     """
@@ -71,15 +82,16 @@ def prepare(
     else:
         check_parameters(found, pipeline)
         require_accepted(found, config)
-    robot = moving_robot(pipeline, _world(config, found))
-    values = robot.nominal() if found is None or found.posterior is None else found.values
+    robot = robot or moving_robot(pipeline, _world(config, found))
+    values = _changed(robot.nominal() if found is None or found.posterior is None else found.values, changed or {})
     rng = np.random.default_rng(config.seed)
     draws = draw_robots(values, found, config.vary, config.randomise, rng)
+    draws = {n: d for n, d in draws.items() if n not in (changed or ())}
     recorded = None
     if found is not None:
         timing = timing or timing_of(found)
         recorded = Recorded.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
-    nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, recorded is not None)
+    nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, set(DELAYS) <= set(values))
     if recorded:
         recorded.transport_to(nodes)
     noise = _disturb(nodes[robot.roles.sensor], found, config)
@@ -101,6 +113,22 @@ def timing_of(found: Identification) -> Timing:
             hint="name the folder that identify wrote, or run `sim2real identify` again",
         )
     return found.timing
+
+
+def _changed(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
+    """Return the model's values with others in place of some.
+
+    Raises:
+        UsageError: When one is not known, or only one of two delays is given.
+    """
+    known = dict.fromkeys([*values, *DELAYS])
+    if unknown := sorted(set(changed) - set(known)):
+        raise UsageError(f"there is no parameter {unknown[0]!r}. Available: {', '.join(known)}")
+    made = {**values, **changed}
+    given = set(DELAYS) & set(made)
+    if len(given) == 1 and given & set(changed):
+        raise UsageError(f"only {given.pop()!r} was given: a loop has {' and '.join(DELAYS)}")
+    return made
 
 
 def require_accepted(found: Identification, config: TrainConfig) -> None:
@@ -203,3 +231,42 @@ def _off(found: Identification | None, noise: tuple[Noise, ...]) -> dict[str, np
             own = np.asarray(found.samples[measured] - found.samples[model], np.float64)
             off[n.column] = own[np.isfinite(own)][:_SHOWN]
     return off
+
+
+def find_parameters(
+    pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None
+) -> tuple[Path | None, Path | None]:
+    """Return the identification to train on, None for the nominal model, and the run folder to write into.
+
+    Args:
+        pipeline: The robot.
+        config: The stage's configuration.
+        root: Folder of all runs.
+        run_dir: Run folder; None: the newest one with an identification.
+    """
+    if config.model == "nominal":
+        return None, run_dir
+    if config.parameters is not None:
+        return Path(config.parameters), run_dir
+    found = newest(root, pipeline.name, "identify", run_dir)
+    return found.output("parameters"), run_dir or found.run_dir
+
+
+def contract_of(robot: Robot, task: TrainingTask, values: Mapping[str, float]) -> PolicyContract:
+    """Return what a policy of a robot sees and does.
+
+    Args:
+        robot: The robot.
+        task: Its task, with the actions' bounds.
+        values: Parameters by name, whose delays the policy is trained with.
+    """
+    return PolicyContract(
+        observation=robot.observation,
+        action=tuple(
+            replace(term, low=float(low), high=float(high))
+            for term, low, high in zip(robot.action, task.action_low, task.action_high, strict=True)
+        ),
+        rate_hz=robot.rate_hz,
+        delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
+        hashes={},
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +14,11 @@ import numpy as np
 from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.run_folder import OpenStage, StageFolder, newest, open_stage
+from sim2real.artifacts.run_folder import OpenStage, StageFolder, open_stage
+from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
-from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
+from sim2real.robots.loop_robot import LoopRobot
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.events import event_files
@@ -25,9 +26,11 @@ from sim2real.stages.explaining import explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
-from sim2real.stages.prepared import prepare, require_accepted, timing_of
+from sim2real.stages.prepared import contract_of, find_parameters, prepare, require_accepted, timing_of
 from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
 from sim2real.stages.robot import moving_robot
+from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitivity, with_room
+from sim2real.train.networks import Policy
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 from sim2real.train.sweep import Sweep, named
@@ -72,8 +75,11 @@ def train(
         result = patiently(
             lambda: learn(made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep)
         )
-    contract = _contract(made.robot, made.env.task, made.values)
-    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes)
+    contract = contract_of(made.robot, made.env.task, made.values)
+    weak = None
+    if config.sensitivity:
+        weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
+    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes, sensitivity=weak)
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
@@ -86,7 +92,26 @@ def train(
         "episodes that end at a pause": f"{made.episodes.cut} of {made.episodes.timelines}",
         "timelines drawn again": made.episodes.again,
     }
-    return bundle, about
+    return bundle, about if weak is None else {**about, "what breaks it": weak.said}
+
+
+def _sensitivity(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None,
+    timing: Timing | None,
+    robot: Robot,
+    policy: Policy,
+) -> Sensitivity | None:
+    """Return how the policy does where one parameter is wrong; None where nothing says by how much it may be."""
+    if config.model == "nominal" or identification is None or not isinstance(robot, LoopRobot):
+        return None
+    moves = moves_of(identification)
+    models = models_of(identification.values, moves)
+    wide = with_room(robot, models)
+    few = replace(config, timelines=TIMELINES)
+    env = prepare(pipeline, few, identification, timing, robot=wide).env
+    return sensitivity(wide, env, policy, moves, models, config.seed)
 
 
 def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -101,7 +126,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     moving_robot(pipeline)  # before anything is read
     interrupted = find_interrupted(pipeline.name, config, root)
     run_dir = run_dir if interrupted is None else interrupted.run_dir
-    path, run_dir = _find_parameters(pipeline, config, root, run_dir)
+    path, run_dir = find_parameters(pipeline, config, root, run_dir)
     if interrupted is not None:
         check_same_parameters(interrupted, path)
     identification = None if path is None else open_identification(path, pipeline)
@@ -139,31 +164,6 @@ def _watching(stage: OpenStage, config: TrainConfig) -> AbstractContextManager[C
         return nullcontext()
     names = Sweep.parse(config.sweep).names(config.ppo.num_seeds)
     return event_files(stage.output("tensorboard", "tensorboard"), names)
-
-
-def _find_parameters(
-    pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None
-) -> tuple[Path | None, Path | None]:
-    """Return the identification to train on, None for the nominal model, and the run folder to write into."""
-    if config.model == "nominal":
-        return None, run_dir
-    if config.parameters is not None:
-        return Path(config.parameters), run_dir
-    found = newest(root, pipeline.name, "identify", run_dir)
-    return found.output("parameters"), run_dir or found.run_dir
-
-
-def _contract(robot: Robot, task: Any, values: Mapping[str, float]) -> PolicyContract:
-    return PolicyContract(
-        observation=robot.observation,
-        action=tuple(
-            replace(term, low=float(low), high=float(high))
-            for term, low, high in zip(robot.action, task.action_low, task.action_high, strict=True)
-        ),
-        rate_hz=robot.rate_hz,
-        delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
-        hashes={},
-    )
 
 
 def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> None:

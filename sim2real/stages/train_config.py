@@ -34,6 +34,8 @@ class TrainConfig(LearningConfig):
     """In what they differ."""
     seed: int = 0
     """Seed of training."""
+    sensitivity: bool = True
+    """Afterwards, simulate which parameter breaks the policy if it is wrong by multiples of its uncertainty."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything is compiled."""

@@ -33,6 +33,7 @@ from sim2real.view.blocks import (
 )
 from sim2real.view.episodes import episodes_svg
 from sim2real.view.identify_section import identify_section
+from sim2real.view.sensitivity import sensitivity_blocks
 from sim2real.view.servos import DRY, servo_blocks
 from sim2real.view.signals import Signals, signals_of, simulated_series
 
@@ -75,7 +76,8 @@ def train_section(artifact: StageFolder) -> PageSection:
     rows = [[str(seed), number(float(curves.returns[-1, seed])), f"{last[seed]:.1%}"] for seed in range(seeds)]
     table = TableBlock("Each seed at the end", ("seed", "return", "success"), rows)
     lead = "A policy for the identified model, with the timing of the robot."
-    return PageSection("train", "Train", lead, tiles, [figure, table, *_drawn_blocks(artifact), *about(artifact)])
+    blocks = [figure, table, *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
+    return PageSection("train", "Train", lead, tiles, blocks)
 
 
 def _drawn_blocks(artifact: StageFolder) -> list[Block]:

@@ -180,7 +180,7 @@ def environment():
 def test_brax_runs_the_task_with_its_own_wrappers(environment):
     env = composer.BraxEnv(environment)
     assert (env.observation_size, env.action_size, env.backend, env.dt) == (3, 1, "mjx", 0.02)
-    wrapped = AutoResetWrapper(EpisodeWrapper(env, episode_length=1000, action_repeat=1))
+    wrapped = AutoResetWrapper(EpisodeWrapper(env, episode_length=env.max_episode_length, action_repeat=1))
 
     def run(key):
         def step(state, _):
@@ -190,12 +190,25 @@ def test_brax_runs_the_task_with_its_own_wrappers(environment):
         state = wrapped.reset(key)
         return state.obs, jax.lax.scan(step, state, length=25)[1]
 
-    first, (done, _, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
+    first, (done, truncation, observations) = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 3))
     assert first.shape == (3, 3)
     assert [np.flatnonzero(d).tolist() for d in np.asarray(done)] == [[9, 19]] * 3
+    np.testing.assert_array_equal(truncation, done)  # brax's learners go by this: a time limit is no failure
     starts = np.stack([first, observations[:, 9], observations[:, 19]])[..., 2]
     assert len(np.unique(starts)) == 9  # every episode of every copy starts somewhere else
     assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
+
+
+def test_brax_s_wrapper_must_not_go_on_past_the_time_limit(environment):
+    wrapped = EpisodeWrapper(composer.BraxEnv(environment), episode_length=1000, action_repeat=1)
+
+    def run(key):
+        play = lambda state, _: (new := wrapped.step(state, jnp.ones(1)), (new.done, new.reward))  # noqa: E731
+        return jax.lax.scan(play, wrapped.reset(key), length=11)[1]
+
+    done, reward = jax.jit(run)(jax.random.key(0))
+    assert not done.any(), "brax takes an environment's own `done` for a failure"
+    assert np.isnan(reward).tolist() == [False] * 10 + [True]
 
 
 def test_brax_may_save_the_fresh_starts(environment):
@@ -234,7 +247,8 @@ def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
 def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])
-    vector._state = vector._state.replace(data=vector._state.data.replace(qpos=places))
+    state = vector._moment.state
+    vector._moment = vector._moment._replace(state=state.replace(data=state.data.replace(qpos=places)))
     _, reward, terminated, truncated, infos = vector.step(np.zeros((4, 1)))
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
@@ -243,14 +257,18 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "needed"),
-    [("BraxEnv", "brax_env", "brax.envs.base"), ("MjxVectorEnv", "vector_env", "gymnasium")],
+    ("name", "modules", "needed"),
+    [
+        ("BraxEnv", ("brax_env", "counted"), "brax.envs.base"),
+        ("MjxVectorEnv", ("vector_env", "copies"), "gymnasium"),
+    ],
 )
-def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):
+def test_without_the_other_library_the_error_names_the_extra(name, modules, needed, monkeypatch):
     monkeypatch.delitem(vars(composer), name, raising=False)
-    monkeypatch.delitem(sys.modules, f"sim2real.composer.interop.{module}", raising=False)
+    for module in modules:
+        monkeypatch.delitem(sys.modules, f"sim2real.composer.interop.{module}", raising=False)
     monkeypatch.setitem(sys.modules, needed, None)
     library = needed.partition(".")[0]
-    with pytest.raises(Sim2RealError, match=f"{name} needs {library}, which is not installed") as caught:
+    with pytest.raises(Sim2RealError, match=f"for {library} need {library}, which is not installed") as caught:
         getattr(composer, name)
     assert caught.value.hint == "pip install 'sim2real[interop]'"

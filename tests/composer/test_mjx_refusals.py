@@ -213,8 +213,19 @@ def test_actions_of_a_task_s_own_and_after_compile():
     assert environment.mjx_model.opt.gravity.tolist() == [0, 0, -1]
     after = jax.eval_shape(environment.step, jax.eval_shape(environment.reset, jax.random.key(0)), jnp.zeros(3))
     assert after.data.ctrl.shape == (1,)
-    assert composer.BraxEnv(environment).action_size == 3
     pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
+    with pytest.raises(
+        UsageError, match=r"Steered shows its policy nothing: no observable is enabled\. There are: none"
+    ):
+        composer.MjxVectorEnv(environment, 2)
+
+    class Shown(Steered):
+        @composer.observable
+        def height(self, physics):
+            return physics.bind(self.tip).xpos[2:]
+
+    environment = composer.MjxEnvironment(Shown())
+    assert composer.BraxEnv(environment).action_size == 3
     space = composer.MjxVectorEnv(environment, 2).single_action_space
     assert (space.low.tolist(), space.high.tolist()) == ([-1, -2, -np.inf], [1, 1, 1])
 

@@ -212,7 +212,7 @@ def test_masses_sizes_and_options_differ_from_copy_to_copy_as_on_jax(installed, 
 def test_environments_of_brax_and_gymnasium_run_on_it(installed):
     environment = composer.MjxEnvironment(Throw(), time_limit=3 * SUBSTEPS * 0.004, impl="warp", nconmax=4)
     wrappers = pytest.importorskip("brax.envs.wrappers.training")
-    wrapped = wrappers.wrap(composer.BraxEnv(environment), episode_length=100)
+    wrapped = wrappers.wrap(composer.BraxEnv(environment), episode_length=3)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
     for _ in range(4):
         state = jax.jit(wrapped.step)(state, jnp.zeros((2, 2)))

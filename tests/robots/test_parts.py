@@ -5,6 +5,8 @@ import pytest
 from small_robot import SHEET, PairTask, play_in_a_graph, play_on_c
 
 from sim2real import composer
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline import load_pipeline
 
 STEP_S = 0.005
 
@@ -99,3 +101,18 @@ def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
     np.testing.assert_allclose(later.position, positions, atol=1e-3)
     np.testing.assert_allclose(later.velocity, speeds, atol=0.05)
     np.testing.assert_allclose(rewards, expected, atol=1e-3)
+
+
+def test_other_learners_see_the_joints_and_get_bounds_for_the_goals():
+    """A composed task of servos, without its graph, for brax and gymnasium: what it shows, and what it may be told."""
+    pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
+    task = load_pipeline("arm").load().make_task()
+    with pytest.raises(UsageError, match=r"Reach shows its policy nothing: no observable is enabled\. There are: '"):
+        composer.MjxVectorEnv(composer.MjxEnvironment(task), 2)
+    for observable in task.observables.values():
+        observable.enabled = True
+    env = composer.MjxVectorEnv(composer.MjxEnvironment(task), 2)
+    shapes = {name.split("/")[-1]: space.shape for name, space in env.single_observation_space.items()}
+    assert shapes == dict.fromkeys(("joint_positions", "joint_velocities", "target_position"), (1, 3))
+    assert env.single_action_space.high.tolist() == pytest.approx([1.4, 1.4, 1.6])
+    assert env.single_action_space.low.tolist() == pytest.approx([-1.4, -1.4, -1.6])

@@ -115,3 +115,15 @@ def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(tr
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
     price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.servos.speed) ** 2)
     np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)
+
+
+def test_what_is_seen_lies_within_its_bounds(pair, trained):
+    terms = pair.observation
+    assert [t.name for t in terms] == ["position", "velocity", "goal", "aim", "past position, velocity, goal"]
+    unknown = (-np.inf,), (np.inf,)
+    low, high = (np.concatenate([np.tile(getattr(t, b) or unknown[i], t.history) for t in terms])
+                 for i, b in enumerate(("low", "high")))  # fmt: skip
+    seen = np.concatenate([trained.first[None], trained.rows["seen"]])
+    assert seen.shape[1] == len(low) == len(high)
+    assert ((seen >= low - 1e-6) & (seen <= high + 1e-6)).all()
+    assert np.isfinite(low).sum() == len(low) - 1, "nothing is known of the aim"

@@ -95,6 +95,17 @@ def test_randomise(run):
     assert robot["identified"]["gain"] == pytest.approx(robot["truth"]["gain"], rel=0.3)
 
 
+@pytest.mark.slow
+def test_interop(run):
+    pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
+    report = run("interop")
+    name = f"interop/{jax.default_backend()}/pendulum"
+    values = {row["name"].removeprefix(f"{name}/"): row["value"] for row in report["rows"]}
+    assert values["level"] == min(values["ours/best_return"], values["brax/best_return"]) < 0
+    assert values["brax/time_to_level_s"] > values["brax/time_to_level_without_compiling_s"] > 0
+    assert {len(curve) for curve in report["curves"].values()} == {2}
+
+
 def test_async(run):
     assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
 

@@ -2,85 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import jax
 import numpy as np
 from dm_env import specs
 
+from sim2real.composer.interop.copies import AutoresetMode, CopiesVectorEnv, gymnasium
+from sim2real.composer.interop.task import PureTask, check_shown
 from sim2real.composer.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
-from sim2real.errors import Sim2RealError, UsageError
-
-if TYPE_CHECKING:
-    from sim2real.composer.types import ArrayLike
-
-try:
-    import gymnasium
-    from gymnasium.vector import AutoresetMode, VectorEnv
-except ImportError as error:
-    raise Sim2RealError(
-        "MjxVectorEnv needs gymnasium, which is not installed", hint="pip install 'sim2real[interop]'"
-    ) from error
+from sim2real.errors import UsageError
 
 
-class MjxVectorEnv(VectorEnv):
-    """Copies of a task, with the interface of ``gymnasium.vector``; a copy that is done starts anew at the next step.
+class MjxVectorEnv(CopiesVectorEnv):
+    """Copies of a task, with the interface of ``gymnasium.vector``; observations are dictionaries of observables.
 
     Args:
         environment: The task as a pure environment.
         num_envs: Number of copies.
+        autoreset_mode: What happens to a copy that is done; see ``CopiesVectorEnv``.
+
+    Raises:
+        UsageError: When the task shows its policy nothing, or its action is not one array.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012 - gymnasium's own form
-
-    def __init__(self, environment: MjxEnvironment, num_envs: int) -> None:
-        self.environment, self.num_envs = environment, num_envs
-        self.single_action_space = _action_box(environment.action_spec())
-        self.single_observation_space = gymnasium.spaces.Dict(
-            {k: _box(v) for k, v in environment.observation_spec().items()}
-        )
-        batch = gymnasium.vector.utils.batch_space
-        self.action_space = batch(self.single_action_space, num_envs)
-        self.observation_space = batch(self.single_observation_space, num_envs)
-        self._reset = jax.jit(jax.vmap(environment.reset))
-        self._step = jax.jit(jax.vmap(environment.step))
-        self._select = jax.jit(jax.vmap(environment.select))
-        self._key = jax.random.key(0)
-        self._state: Any = None
-        self._done = np.zeros(num_envs, bool)
-
-    def _keys(self) -> jax.Array:
-        self._key, key = jax.random.split(self._key)
-        return jax.random.split(key, self.num_envs)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start all copies; return observations and infos."""
-        del options
-        if seed is not None:
-            self._key = jax.random.key(seed)
-        self._state = self._reset(self._keys())
-        self._done = np.zeros(self.num_envs, bool)
-        return self._observation(), {"failed": np.asarray(self._state.failed)}
-
-    def step(
-        self, actions: ArrayLike
-    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step all copies; return observations, rewards, terminations, truncations and infos."""
-        before, done = self._state, self._done
-        self._state = self._step(before, np.asarray(actions))
-        if done.any():
-            self._state = self._select(done, self._reset(self._keys()), self._state)
-        state = self._state
-        truncated = np.asarray(state.truncated)
-        self._done = np.asarray(state.done)
-        infos = {"discount": np.asarray(state.discount), "failed": np.asarray(state.failed)}
-        return self._observation(), np.asarray(state.reward), self._done & ~truncated, truncated, infos
-
-    def _observation(self) -> dict[str, np.ndarray]:
-        return {k: np.asarray(v) for k, v in self._state.observation.items()}
+    def __init__(
+        self,
+        environment: MjxEnvironment,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self.environment = environment
+        action = _action_box(environment.action_spec())
+        observation = gymnasium.spaces.Dict({k: _box(v) for k, v in check_shown(environment).items()})
+        super().__init__(PureTask(environment, flat=False), num_envs, observation, action, autoreset_mode)
 
 
 def _action_box(spec: object) -> gymnasium.spaces.Box:

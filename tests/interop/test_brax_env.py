@@ -1,0 +1,79 @@
+"""A robot as a brax environment: actions, starts and ends of episodes under brax's own wrappers.
+
+brax's own PPO trains on it in `tests/scripts/test_benches.py`.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
+from brax.envs.wrappers.training import wrap
+
+from sim2real.interop import brax_env
+
+
+@pytest.fixture(scope="module")
+def played(pendulum):
+    """Two episodes of two copies, under the wrappers with which brax's learners train."""
+    env = brax_env(pendulum)
+    wrapped = wrap(env, episode_length=env.max_episode_length)
+
+    def run(keys):
+        def step(state, _):
+            state = wrapped.step(state, jnp.full((2, 1), 0.5))
+            kept = {n: state.info[n] for n in ("truncation", "steps")}
+            return state, {"obs": state.obs, "done": state.done, "reward": state.reward, **kept, **state.metrics}
+
+        first = wrapped.reset(keys)
+        return first.obs, jax.lax.scan(step, first, length=50)[1]
+
+    first, rows = jax.jit(run)(jax.random.split(jax.random.PRNGKey(0), 2))  # brax knows no typed keys
+    return env, np.asarray(first), jax.tree.map(np.asarray, rows)
+
+
+def test_its_sizes_and_its_period(played):
+    env, first, _ = played
+    assert (env.observation_size, env.action_size, env.dt, env.max_episode_length) == (19, 1, 0.02, 24)
+    assert first.shape == (2, 19)
+
+
+def test_brax_sees_a_time_limit_as_a_truncation(played):
+    rows = played[2]
+    assert [np.flatnonzero(rows["done"][:, i]).tolist() for i in range(2)] == [[23, 47]] * 2
+    np.testing.assert_array_equal(rows["truncation"], rows["done"])
+    assert np.isfinite(rows["reward"]).all()
+
+
+def test_every_episode_starts_somewhere_else(played):
+    _, first, rows = played
+    starts = np.concatenate([first, rows["obs"][23], rows["obs"][47]])
+    assert len(np.unique(starts[:, :2], axis=0)) == 6
+
+
+def test_metrics_are_those_of_the_whole_episode_where_it_ends(played):
+    rows = played[2]
+    np.testing.assert_allclose(rows["return"][23], rows["reward"][:24].sum(axis=0), rtol=1e-4)
+    assert not rows["return"][:23].any()
+    assert set(rows) >= {"success"}
+
+
+def test_actions_between_minus_one_and_one_span_the_bounds(played):
+    rows = played[2]
+    np.testing.assert_allclose(rows["obs"][5][:, 15], 1.0)  # half of 2 V
+
+
+def test_past_the_time_limit_there_is_no_reward_to_learn_from(pendulum):
+    env = brax_env(pendulum)
+
+    @jax.jit
+    def run(key):
+        state = env.reset(key)
+        state = state.replace(info={**state.info, "steps": jnp.float32(0)})  # as under brax's EpisodeWrapper
+        play = lambda state, _: (new := env.step(state, jnp.zeros(1)), (new.reward, new.done))  # noqa: E731
+        return jax.lax.scan(play, state, length=25)[1]
+
+    reward, done = run(jax.random.PRNGKey(0))
+    assert np.isnan(reward).tolist() == [False] * 24 + [True]
+    assert not done.any()

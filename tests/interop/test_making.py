@@ -1,0 +1,61 @@
+"""From a pipeline, a robot or a run to an environment: what is taken, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sim2real
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.interop import making, robot_environment
+
+
+def delays(made):
+    """The two delays that an environment's episodes are drawn around."""
+    return {n: v for n, v in made.steps.env.task.values.items() if n.endswith("_delay")}
+
+
+def test_the_nominal_model_has_delays_where_they_are_given(pendulum):
+    assert sum(delays(pendulum).values()) == pytest.approx(0.045)
+    assert delays(robot_environment("pendulum", "nominal")) == {}
+    robot = sim2real.load_pipeline("pendulum").load()
+    assert robot_environment(robot, "nominal").steps.env.task.values == robot.nominal()
+
+
+def test_parameters_may_have_other_values(pendulum):
+    made = robot_environment("pendulum", "nominal", {"damping": 3.5})
+    assert made.steps.env.task.values["damping"] == 3.5
+
+
+def test_what_does_not_exist_is_named(tmp_path):
+    with pytest.raises(UsageError, match=r"there is no parameter 'mass'\. Available: gain, gravity, damping, friction"):
+        robot_environment("pendulum", "nominal", {"mass": 1.0})
+    with pytest.raises(UsageError, match="only 'sensor_delay' was given: a loop has sensor_delay and actuator_delay"):
+        robot_environment("pendulum", "nominal", {"sensor_delay": 0.01})
+    with pytest.raises(UsageError, match="there is no file, pipeline or run 'pendulun'"):
+        robot_environment("pendulun", runs=tmp_path)
+    with pytest.raises(Sim2RealError, match="identify"):
+        robot_environment("pendulum", runs=tmp_path)
+
+
+def test_the_package_has_it_without_an_import():
+    assert sim2real.interop.robot_environment is robot_environment
+
+
+def test_no_module_hides_a_function():
+    folder = Path(sim2real.interop.__file__).parent
+    assert not {path.stem for path in folder.glob("*.py")} & set(vars(making))
+
+
+def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
+    from dataclasses import replace
+
+    from sim2real.interop.environment import RobotEnvironment
+    from sim2real.stages.prepared import contract_of
+
+    env = pendulum.steps.env
+    contract = contract_of(sim2real.load_pipeline("pendulum").load(), env.task, {})
+    contract = replace(contract, observation=contract.observation[1:])
+    with pytest.raises(UsageError, match="observation terms have 16 entries, its task shows 19"):
+        RobotEnvironment(env, contract)
+    assert np.isfinite([e.low for e in pendulum.observation]).all()

@@ -1,0 +1,184 @@
+"""A robot as a gymnasium vector environment: spaces, seeds, ends of episodes, and refusals."""
+
+import math
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
+
+from sim2real.errors import UsageError  # noqa: E402
+from sim2real.interop import robot_environment, vector_env  # noqa: E402
+from sim2real.stages.pipeline import load_pipeline  # noqa: E402
+
+COPIES = 3
+
+
+@pytest.fixture(scope="module")
+def env(pendulum):
+    return vector_env(pendulum, COPIES)
+
+
+@pytest.fixture(scope="module")
+def same_step(pendulum, env):
+    made = vector_env(pendulum, COPIES, "SameStep")
+    made._step, made._start, made._restart = env._step, env._start, env._restart  # compiled once
+    return made
+
+
+def actions_of(seed, steps, env):
+    space = env.single_action_space
+    return np.random.default_rng(seed).uniform(space.low, space.high, (steps, env.num_envs, *space.shape))
+
+
+def play(env, seed, steps):
+    """Reset, and step with random actions; return all that came."""
+    rows = [(env.reset(seed=seed)[0], np.zeros(env.num_envs), *np.zeros((2, env.num_envs), bool), {})]
+    rows += [env.step(a) for a in actions_of(0, steps, env)]
+    return [list(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("name", ["pendulum", "arm", "so101"])
+def test_every_entry_has_a_name_a_unit_and_bounds(name):
+    robot = robot_environment(name, "nominal")
+    seen, done = robot.observation, robot.action
+    assert len(seen) == load_pipeline(name).load().observation_size
+    assert len({e.name for e in seen}) == len(seen)
+    assert all(e.unit and math.isfinite(e.low) and e.low < e.high < math.inf for e in (*seen, *done))
+    assert len(done) == {"pendulum": 1, "arm": 3, "so101": 6}[name]
+    assert {e.unit for e in done} == {"V" if name == "pendulum" else "rad/s"}
+    env = vector_env(robot, 2)  # compiles nothing
+    assert env.single_observation_space.shape == (len(seen),)
+    assert env.single_action_space.high.tolist() == pytest.approx([e.high for e in done])
+
+
+def test_names_units_and_bounds_are_in_the_order_of_the_observation(env):
+    found = {e.name: (i, e.unit, e.low, e.high) for i, e in enumerate(env.robot.observation)}
+    assert found["cos(th), sin(th), thdot / 10[0][2]"] == (2, "rad/s", -6.0, 6.0)
+    assert found["past voltage[0][0]"] == (15, "V", -2.0, 2.0)
+    env.reset(seed=0)
+    told = np.array([[1.5], [-0.5], [7.0]])
+    seen = env.step(told)[0]
+    np.testing.assert_allclose(seen[:, 15], [1.5, -0.5, 2.0])  # clipped to the bounds
+
+
+def test_observations_stay_within_the_space(env):
+    observations, rewards, *_ = play(env, 5, 30)
+    assert all(env.observation_space.contains(o) for o in observations)
+    assert rewards[1].dtype == np.float64
+    assert (np.array(rewards)[1:25] < 0).all()
+
+
+def test_a_seed_reproduces_episodes_and_each_copy_has_its_own(env):
+    first, again, other = (play(env, seed, 30)[0] for seed in (7, 7, 8))
+    np.testing.assert_array_equal(first, again)
+    starts = first[0]
+    assert len(np.unique(starts, axis=0)) == COPIES
+    np.testing.assert_array_equal(other[0][:-1], starts[1:])  # copy i has the seed + i
+    assert (first[25] != first[0]).any(axis=1).all()  # another episode
+
+
+def test_a_copy_s_episodes_do_not_depend_on_the_others(env, pendulum):
+    alone = env.reset(seed=[4, 9, 1])[0]
+    mixed = env.reset(seed=[9, 9, 4])[0]
+    np.testing.assert_array_equal(alone[[1, 1, 0]], mixed)
+
+
+def test_without_a_seed_the_next_reset_goes_on(env):
+    first = env.reset(seed=3)[0]
+    second = env.reset()[0]
+    assert (first != second).any(axis=1).all()
+    env.reset(seed=3)
+    np.testing.assert_array_equal(env.reset()[0], second)
+
+
+def test_the_time_limit_truncates_and_the_next_step_starts_anew(env):
+    observations, rewards, terminated, truncated, infos = play(env, 2, 26)
+    assert np.array(truncated).all(axis=1).tolist() == [i == 24 for i in range(27)]
+    assert not np.any(terminated)
+    assert rewards[25].tolist() == [0.0] * COPIES  # the step that starts anew
+    assert infos[24]["_success"].tolist() == [True] * COPIES
+    np.testing.assert_allclose(infos[24]["return"], np.sum(rewards[:25], axis=0), rtol=1e-4)
+    assert "success" not in infos[23]
+    history = observations[25][:, 3:]
+    assert not history.any(), "an episode's first observation has no history"
+
+
+def test_in_the_same_step_the_final_observation_is_in_the_infos(env, same_step):
+    late, _, _, _, told = play(env, 2, 25)
+    seen, _, _, truncated, infos = play(same_step, 2, 25)
+    np.testing.assert_array_equal(np.array(truncated)[:, 0].nonzero()[0], [24])
+    np.testing.assert_array_equal(np.stack(infos[24]["final_obs"]), late[24])
+    np.testing.assert_array_equal(seen[24], late[25])  # the same new episodes, a step earlier
+    np.testing.assert_array_equal(infos[24]["final_info"]["return"], told[24]["return"])
+    assert infos[24]["_final_obs"].all()
+    assert "final_obs" not in infos[23]
+
+
+def test_the_caller_may_reset_copies_that_are_done(env, pendulum):
+    made = vector_env(pendulum, COPIES, "Disabled")
+    made._step, made._start, made._restart = env._step, env._start, env._restart
+    play(made, 2, 24)
+    with pytest.raises(UsageError, match=r"copies \[0, 1, 2\] are done"):
+        made.step(np.zeros((COPIES, 1)))
+    mask = np.array([True, False, False])
+    before = np.asarray(made._moment.observation)
+    seen, _ = made.reset(options={"reset_mask": mask})
+    assert (seen[0] != before[0]).any()
+    np.testing.assert_array_equal(seen[1:], before[1:])
+    with pytest.raises(UsageError, match=r"copies \[1, 2\] are done"):
+        made.step(np.zeros((COPIES, 1)))
+    with pytest.raises(UsageError, match="reset_mask must be bool of shape"):
+        made.reset(options={"reset_mask": np.array([1, 0])})
+
+
+def test_wrong_actions_seeds_and_modes_are_refused_in_words(env, pendulum):
+    with pytest.raises(UsageError, match=r"step\(\) was called before reset\(\)"):
+        vector_env(pendulum, 2).step(np.zeros((2, 1)))
+    env.reset(seed=0)
+    with pytest.raises(UsageError, match=r"actions have shape \(3,\), 3 copies need \(3, 1\)"):
+        env.step(np.zeros(3))
+    with pytest.raises(UsageError, match=r"actions of copies \[1\] are not finite"):
+        env.step(np.array([[0.0], [np.nan], [1.0]]))
+    with pytest.raises(UsageError, match="actions must be real numbers, got <U1"):
+        env.step(np.full((3, 1), "a"))
+    with pytest.raises(UsageError, match="2 seeds were given for 3 copies"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(UsageError, match=r"unknown autoreset_mode 'Never'\. Available: NextStep, SameStep, Disabled"):
+        vector_env(pendulum, 2, "Never")
+    with pytest.raises(UsageError, match="num_envs must be at least 1"):
+        vector_env(pendulum, 0)
+
+
+def test_gymnasium_s_own_wrapper_counts_the_episodes(env):
+    wrapped = RecordEpisodeStatistics(env)
+    wrapped.reset(seed=1)
+    rows = [wrapped.step(a) for a in actions_of(0, 24, env)]
+    assert rows[-1][4]["episode"]["l"].tolist() == [24] * COPIES
+    np.testing.assert_allclose(rows[-1][4]["episode"]["r"], rows[-1][4]["return"], rtol=1e-4)
+
+
+class One(gymnasium.Env):
+    """The only copy, for gymnasium's checker, which knows no vector environments."""
+
+    def __init__(self, env):
+        self.env, self.metadata, self.render_mode = env, env.metadata | {"render_fps": 50}, None
+        self.observation_space, self.action_space = env.single_observation_space, env.single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        observation, _ = self.env.reset(seed=seed)
+        return observation[0], {}
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = self.env.step(action[None])
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+
+def test_gymnasium_s_checker_finds_nothing(pendulum, recwarn):
+    made = vector_env(pendulum, 1)
+    check_env(One(made), skip_render_check=True, skip_close_check=True)
+    told = [str(w.message) for w in recwarn if "gymnasium" in w.filename or "gym" in str(w.message)]
+    assert not [t for t in told if "symmetric and normalized" not in t], told  # actions are in volts

@@ -1,0 +1,143 @@
+"""Which parameter breaks a policy, where it is known: a pendulum that a constant voltage must hold at an angle.
+
+It comes to rest where gravity * sin(angle) = gain * voltage; so only these two decide, whatever damping and delays are.
+"""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.artifacts.identification import Estimate
+from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.sensitivity import Moved, Sensitivity
+from sim2real.errors import Sim2RealError
+from sim2real.graph.schedule import draw
+from sim2real.robots.loop import DelayParams
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.sensitivity import MULTIPLES, models_of, moves_of, sensitivity, with_room
+from sim2real.train.env import GraphEnvironment
+
+VALUES = {
+    "gain": 20.0, "gravity": 100.0, "damping": 20.0, "friction": 0.1, "sensor_delay": 0.02, "actuator_delay": 0.025,
+}  # fmt: skip
+VOLTS, NEAR_RAD = 2.0, 0.05
+ANGLE_RAD = np.arcsin(VALUES["gain"] * VOLTS / VALUES["gravity"])
+
+
+def found_with(errors, correlation=0.0, names=tuple(VALUES)):
+    """An identification with relative standard errors, and a correlation of the two delays."""
+    sigma = np.array([errors[n] for n in names])  # of logarithms, and of delays in seconds
+    matrix = np.eye(len(names))
+    matrix[-2, -1] = matrix[-1, -2] = correlation
+    kinds = tuple("linear" if n.endswith("delay") else "log" for n in names)
+    mean = np.array([v if k == "linear" else np.log(v) for v, k in zip(VALUES.values(), kinds, strict=True)])
+    low = np.where([k == "linear" for k in kinds], 0.0, mean - 2.0)
+    posterior = Posterior(
+        names, kinds, mean, matrix * np.outer(sigma, sigma), low, np.where(low == 0.0, 0.06, mean + 2)
+    )
+    estimates = []
+    for n, s in zip(names, sigma, strict=True):
+        half = 1.96 * s * (1.0 if n.endswith("delay") else VALUES[n])
+        ends = {"low95": VALUES[n] - half, "high95": VALUES[n] + half}
+        kind = "delay" if n.endswith("delay") else "dynamics"
+        estimates.append(Estimate(n, "s" if kind == "delay" else "u", kind, "", None, VALUES[n], "accepted", **ends))
+    total = float(np.sqrt(sigma[-2:] @ matrix[-2:, -2:] @ sigma[-2:]))
+    ends = {"low95": 0.045 - 1.96 * total, "high95": 0.045 + 1.96 * total}
+    estimates.append(Estimate("round_trip_delay", "s", "derived", "", None, 0.045, "accepted", **ends))
+    return SimpleNamespace(parameters=estimates, values=VALUES, posterior=posterior)
+
+
+SURE = dict.fromkeys(VALUES, 1e-3) | {"sensor_delay": 1e-3, "actuator_delay": 1e-3}
+
+
+class Holding(type(load_pipeline("pendulum").load())):
+    """Succeeds near the angle; all episodes start hanging at rest."""
+
+    def random_params(self, key, draw):
+        values = draw(key)
+        return self.resumed_params(values, jnp.array([np.pi, 0.0])) | {"sensor": DelayParams(values["sensor_delay"])}
+
+    def success(self, state):
+        return jnp.abs(jnp.abs(state.th - jnp.pi) - ANGLE_RAD) < NEAR_RAD
+
+
+@pytest.fixture(scope="module")
+def judged():
+    """The policy on all models; the gain is uncertain by 2 %."""
+    found = found_with({**SURE, "gain": 0.02})
+    moves = moves_of(found)
+    models = models_of(found.values, moves)
+    robot = with_room(Holding(), models)
+    nodes, task = robot.training(found.values, {}, {}, True)
+    env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
+    policy = SimpleNamespace(low=np.array([-2.0]), get_action=lambda observation: jnp.array([VOLTS]))
+    return sensitivity(robot, env, policy, moves, models, seed=0)
+
+
+def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
+    assert judged.success == 1.0
+    assert judged.parameters[0].name == "gain"
+    assert {p.name for p in judged.parameters} == {*VALUES, "round_trip_delay"}
+    assert [judged.breaks_at(p) for p in judged.parameters[1:]] == [None] * 6
+    assert judged.said.startswith("Measure 'gain' better: 4 half-widths of its 95 % interval ")
+
+
+def test_it_breaks_where_the_angle_is_too_far_off(judged):
+    gain = judged.parameters[0]
+    angle = np.arcsin(np.minimum(gain.values * VOLTS / VALUES["gravity"], 1.0))
+    np.testing.assert_array_equal(gain.success > 0.5, np.abs(angle - ANGLE_RAD) < NEAR_RAD)
+    np.testing.assert_allclose(gain.values, 20.0 + MULTIPLES * gain.half_width)
+
+
+def test_others_follow_as_the_recording_ties_them_together():
+    uncertain = {**SURE, "sensor_delay": 0.01, "actuator_delay": 0.01}
+    moves = {m.name: m for m in moves_of(found_with(uncertain, correlation=-0.999))}
+    sums = [m["sensor_delay"] + m["actuator_delay"] for m in moves["sensor_delay"].models]
+    np.testing.assert_allclose(sums, 0.045, atol=5e-4)  # moved alone, it would be 64 ms at one half-width
+    assert moves["sensor_delay"].values.tolist() == pytest.approx([0.0] * 3 + [0.0004, 0.0396, *[0.045] * 3], abs=1e-3)
+    total = moves["round_trip_delay"]
+    np.testing.assert_allclose(total.values, 0.045 + MULTIPLES * total.half_width, rtol=1e-6)
+    assert total.half_width < 0.001
+
+
+def test_what_is_not_known_to_be_uncertain_is_not_moved():
+    found = found_with(SURE)
+    found.parameters[0] = Estimate("gain", "u", "dynamics", "", None, 20.0, "fixed")
+    assert "gain" not in {m.name for m in moves_of(found)}
+    found.posterior = None
+    assert moves_of(found) == []
+
+
+def curve(name, *success):
+    return Moved(name, "u", 1.0, 0.1, 1.0 + 0.1 * np.array([-2.0, -1.0, 1.0, 2.0]), np.array(success))
+
+
+def test_the_worst_comes_first_and_the_file_says_the_same(tmp_path):
+    multiples = np.array([-2.0, -1.0, 1.0, 2.0])
+    parameters = [curve("mild", 0.9, 0.9, 0.9, 0.7), curve("none", 1, 1, 1, 0.9), curve("first", 1, 0.5, 1, 1)]
+    made = Sensitivity.of(multiples, 1.0, 16, parameters)
+    assert [(p.name, made.breaks_at(p)) for p in made.parameters] == [("first", -1.0), ("mild", 2.0), ("none", None)]
+    assert made.said == (
+        "Measure 'first' better: 1 half-width of its 95 % interval below the estimate, at 0.9 u, success falls from "
+        "1.00 to 0.50."
+    )
+    made.save(tmp_path / "sensitivity.json")
+    again = Sensitivity.load(tmp_path)
+    assert again.said == made.said
+    np.testing.assert_array_equal(again.parameters[0].success, made.parameters[0].success)
+    (tmp_path / "sensitivity.json").write_text('{"format": 1, "multiples": []}')
+    with pytest.raises(Sim2RealError, match=r"sensitivity\.json is malformed"):
+        Sensitivity.load(tmp_path)
+
+
+def test_nothing_breaks_it_and_a_policy_that_never_works_are_said():
+    multiples = np.array([-2.0, -1.0, 1.0, 2.0])
+    fine = Sensitivity.of(multiples, 0.9, 16, [curve("a", 0.9, 0.9, 0.9, 0.85)])
+    assert fine.said.startswith("Nothing within 2 half-widths of the 95 % intervals breaks this policy")
+    assert (
+        "does badly on the model as identified already (0.02)"
+        in Sensitivity.of(multiples, 0.02, 16, [curve("a", 0, 0, 0, 0)]).said
+    )

@@ -1,0 +1,98 @@
+"""Rows in which the policy makes no step belong to its step before, for learners that know nothing of rows."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.train.env import GraphEnvironment
+from sim2real.train.policy_steps import PolicySteps
+
+VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}
+
+
+def graph_at(rate_hz, episode_s=0.5):
+    """The pendulum, whose world ticks at 100 Hz, with a policy of another rate."""
+    robot = load_pipeline("pendulum").load()
+    nodes, task = robot.training({**robot.nominal(), **VALUES}, {}, {}, True)
+    for name in ("sensor", "agent", "actuator"):
+        nodes[name].rate = rate_hz
+    return GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, episode_s)), task)
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    """A policy at 40 Hz: two or three ticks of the world pass between its steps."""
+    return graph_at(40.0)
+
+
+@pytest.fixture(scope="module")
+def played(uneven):
+    """The same actions, row by row and policy step by policy step."""
+    env, key = PolicySteps(uneven), jax.random.key(3)
+    turns = uneven.graph.turns[0]
+    actions = jnp.linspace(-1.0, 1.0, int(turns.sum()))[:, None]
+
+    def by_rows(state, action):
+        made = uneven.step(state, action, key)
+        return made.state, made._replace(state=made.state.step_state.seq)
+
+    def by_steps(state, action):
+        made = env.step(state, action, key)
+        return made.state, made._replace(state=made.state.step_state.seq)
+
+    of_row = actions[np.maximum(np.cumsum(turns) - 1, 0)][: uneven.length]
+    rows = jax.jit(lambda: jax.lax.scan(by_rows, uneven.reset(key)[0], of_row)[1])()
+    state, first = env.reset(key)
+    steps = jax.jit(lambda state: jax.lax.scan(by_steps, state, actions[: env.length])[1])(state)
+    as_numpy = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
+    return SimpleNamespace(env=env, turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), first=first, state=state)
+
+
+def test_some_rows_have_no_step_of_the_policy(played):
+    assert 0.5 < played.turns.mean() < 1.0
+    assert played.rows.valid.tolist() == played.turns[:-1].tolist()
+
+
+def test_every_step_is_one_of_the_policy(played):
+    assert int(played.state.step_state.seq) == 0
+    assert played.steps.valid.all()
+    assert played.steps.state.tolist() == list(range(1, played.turns.sum()))
+
+
+def test_rewards_of_the_rows_between_are_added_to_the_step_before(played):
+    begins = np.flatnonzero(played.turns)
+    wanted = [part.sum() for part in np.split(played.rows.reward[: begins[-1]], begins[1:-1])]
+    np.testing.assert_allclose(played.steps.reward, wanted, rtol=1e-5)
+
+
+def test_a_step_returns_what_the_policy_sees_next(played):
+    before = np.flatnonzero(played.turns)[1:] - 1  # a row returns the observation of the row after it
+    np.testing.assert_allclose(played.steps.observation, played.rows.observation[before], rtol=1e-5, atol=1e-6)
+
+
+def test_the_last_step_s_observation_is_the_final_one(played):
+    assert played.steps.truncated.tolist() == [False] * (played.env.length - 1) + [True]
+    assert not played.steps.terminated.any()
+
+
+def test_where_every_row_has_a_step_nothing_is_changed():
+    env = graph_at(50.0, 0.2)
+    steps = PolicySteps(env)
+    assert env.graph.turns.all()
+    assert steps.length == env.length
+    key, act = jax.random.key(0), jnp.zeros(1)
+    state = jax.eval_shape(env.reset, key)[0]
+    sizes = [len(str(jax.make_jaxpr(e.step)(state, act, key)).splitlines()) for e in (env, steps)]
+    assert sizes[0] == sizes[1]
+
+
+def test_a_timeline_with_a_single_step_is_refused():
+    with pytest.raises(UsageError, match="'agent' makes fewer than two steps in a timeline"):
+        PolicySteps(graph_at(50.0, 0.02))
