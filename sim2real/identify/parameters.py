@@ -29,6 +29,7 @@ class Parameter:
         transform: Scale on which the search moves: ``linear``, ``log`` (positive values) or ``logit`` (shares).
         kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
+        excite: Which motion tells it, for those whose data does not; "": nothing is said.
         leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
         prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
         per_recording: Whether each recording has a value of its own.
@@ -55,6 +56,7 @@ class Parameter:
     term: str = ""
     off: float | None = None
     narrowed: bool = False
+    excite: str = ""
 
     def __post_init__(self) -> None:
         """Check the bounds."""

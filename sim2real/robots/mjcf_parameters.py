@@ -37,6 +37,20 @@ _ABOUT = {
     "zero": ("rad", "encoder at the model's zero"),
     "payload": ("kg", "mass added at the body's centre of mass"),
 }
+_EXCITE = {
+    "kp": "goals that change while the joint bears a load",
+    "kd": "a stretch in which the joint moves with torque off (`enabled`), to tell the drive's damping from the joint's",
+    "gain": "torques or duties that change",
+    "torque": "commands that the drive cannot follow, so that it is at its limit",
+    "speed": "commands that the drive cannot follow, so that it is at its limit",
+    "released": "a stretch in which the joint moves with torque off (`enabled`)",
+    "damping": "fast motion of each joint, at several speeds",
+    "armature": "fast changes of the command, up to a few hertz",
+    "frictionloss": "slow motion of each joint, with reversals",
+    "zero": "motion of each joint against gravity, up and down",
+    "payload": "motion of each joint against gravity, up and down",
+}
+"""Which motion tells a quantity."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0)}
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 _ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -186,7 +200,7 @@ def _parameter(term: ParameterPattern, name: str, nominal: float) -> Parameter:
         below, above = _WIDE[term.what]
         low, high = nominal / below, nominal * above
     low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
-    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free)
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what])
 
 
 def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
