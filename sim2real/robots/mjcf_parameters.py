@@ -39,11 +39,11 @@ _ABOUT = {
 }
 _EXCITE = {
     "kp": "goals that change while the joint bears a load",
-    "kd": "a stretch in which the joint moves with torque off (`enabled`), to tell the drive's damping from the joint's",
+    "kd": "motion with torque off (`enabled`) besides that with torque on: it tells the joint's damping from the drive's",
     "gain": "torques or duties that change",
     "torque": "commands that the drive cannot follow, so that it is at its limit",
     "speed": "commands that the drive cannot follow, so that it is at its limit",
-    "released": "a stretch in which the joint moves with torque off (`enabled`)",
+    "released": "motion with torque off (`enabled`)",
     "damping": "fast motion of each joint, at several speeds",
     "armature": "fast changes of the command, up to a few hertz",
     "frictionloss": "slow motion of each joint, with reversals",
