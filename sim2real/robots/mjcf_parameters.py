@@ -39,7 +39,7 @@ _ABOUT = {
 }
 _EXCITE = {
     "kp": "goals that change while the joint bears a load",
-    "kd": "motion with torque off (`enabled`) besides that with torque on: it tells the joint's damping from the drive's",
+    "kd": "motion with torque off (`enabled`) besides that with torque on, to tell the joint's damping from it",
     "gain": "torques or duties that change",
     "torque": "commands that the drive cannot follow, so that it is at its limit",
     "speed": "commands that the drive cannot follow, so that it is at its limit",
