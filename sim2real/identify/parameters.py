@@ -37,6 +37,8 @@ class Parameter:
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": of none.
         off: Its value where that term is left out; default: the nominal one.
+        vanishes: Whether nothing lies below 0, and 0 is possible, as for a friction: on a logarithmic scale an estimate
+            only comes near, and counts as negligible where the model without it is as good.
         narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
     """
 
@@ -55,6 +57,7 @@ class Parameter:
     side: Literal["", "command", "measurement"] = ""
     term: str = ""
     off: float | None = None
+    vanishes: bool = False
     narrowed: bool = False
     excite: str = ""
 

@@ -51,6 +51,8 @@ _EXCITE = {
     "payload": "motion of each joint against gravity, up and down",
 }
 """Which motion tells a quantity."""
+_VANISHING = ("kd", "damping", "armature", "frictionloss")
+"""Quantities that a joint may be without."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0)}
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 _ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -200,7 +202,9 @@ def _parameter(term: ParameterPattern, name: str, nominal: float) -> Parameter:
         below, above = _WIDE[term.what]
         low, high = nominal / below, nominal * above
     low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
-    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what])
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
+        vanishes=term.what in _VANISHING,
+    )  # fmt: skip
 
 
 def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:

@@ -25,6 +25,7 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.links import Link
 from sim2real.identify import identifiability, uncertainty
 from sim2real.identify.fit import Fit
+from sim2real.identify.negligible import negligible
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
@@ -63,6 +64,7 @@ class Findings:
         at = uncertainty.linearise(fit.problem, fit.z)
         spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
+        spread, check = negligible(fit.problem, fit.z, at, spread, check)
         return Findings(fit, at.x, spread, check, round_trip(fit.problem.table, at.x, spread))
 
 
