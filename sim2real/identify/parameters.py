@@ -15,6 +15,9 @@ from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_
 from sim2real.errors import UsageError
 from sim2real.identify.leaves import set_leaf
 
+_ABOVE = 0.1
+"""Share of the bounds' width by which a search begins above a lower bound."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -281,8 +284,15 @@ class ParameterTable:
         return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
-        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval."""
-        first = {p.name: p.nominal if p.kind != "delay" else p.low + share * (p.high - p.low) for p in self.parameters}
+        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval.
+
+        Where that is the lower bound, a little above: at a bound nothing moves.
+        """
+        at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
+        first = {p.name: p.nominal if p.kind != "delay" else at(p, share) for p in self.parameters}
+        for p in self.parameters:
+            if p.kind != "delay" and p.transform == "linear" and p.nominal == p.low:
+                first[p.name] = at(p, _ABOVE)
         return self.encode(first)
 
     def starts(self) -> np.ndarray:

@@ -21,7 +21,7 @@ from sim2real.identify.segments import Span, check_log
 from sim2real.identify.verdict import Score, scores
 from sim2real.log.mapping import load_mapping
 from sim2real.robots.mjcf_robot import ROBOT_FILE
-from sim2real.stages import described, identified
+from sim2real.stages import described, identified, left_out
 from sim2real.stages.config import IdentifyConfig, ValidateConfig
 from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.cutting import reach
@@ -88,7 +88,7 @@ def score(
     Raises:
         UsageError: When each recording has parameters of its own: of a new one they are not known.
     """
-    robot = pipeline.load()
+    robot = left_out.having(pipeline.load(), [p.name for p in found.parameters])
     fitting = replace(pipeline.identify, settle_s=found.settle_s)
     model = robot.identifiable(fitting.max_delay_s)
     if own := [p.name for p in model.parameters if p.free and p.per_recording]:
