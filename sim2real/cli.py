@@ -122,13 +122,13 @@ def _dispatch(arguments: list[str]) -> None:
 
 def _stage(stage: str, arguments: list[str]) -> None:
     """``sim2real STAGE PIPELINE [flags]``."""
-    from sim2real.stages import flags, targets
+    from sim2real.stages import described_flags, flags, targets
 
-    if stage == "identify" and flags.by_model(arguments):
-        from sim2real.stages import described as of_model  # imports JAX
+    if stage == "identify" and described_flags.by_model(arguments):
+        told = described_flags.parse_identify(arguments, EXIT_CODES)
+        from sim2real.stages import described  # imports JAX
 
-        parsed, described = of_model.parsed(stage, arguments, EXIT_CODES)
-        _call_stage(stage, described, parsed.config, parsed.runs, parsed.run)
+        _call_stage(stage, described.from_flags(told.robot, told.config.log), told.config, told.runs, told.run)
         return
     pipeline, rest = _pipeline_first(stage, arguments)
     config = getattr(pipeline, stage)
@@ -295,13 +295,13 @@ def _action(command: str, only: str, arguments: list[str], usage: str) -> tuple[
 
 def _check(command: str, arguments: list[str]) -> None:
     """``sim2real check PIPELINE [flags]``."""
-    from sim2real.stages import config, flags
+    from sim2real.stages import config, described_flags, flags
 
-    if flags.by_model(arguments):
-        from sim2real.stages import check, described
+    if described_flags.by_model(arguments):
+        told = described_flags.parse_check(arguments, EXIT_CODES)
+        from sim2real.stages import check, described  # imports JAX
 
-        parsed, pipeline = described.parsed(command, arguments, EXIT_CODES)
-        if not check.run(pipeline, parsed.config):
+        if not check.run(described.from_flags(told.robot, told.config.log), told.config.config()):
             sys.exit(ERROR)
         return
     pipeline, rest = _pipeline_first(command, arguments)

@@ -381,6 +381,8 @@ def test_signals_unwind_once_and_give_their_code(tmp_path, number, code):
         "import sim2real; sim2real.__version__; dir(sim2real)",
         "from sim2real import cli; cli.main(['--help'])",
         "from sim2real import cli; cli.main(['record', 'pendulum', '--help'])",
+        "from sim2real import cli; cli.main(['identify', '--mjcf', 'robot.xml', '--help'])",
+        "from sim2real import cli; cli.main(['check', '--mjcf', 'robot.xml', '--help'])",
         "from sim2real import cli; cli.main(['info'])",
     ],
 )

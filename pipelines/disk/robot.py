@@ -38,7 +38,9 @@ class DiskRobot(LoggedRobot):
         return [
             Parameter("gain", "rad/s^2/V", 28.0, 5.0, 100.0, about="acceleration per volt", leaf="world.gain"),
             Parameter("gravity", "rad/s^2", 134.0, 40.0, 300.0, about="m g l / J", leaf="world.gravity"),
-            Parameter("damping", "1/s", 1.5, 0.1, 6.0, about="friction and back-EMF", leaf="world.friction.viscous"),
+            Parameter(
+                "damping", "1/s", 1.5, 0.1, 6.0, about="with back-EMF", leaf="world.friction.viscous", vanishes=True
+            ),
             Parameter("load", "1", 0.047, 0.003, 0.3, about=share, leaf="world.friction.load", term="load", off=0.0),
             optional("swing", "1", 0.05, 0.0, 1.0, about="load by the swing", leaf="world.swing"),
             optional("cogging", "rad/s^2", 0.0, -5.0, 5.0, about="twice a turn", leaf="world.cogging"),

@@ -121,9 +121,12 @@ def dynamics() -> list[Parameter]:
         "friction": ("rad/s^2", "Coulomb friction, c / J"),
     }
     return [
-        Parameter(name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1])
+        Parameter(
+            name, about[name][0], float(value), float(value) / 4, float(value) * 4, about=about[name][1],
+            vanishes=name in ("damping", "friction"),
+        )
         for name, value in groups(nominal_params()).items()
-    ]
+    ]  # fmt: skip
 
 
 class PendulumWorld(OdeWorld):

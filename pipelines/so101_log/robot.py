@@ -19,6 +19,8 @@ from .model import JOINTS, ArmWorld, Goal, Sensor, nominal
 RATE_HZ, WORLD_HZ = 1 / 0.02006, 4 / 0.02006
 _SATURATES = ("rotation", "wrist_roll", "jaw")
 """The other servos never came to their limit in the recordings."""
+_VANISHING = ("damping", "friction.static")
+"""Where a joint may have none."""
 
 
 class SO101(LoggedRobot):
@@ -47,7 +49,8 @@ class SO101(LoggedRobot):
             for leaf, (unit, low, high, transform, text) in about.items():
                 value = float(np.asarray(get_leaf(nominal(), leaf))[i])
                 name = f"{joint}_{leaf.rpartition('.')[2].removesuffix('_rad_s')}"
-                rows.append(Parameter(name, unit, value, low, high, transform, about=text, leaf=f"world.{leaf}[{i}]"))
+                own: Any = {"about": text, "leaf": f"world.{leaf}[{i}]", "vanishes": leaf in _VANISHING}
+                rows.append(Parameter(name, unit, value, low, high, transform, **own))
         rows += [
             # Read off single_joint_wrist_roll, where the joint stops short of its goal.
             Parameter("wrist_roll_low", "rad", -1.034, -3.0, -0.5, linear, leaf="world.low[4]", about="stop"),

@@ -30,13 +30,18 @@ class ServoOnArm(LoggedRobot):
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
         linear: Any = "linear"
+        gone: Any = {"vanishes": True}
         return [
             Parameter("stall", "N m", 1.0, 0.4, 2.5, about="at full duty, before it saturates", leaf="world.stall"),
             Parameter("back_emf", "N m s/rad", 0.05, 0.01, 0.2, about="back-EMF", leaf="world.back_emf"),
             Parameter("softness", "1/(N m)", 0.8, 0.05, 2.0, linear, about="saturation", leaf="world.softness"),
-            Parameter("armature", "kg m^2", 0.0015, 2e-4, 0.01, about="motor behind gears", leaf="world.armature"),
-            Parameter("viscous", "N m s/rad", 0.005, 2e-4, 0.05, about="viscous friction", leaf="world.viscous"),
-            Parameter("coulomb", "N m", 0.01, 0.001, 0.08, about="friction without load", leaf="world.coulomb"),
+            Parameter(
+                "armature", "kg m^2", 0.0015, 2e-4, 0.01, about="motor behind gears", leaf="world.armature", **gone
+            ),
+            Parameter(
+                "viscous", "N m s/rad", 0.005, 2e-4, 0.05, about="viscous friction", leaf="world.viscous", **gone
+            ),
+            Parameter("coulomb", "N m", 0.01, 0.001, 0.08, about="friction without load", leaf="world.coulomb", **gone),
             Parameter("gears", "1", 0.15, 0.02, 0.4, linear, about="share of the load that rubs", leaf="world.gears"),
             Parameter("static", "1", 0.05, 0.0, 0.3, linear, about="more of it at rest", leaf="world.static"),
             Parameter("stribeck", "rad/s", 0.1, 0.02, 1.0, about="speed that ends it", leaf="world.stribeck_rad_s"),

@@ -43,7 +43,7 @@ class Estimate:
         high95: Its upper end.
         lower: Lower bound of the search.
         upper: Upper bound.
-        verdict: ``accepted``, ``fixed``, ``at a bound``, ``not identifiable`` or ``interrupted``.
+        verdict: ``accepted``, ``negligible``, ``fixed``, ``at a bound``, ``not identifiable`` or ``interrupted``.
         truth: The embedded robot's own value.
     """
 

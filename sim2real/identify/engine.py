@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.c.rollouts import OpenLoop, Rollouts, Start
+from sim2real.composer.c.rollouts import OpenLoop, Rollouts, Start, StepLaw
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
@@ -94,6 +94,7 @@ class CRollouts:
     def __init__(self, graph: CompiledGraph, model: Any) -> None:
         self._graph, self._model = graph, model
         self._world: OpenLoop = graph.nodes[graph.wiring.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
+        self._law: StepLaw | None = getattr(self._world, "law", None)
         self._rollouts: dict[tuple[str, ...], Rollouts] = {}
 
     def rollout(self, gs: GraphState, params: Mapping[str, Any], record: str) -> Rollout:
@@ -109,18 +110,19 @@ class CRollouts:
         fields = world.fields(own, state)
         names = tuple(sorted(fields))
         if names not in self._rollouts:
-            self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives)
+            self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives, self._law)
+        values = world.law_values(own) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
         controls = self._graph.drive(gs, world.controls)
         start = world.start(own, state)
         count, dtype = controls.shape[0], jnp.result_type(float)
         widths = (self._model.nq, self._model.nv, self._model.nv)
 
-        def outside(fields: Any, start: Any, controls: Any) -> tuple[np.ndarray, ...]:
-            fields, start, controls = jax.tree_util.tree_map(np.asarray, (fields, start, controls))
-            made = self._rollouts[names](fields, Start(*start), controls)
+        def outside(*given: Any) -> tuple[np.ndarray, ...]:
+            fields, start, controls, values = jax.tree_util.tree_map(np.asarray, given)
+            made = self._rollouts[names](fields, Start(*start), controls, values)
             return tuple(a.astype(dtype) for a in made)
 
         shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
-        moved = jax.pure_callback(outside, shapes, fields, start, controls, vmap_method="expand_dims")
+        moved = jax.pure_callback(outside, shapes, fields, start, controls, values, vmap_method="expand_dims")
         messages = jax.vmap(lambda *moved: world.message(state, *moved))(*moved)
         return self._graph.replay(gs, messages, (record,))[record]

@@ -66,28 +66,31 @@ class LeftOut:
     free: Mapping[str, float]
 
 
-def folds_of(problem: Problem, blocks: int, names: Sequence[str] = ()) -> list[Fold]:
-    """Return what to leave out: each recording once, or blocks of equal length where there is one recording alone.
+def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: int = 2) -> list[Fold]:
+    """Return what to leave out: each recording once, or blocks of equal length where there are too few recordings.
 
     Args:
         problem: Its fitted segments are divided.
-        blocks: How many blocks of a single recording.
+        blocks: How many blocks, of all recordings together.
         names: What recordings of one name are left out together are called; default: each goes by itself.
+        least: With fewer recordings each is divided into blocks.
 
     Raises:
         UsageError: When there is too little to leave a part out.
     """
     spans = [problem.spans[i] for i in problem.train]
     recordings = sorted({s.recording for s in spans})
-    begin, end = min(s.begin_s for s in spans), max(s.begin_s for s in spans) + problem.segment_s
-    if len(recordings) > 1:
-        groups: dict[str, list[int]] = {}
-        for r in recordings:
-            groups.setdefault(names[r] if names else f"recording {r + 1}", []).append(r)
+    called = {r: names[r] if names else f"recording {r + 1}" for r in recordings}
+    groups = {name: [r for r in recordings if called[r] == name] for name in called.values()}
+    if len(groups) >= max(least, 2):
         found = [Fold(name, tuple((r, 0.0, np.inf) for r in own)) for name, own in groups.items()]
     else:
-        edges = np.linspace(begin, end, blocks + 1)
-        found = [Fold(f"{a:.0f} to {b:.0f} s", ((recordings[0], a, b),)) for a, b in pairwise(edges)]
+        found = []
+        for r in recordings:
+            own = [s.begin_s for s in spans if s.recording == r]
+            edges = np.linspace(min(own), max(own) + problem.segment_s, -(-blocks // len(recordings)) + 1)
+            which = f"{called[r]}, " if len(recordings) > 1 else ""
+            found += [Fold(f"{which}{a:.0f} to {b:.0f} s", ((r, a, b),)) for a, b in pairwise(edges)]
     counts = [int(f.touches(spans, problem.segment_s).sum()) for f in found]
     if not 2 <= len(found) <= len(spans) or min(counts) == 0 or max(counts) == len(spans):
         raise UsageError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -55,10 +56,18 @@ def check(problem: Problem, z: np.ndarray) -> Check:
     return from_linearised(problem, linearise(problem, z))
 
 
-def from_linearised(problem: Problem, at: Linearised) -> Check:
-    """Judge a linearised point."""
+def from_linearised(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Check:
+    """Judge a linearised point.
+
+    Args:
+        problem: The residuals.
+        at: The point.
+        without: Names of parameters that may be absent: whether the data determines them does not count.
+    """
     table = problem.table
     J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
+    held = np.isin(table.names, list(without))
+    J[:, held] = 0.0
     shift = time_shift(table) / table.span
     if shift.any():  # what the residuals say about it is no information: see ``uncertainty``
         unit = shift / np.linalg.norm(shift)
@@ -66,20 +75,24 @@ def from_linearised(problem: Problem, at: Linearised) -> Check:
     information = J.T @ J
     weights, axes = np.linalg.eigh(information)
     largest = float(weights[-1])
-    least = float(weights[int(shift.any())])  # not that of the shift, which is 0 by construction
-    condition = float(np.sqrt(largest / max(least, largest * 1e-14)))
+    gone = int(shift.any()) + int(held.sum())  # the shift, and what may be absent, are 0 by construction
+    least = float(weights[gone]) if gone < len(weights) else largest
+    condition = float(np.sqrt(largest / max(least, largest * 1e-14, 1e-300)))
     loose = weights < 1.0 / VAGUE**2
     prior = at.prior * np.outer(table.span, table.span)
     duration_s = problem.segment_s * len(problem.train)
     slope = np.abs(table.slope(at.x)) * table.span
     error = np.sqrt(np.diag(np.linalg.inv(information + prior))) * slope
     minute = np.sqrt(np.diag(np.linalg.inv(information * 60.0 / duration_s + prior))) * slope
-    groups = _groups(axes[:, loose])  # in widths of the bounds, so that a second is no smaller than a logarithm
+    open_axes = np.where(held[:, None], 0.0, axes)[:, loose]
+    # In widths of the bounds, so that a second is no smaller than a logarithm.
+    open_axes = open_axes[:, np.abs(open_axes).max(axis=0, initial=0.0) > 1e-9]
+    groups = _groups(open_axes)
     return Check(
         condition=condition,
         expected_error=error,
         per_minute=minute,
-        determined=tuple(_determined(table, axes[:, loose] * table.span[:, None], g) for g in groups),
+        determined=tuple(_determined(table, open_axes * table.span[:, None], g) for g in groups),
         undetermined=tuple(tuple(table.names[i] for i in g) for g in groups),
         duration_s=duration_s,
     )

@@ -15,6 +15,9 @@ from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_
 from sim2real.errors import UsageError
 from sim2real.identify.leaves import set_leaf
 
+_ABOVE = 0.1
+"""Share of the bounds' width by which a search begins above a lower bound."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -29,6 +32,7 @@ class Parameter:
         transform: Scale on which the search moves: ``linear``, ``log`` (positive values) or ``logit`` (shares).
         kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
+        excite: Which motion tells it, for those whose data does not; "": nothing is said.
         leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
         prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
         per_recording: Whether each recording has a value of its own.
@@ -36,6 +40,8 @@ class Parameter:
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
         term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": of none.
         off: Its value where that term is left out; default: the nominal one.
+        vanishes: Whether nothing lies below 0, and 0 is possible, as for a friction: on a logarithmic scale an estimate
+            only comes near, and counts as negligible where the model without it is as good.
         narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
     """
 
@@ -54,7 +60,9 @@ class Parameter:
     side: Literal["", "command", "measurement"] = ""
     term: str = ""
     off: float | None = None
+    vanishes: bool = False
     narrowed: bool = False
+    excite: str = ""
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -276,8 +284,15 @@ class ParameterTable:
         return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
-        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval."""
-        first = {p.name: p.nominal if p.kind != "delay" else p.low + share * (p.high - p.low) for p in self.parameters}
+        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval.
+
+        Where that is the lower bound, a little above: at a bound nothing moves.
+        """
+        at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
+        first = {p.name: p.nominal if p.kind != "delay" else at(p, share) for p in self.parameters}
+        for p in self.parameters:
+            if p.kind != "delay" and p.transform == "linear" and p.nominal == p.low:
+                first[p.name] = at(p, _ABOVE)
         return self.encode(first)
 
     def starts(self) -> np.ndarray:

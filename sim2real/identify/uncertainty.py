@@ -59,7 +59,7 @@ class Uncertainty:
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
-        verdict: One a parameter: ``accepted``, ``not identifiable`` or ``at a bound``.
+        verdict: One a parameter: ``accepted``, ``negligible``, ``not identifiable`` or ``at a bound``.
         correlation: Shape ``(P, P)``.
         inflation: Factor on the variance for residuals that are correlated in time.
         misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the
@@ -128,12 +128,8 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
     """
     table, size = problem.table, len(at.x)
-    r, J, inside = at.residuals, at.jacobian.reshape(-1, size), at.residuals.reshape(-1) != 0.0
-    free = size + 2 * len(problem.channels) * len(r) * bool(problem.config.initial_state == "free")
-    count = int(inside.sum())
-    rho = _correlation_in_time(r)
-    inflation = (1 + rho) / (1 - rho)
-    variance = float(np.sum(r**2)) / max(count - free, 1) * inflation
+    J, (count, free, inflation) = at.jacobian.reshape(-1, size), _freedom(problem, at)
+    variance = loss_variance(problem, at)
     shift = time_shift(table)
     # The sensor's delay carries the shift.
     fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
@@ -170,6 +166,19 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     )
 
 
+def loss_variance(problem: Problem, at: Linearised) -> float:
+    """Return the variance of a residual, larger where residuals are correlated in time."""
+    count, free, inflation = _freedom(problem, at)
+    return float(np.sum(at.residuals**2)) / max(count - free, 1) * inflation
+
+
+def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
+    """Return how many residuals there are, how many numbers were fitted, and the factor for correlation in time."""
+    states = 2 * len(problem.channels) * len(at.residuals) * bool(problem.config.initial_state == "free")
+    rho = _correlation_in_time(at.residuals)
+    return int(np.count_nonzero(at.residuals)), len(at.x) + states, (1 + rho) / (1 - rho)
+
+
 def between_parts(
     spread: Uncertainty, table: ParameterTable, x: np.ndarray, moved: np.ndarray, share: np.ndarray
 ) -> Uncertainty:
@@ -193,6 +202,19 @@ def between_parts(
     factor = _widening(error / np.maximum(own, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
     factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(own, 1e-30)))
+    return scaled(spread, table, x, factor)
+
+
+def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np.ndarray) -> Uncertainty:
+    """Return intervals that are wider by a factor each.
+
+    Args:
+        spread: The uncertainty without it.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        factor: Shape ``(P,)``: on standard errors and on the reach of intervals.
+    """
+    shifts = time_shift(table) != 0.0
     cov = spread.scale_covariance * np.outer(factor, factor)
     middle = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, table.unscale(x), strict=True)])
     low, high = (

@@ -163,6 +163,12 @@ def judge(
     known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
+    reasons += [
+        f"{name} is negligible: at most {spread.high[i]:.2g} {table.columns[i].parameter.unit} (95 %), and without it "
+        "the model predicts the same"
+        for i, name in enumerate(table.names)
+        if spread.verdict[i] == "negligible"
+    ]
     reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)

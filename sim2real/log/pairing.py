@@ -52,8 +52,10 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pa
         or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity],
         "measured position", path,
     )  # fmt: skip
+    named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
     series = [s for s in series if np.ptp(s.values[s.finite], axis=0).any()] or series
-    commands = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
+    # A command that never changes is still the command, where there is no other: to say so is what `check` is for.
+    commands = [s for s in named if any(s is other for other in series)] or named
     # A feed-forward beside a goal is no command of its own; a goal is what positions follow.
     goals = [s for s in commands if s.meaning.quantity in ("", "position")]
     command = _one(goals or commands, "command", path)

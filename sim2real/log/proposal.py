@@ -76,7 +76,7 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     to_rad, why = radian(measured, q, asked, path)
     said.append(f"{measured.name!r} is in {'degrees' if to_rad != 1 else 'radians'}: {why}")
     fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width)
-    kind = pair.kind or ("position" if _follows(found) else "duty")
+    kind = pair.kind or ("position" if command.meaning.unit in ("rad", "deg") or _follows(found) else "duty")
     if kind == "position":
         command, scales, more = _goal(measured, command, found, to_rad, path)
         fields["actuator"]["goal"] = field_of(command, "rad", scales)
@@ -111,9 +111,9 @@ def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
 
 
 def _follows(found: Following) -> bool:
-    best = np.abs(found.r).max(axis=1)
+    best, moved = np.abs(found.r).max(axis=1), found.moved.any(axis=1)
     ratio = evidence.unit_ratio(_at_best(found)[best > SURE])
-    return bool((best[best > 0] > SURE).mean() > 0.5) and ratio is not None if (best > 0).any() else False
+    return bool(moved.any() and (best[moved] > SURE).mean() > 0.5) and ratio is not None
 
 
 def _at_best(found: Following) -> np.ndarray:

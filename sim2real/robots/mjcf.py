@@ -12,6 +12,7 @@ from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 _NO_LIMIT = 1e6
+_LEAST_FRICTION = 1e-9
 
 
 def read_spec(path: Path) -> Any:
@@ -44,7 +45,9 @@ def joints_of(model: Any) -> tuple[str, ...]:
     return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
 
 
-def driven(path: Path, joints: Sequence[str], step_s: float, fix_base: bool, contacts: bool) -> Any:
+def driven(
+    path: Path, joints: Sequence[str], step_s: float, fix_base: bool, contacts: bool, rubbing: bool = True
+) -> Any:
     """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
     First stand those of force, in the order of the joints, then those of stiffness, whose force is ``-ctrl * angle``,
@@ -57,6 +60,7 @@ def driven(path: Path, joints: Sequence[str], step_s: float, fix_base: bool, con
         step_s: Time step [s].
         fix_base: Whether a floating base is held where the model has it.
         contacts: Whether bodies touch.
+        rubbing: Whether joints have dry friction, be it little: MJX leaves it out for good where the model has none.
 
     Raises:
         UsageError: When a joint is missing or is no hinge or slide, or the base floats.
@@ -84,6 +88,8 @@ def driven(path: Path, joints: Sequence[str], step_s: float, fix_base: bool, con
     for joint in joints:
         most = limits[joint] or _NO_LIMIT
         spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
+        if rubbing:
+            spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
     option = spec.option
     option.timestep, option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -15,14 +15,15 @@ from sim2real.identify.parameters import Parameter, Transform
 from sim2real.robots.mjcf import gains_of, limit_of
 
 What = Literal[
-    "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload"
-]
+    "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
+    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf",
+]  # fmt: skip
 ALL = ".*"
 _WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
-         "armature": (30, 30), "frictionloss": (50, 20)}  # fmt: skip
+         "armature": (30, 30), "frictionloss": (50, 20), "stribeck_rad_s": (10, 20)}  # fmt: skip
 """By which factors bounds lie below and above the nominal value."""
 _FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
-             "frictionloss": 0.1}  # fmt: skip
+             "frictionloss": 0.1, "stribeck_rad_s": 0.1}  # fmt: skip
 """Nominal values where the model has none."""
 _ABOUT = {
     "kp": ("N m/rad", "stiffness of the drive"),
@@ -36,8 +37,53 @@ _ABOUT = {
     "frictionloss": ("N m", "dry friction"),
     "zero": ("rad", "encoder at the model's zero"),
     "payload": ("kg", "mass added at the body's centre of mass"),
+    "load": ("1", "dry friction of gears, as a share of the drive's torque"),
+    "static": ("N m", "dry friction at rest beyond that in motion"),
+    "stribeck_rad_s": ("rad/s", "speed at which 1/e of that is left"),
+    "drag": ("N m s^2/rad^2", "friction by the square of the speed"),
+    "bias": ("N m", "dry friction upwards beyond the mean of both directions"),
+    "back_emf": ("N m s/rad", "damping by the motor's voltage, with torque on, beyond its limit"),
 }
-_FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0)}
+_EXCITE = {
+    "kp": "goals that change while the joint bears a load",
+    "kd": "motion with torque off (`enabled`) besides that with torque on, to tell the joint's damping from it",
+    "gain": "torques or duties that change",
+    "torque": "commands that the drive cannot follow, so that it is at its limit",
+    "speed": "commands that the drive cannot follow, so that it is at its limit",
+    "released": "motion with torque off (`enabled`)",
+    "damping": "fast motion of each joint, at several speeds",
+    "armature": "fast changes of the command, up to a few hertz",
+    "frictionloss": "slow motion of each joint, with reversals",
+    "zero": "motion of each joint against gravity, up and down",
+    "payload": "motion of each joint against gravity, up and down",
+    "load": "the same motion with and without a load",
+    "static": "slow motion of each joint, with reversals",
+    "stribeck_rad_s": "motion of each joint at many speeds, from slow to fast, with reversals",
+    "drag": "fast motion of each joint, at several speeds",
+    "bias": "slow motion of each joint, with reversals",
+    "back_emf": "commands that the drive cannot follow, so that it is at its limit",
+}
+"""Which motion tells a quantity."""
+_VANISHING = ("kd", "damping", "armature", "frictionloss")
+"""Quantities that a joint may be without."""
+_FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
+          "load": (0.0, 0.0, 1.0)}  # fmt: skip
+_OF_MODEL = {
+    "static": ("frictionloss", 5.0),
+    "bias": ("frictionloss", 5.0),
+    "drag": ("damping", 5.0),
+    "back_emf": ("damping", 30.0),
+}
+"""Terms without a usual size: up to a factor of what the model has of another quantity."""
+OPTIONAL = {
+    "load": ("load",),
+    "stribeck": ("static", "stribeck_rad_s"),
+    "drag": ("drag",),
+    "direction": ("bias",),
+    "back_emf": ("back_emf",),
+}
+"""Optional terms, and the quantities that each has."""
+LAWS = tuple(what for quantities in OPTIONAL.values() for what in quantities)
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 _ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
 
@@ -55,6 +101,7 @@ class ParameterPattern:
         high: Upper bound; None: a factor above.
         name: Name of the parameter; default: the quantity, with the pattern's letters where it is for a group.
         free: Whether it is identified; else it is held at ``nominal``.
+        term: Optional term of the model that it belongs to; "": of none.
     """
 
     what: What
@@ -65,6 +112,7 @@ class ParameterPattern:
     high: float | None = None
     name: str = ""
     free: bool = True
+    term: str = ""
 
     def __post_init__(self) -> None:
         """Check what can be checked without a model."""
@@ -138,9 +186,30 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
         )
         for group, name in groups:
             nominal = _nominal(term, [names[i] for i in group], own)
-            p = _parameter(term, name, nominal)
+            p = _parameter(term, name, nominal, _size(term, [names[i] for i in group], own))
             found.append(Placed(p, term.what, tuple(i + offset for i in group)))
     return found
+
+
+def optional(terms: Sequence[ParameterPattern]) -> tuple[ParameterPattern, ...]:
+    """Return patterns with all optional terms added that none of them is of: one value for all joints, not identified.
+
+    Terms are chosen with ``--terms``; without, they are 0.
+    """
+    said = {term.what for term in terms}
+    return (
+        *(replace(term, term=own) if (own := _term_of(term.what)) else term for term in terms),
+        *(
+            ParameterPattern(what, free=False, term=name)
+            for name, quantities in OPTIONAL.items()
+            for what in quantities
+            if what not in said
+        ),
+    )
+
+
+def _term_of(what: str) -> str:
+    return next((name for name, quantities in OPTIONAL.items() if what in quantities), "")
 
 
 def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints: np.ndarray, dofs: np.ndarray) -> Any:
@@ -155,11 +224,14 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
     """
     drive: dict[str, Any] = {}
     model: dict[str, Any] = {}
+    terms: Any = base.terms
     # A speed without load makes a damping of the torque limit, so that comes first.
     for p in sorted(placed, key=lambda p: p.what == "speed"):
-        value, at = jnp.asarray(values[p.parameter.name], jnp.float32), np.array(p.at)
+        value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
         if p.what in _ON_DRIVE:
             drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
+        elif p.what in LAWS:
+            terms = terms.replace(**{p.what: getattr(terms, p.what).at[at].set(value)})
         elif p.what in ("torque", "speed"):
             limits = model.get("jnt_actfrcrange", jnp.asarray(base.model.jnt_actfrcrange))
             if p.what == "torque":
@@ -172,21 +244,25 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
         else:
             field = _ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
-    return base.replace(model=base.model.tree_replace(model), **drive)
+    return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
 
 
-def _parameter(term: ParameterPattern, name: str, nominal: float) -> Parameter:
+def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
     unit, about = _ABOUT[term.what]
     transform: Transform = "log"
     kind: Any = "measurement" if term.what == "zero" else "dynamics"
     if term.what in _FIXED:
         _, low, high = _FIXED[term.what]
         transform = "linear"
+    elif term.what in _OF_MODEL:
+        low, high, transform = -own_size if term.what == "bias" else 0.0, own_size, "linear"
     else:
         below, above = _WIDE[term.what]
         low, high = nominal / below, nominal * above
     low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
-    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free)
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
+        vanishes=term.what in _VANISHING, term=term.term, off=nominal if term.term and not term.free else None,
+    )  # fmt: skip
 
 
 def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
@@ -195,6 +271,8 @@ def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
         return term.nominal
     if term.what in _FIXED:
         return _FIXED[term.what][0]
+    if term.what in _OF_MODEL:
+        return 0.0
     values: list[float] = []
     for name in names:
         if term.what in _ON_DOF:
@@ -205,6 +283,14 @@ def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
             values.append(limit)
     known = [v for v in values if v > 0]
     return float(np.median(known)) if known else _FALLBACK[term.what]
+
+
+def _size(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
+    """Return how large a term can be that has no usual size of its own; 0 for others."""
+    if term.what not in _OF_MODEL:
+        return 0.0
+    quantity, factor = _OF_MODEL[term.what]
+    return factor * _nominal(replace(term, what=quantity, nominal=None), names, own)
 
 
 def _letters(pattern: str) -> str:

@@ -19,7 +19,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.mjcf import driven, joints_of, read_model, read_spec
-from sim2real.robots.mjcf_parameters import ParameterPattern, Placed, expand, place
+from sim2real.robots.mjcf_parameters import LAWS, ParameterPattern, Placed, expand, optional, place
 from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
@@ -165,7 +165,9 @@ class MjcfRobot(LoggedRobot):
             )
         self.config, self.tick_s = config, config.step_s
         own = read_model(config.model)
-        self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts)
+        self.lawful = any(term.what in LAWS for term in config.terms)
+        rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
+        self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts, rubbing)
         self.placed = tuple(expand(config.terms, config.joints, self.model, own))
 
     @property
@@ -191,9 +193,14 @@ class MjcfRobot(LoggedRobot):
         """Return sensor, actuator and world."""
         config = self.config
         still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
-        world = DrivenWorld("world", 1 / config.step_s, self.model, (config.kp_unit, config.kd_unit))
+        units = config.kp_unit, config.kd_unit
+        world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
+
+    def with_optional_terms(self) -> MjcfRobot:
+        """Return the robot with all optional terms to choose from; a step of its simulation then takes longer."""
+        return MjcfRobot(replace(self.config, terms=optional(self.config.terms)))
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""

@@ -38,7 +38,8 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
     }.items():
         value = getattr(sheet, name)
         names = [f"{name}_{j.name}" for j in map(Joint.of, joints)] if name in own else [name]
-        found += [Parameter(n, unit, value, value / factor, value * factor, about=about) for n in names]
+        gone = name != "gain"
+        found += [Parameter(n, unit, value, value / factor, value * factor, about=about, vanishes=gone) for n in names]
     return found
 
 

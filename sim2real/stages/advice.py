@@ -18,25 +18,29 @@ _SHORT_S = 12.0
 _MOVING, _COVERED, _ONE_SIDED = 0.3, 0.5, 0.2
 
 
-def recommend(found: Mapping[str, Any], pipeline: str) -> list[str]:
+def recommend(found: Mapping[str, Any], identify: str, record: str) -> list[str]:
     """Return sentences: first the problems of the data, then what to do next.
 
     Args:
         found: The result of ``check.judge``.
-        pipeline: The pipeline's name.
+        identify: The command that identifies from this data.
+        record: The command that records what was planned.
     """
     planned = found["source"] != "log"
-    said = [sentence for r in found["recordings"] for sentence in _about(r, len(found["recordings"]) > 1)]
+    have_s = sum(r["sampling"]["duration_s"] for r in found["recordings"])
+    said = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
+    said += [sentence for r in found["recordings"] for sentence in _about(r, len(found["recordings"]) > 1)]
     enough = _enough(found)
     if not found["determined"]:
         names = ", ".join(dict.fromkeys(n for group in found["undetermined"] for n in group))
         said.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
+        said += _better(found)
     if found["only_sum_of_delays"]:
         said.append("of the delays before and after the world only the sum is determined: no log can tell them apart")
     if enough:
         said.append(enough)
     if found["determined"]:
-        said.append(f"next: sim2real {'record' if planned else 'identify'} {pipeline}")
+        said.append(f"next: {record if planned else identify}")
     return said
 
 
@@ -44,13 +48,23 @@ def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) ->
     """Return the command line of an identification with the same settings and further flags; "" without any.
 
     Args:
+        pipeline: The robot.
+        config: The settings of the last identification.
+        root: Folder of all runs.
+        flags: The further flags.
+    """
+    return command(pipeline, config, root, flags) if flags else ""
+
+
+def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str = "") -> str:
+    """Return the command line of an identification with some settings and further flags.
+
+    Args:
         pipeline: The robot; settings that equal its defaults need no flag.
         config: The settings of the last identification.
         root: Folder of all runs.
         flags: The further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
-    if not flags:
-        return ""
     new = flags.split()
     named = {name for flag, name in pairwise(new) if flag in ("--bounds", "--fix")}
     words = ["sim2real", "identify", *pipeline.words]
@@ -74,8 +88,6 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
     """Yield the problems of one recording."""
     which = f"{recording['name']}: " if several else ""
     s = recording["sampling"]
-    if s["duration_s"] < _SHORT_S:
-        yield f"{which}only {s['duration_s']:.1f} s: too little to fit one part and check on another"
     if s["gaps"]:
         yield f"{which}{s['gaps']} gaps in the measurements, the longest {s['longest_gap_s']:.3g} s"
     for j in recording["joints"]:
@@ -91,6 +103,13 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
             yield f"{which}{j['name']} stays in {share:.0%} of its range: vary the level of the excitation"
     if recording["commands"] and all(c["low_hz"] is None for c in recording["commands"]):
         yield f"{which}no command changes: gains and delays of the actuator are not determined"
+
+
+def _better(found: Mapping[str, Any]) -> list[str]:
+    """Return what to record instead, for parameters that are not determined and say so."""
+    open_names = {n for group in found["undetermined"] for n in group}
+    motions = [p["excite"] for p in found["parameters"] if p["name"] in open_names and p.get("excite")]
+    return [f"record instead: {'; '.join(dict.fromkeys(motions))}"] if motions else []
 
 
 def _enough(found: Mapping[str, Any]) -> str:

@@ -71,7 +71,9 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     source = find_source(pipeline, config, model, parameters, fitting)
     found = judge(model, source, fitting, parameters, dict(robot.units))
     found = {"pipeline": pipeline.name, **found}
-    found["recommendation"] = advice.recommend(found, pipeline.name)
+    own = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
+    identify = advice.command(pipeline, replace(pipeline.identify, **own), config.runs)
+    found["recommendation"] = advice.recommend(found, identify, f"sim2real record {pipeline.name}")
     if config.json:
         print(json.dumps(plain(found), indent=1))
     else:
@@ -313,11 +315,9 @@ def show(found: dict[str, Any]) -> None:
         ]
         for p in found["parameters"]
     ]
-    heads = ["parameter", "nominal", "s.e. from a minute", "unit", "of nominal", "determined"]
-    print(table(rows, heads))
-    print()
+    print(table(rows, ["parameter", "nominal", "s.e. from a minute", "unit", "of nominal", "determined"]))
     about = {"condition number": f"{found['condition']:.2g}", "directions left open": len(found["undetermined"])}
-    print(pairs(about))
+    print(f"\n{pairs(about)}")
     for message in [*found["messages"], *found["recommendation"]]:
         print(f"- {message}")
 
@@ -337,6 +337,7 @@ def _parameters(problem: Problem, at: uncertainty.Linearised, check: identifiabi
                 "standard_error_per_minute": float(error),
                 "percent_of_nominal": share,
                 "determined": "alone" if c.label not in loose else "in a group",
+                "excite": p.excite,
             }
         )
     return rows

@@ -237,7 +237,7 @@ class RobotFlags:
     parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
     """What is identified: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
     kp@.*_calf_joint; with =VALUE it is held. WHAT is kp, kd, gain, torque, speed, released, damping, armature,
-    frictionloss, zero or payload."""
+    frictionloss, zero, payload, load, static, stribeck_rad_s, drag, bias or back_emf."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of the log, if it is of another recorder; default: one is proposed."""
     rate_hz: float | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from sim2real.log.reader import read_log
 from sim2real.robots.mjcf import joints_of, read_model, read_spec
 from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
-from sim2real.stages import flags, importing
-from sim2real.stages.config import MODEL_IDENTIFY, CheckConfig, RobotFlags
+from sim2real.stages import importing
+from sim2real.stages.config import MODEL_IDENTIFY, RobotFlags
 from sim2real.stages.pipeline import Pipeline
 
 _STEPS_S = (0.0005, 0.005)
@@ -77,21 +77,6 @@ class DescribedPipeline(Pipeline):
         return files_of(self.description)
 
 
-def parsed(command: str, arguments: Sequence[str], codes: str) -> tuple[Any, DescribedPipeline]:
-    """Return the flags of a stage for a robot that is a model and a log, and the pipeline that they describe.
-
-    Args:
-        command: ``identify`` or ``check``.
-        arguments: What the user typed behind it.
-        codes: What exit codes mean, for the help.
-    """
-    own = MODEL_IDENTIFY if command == "identify" else CheckConfig()
-    about = (type(own).__doc__ or "").strip().splitlines()[0]
-    epilog = f"examples\n  sim2real {command} --mjcf robot.xml --log run.csv\n\n{codes}"
-    found = flags.parse_model(own, arguments, command, about, epilog)
-    return found, from_flags(found.robot, found.config.log)
-
-
 def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
     """Return the pipeline of a model and of what a log says of it.
 
@@ -119,12 +104,23 @@ def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
             mapping, _ = importing.proposed(open_foreign(first), asked)
         episode = importer.import_file(first, mapping)
         importing.refuse_contradictions(first, episode, told.as_told)
-    words = ("--mjcf", str(told.mjcf), *(word for p in told.parameter for word in ("--parameter", p)))
     description = _description(told, model, episode)
     summary = f"{len(description.joints)} joints of {told.mjcf.name}"
     return DescribedPipeline(
-        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, told=words
+        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, told=_words(told)
     )
+
+
+def _words(told: RobotFlags) -> tuple[str, ...]:
+    """Return the flags that describe the robot, as a command line has them."""
+    found: list[str] = []
+    for f in fields(told):
+        flag, value = f"--{f.name.replace('_', '-')}", getattr(told, f.name)
+        if f.name == "parameter":
+            found += [word for one in value for word in (flag, one)]
+        elif value != f.default:
+            found += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
+    return tuple(map(str, found))
 
 
 def from_file(path: Path, name: str) -> DescribedPipeline:

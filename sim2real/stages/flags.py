@@ -16,7 +16,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import tyro
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, RobotFlags, TrainConfig
+from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
 
 Config = TypeVar("Config")
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
@@ -32,13 +32,6 @@ class StageFlags(Generic[Config]):
     """Folder of all runs."""
     run: OptionalFolder = None
     """Run folder to add to; default: a new one for record, for the others the newest one with what they need."""
-
-
-@dataclass(frozen=True)
-class ModelFlags(StageFlags[Config]):
-    """Flags of one stage, for a robot that is described by its model and a log."""
-
-    robot: Annotated[RobotFlags, tyro.conf.arg(name="")] = field(default_factory=RobotFlags)
 
 
 @dataclass(frozen=True)
@@ -115,25 +108,6 @@ def parse(
     if unknown:
         raise _unknown(unknown, default, prog)
     return parsed
-
-
-def by_model(arguments: Sequence[str]) -> bool:
-    """Return whether a command is for a robot that is described by its model instead of a pipeline."""
-    return any(word.split("=")[0] == "--mjcf" for word in arguments) and arguments[0].startswith("-")
-
-
-def parse_model(default: Any, arguments: Sequence[str], command: str, about: str, epilog: str) -> ModelFlags[Any]:
-    """Return the flags of a stage for a robot that is described by its model.
-
-    Args:
-        default: The stage's configuration.
-        arguments: What the user typed behind the command.
-        command: The command.
-        about: First line of the help.
-        epilog: Last lines of the help.
-    """
-    prog = f"sim2real {command} --mjcf ROBOT.xml --log FILE"
-    return parse(ModelFlags(default), arguments, prog, about, epilog, kind=ModelFlags[type(default)])
 
 
 def flag_names(config: Any, prefix: str = "") -> list[str]:

@@ -25,6 +25,7 @@ from sim2real.artifacts.identification import (
 from sim2real.artifacts.links import Link
 from sim2real.identify import identifiability, noise, uncertainty
 from sim2real.identify.fit import Fit
+from sim2real.identify.negligible import negligible
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
@@ -65,6 +66,7 @@ class Findings:
         at = uncertainty.linearise(fit.problem, fit.z)
         spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
+        spread, check = negligible(fit.problem, fit.z, at, spread, check)
         trip = round_trip(fit.problem.table, at.x, spread)
         return Findings(fit, at.x, spread, check, trip, noise.widening(fit.problem.table, at, spread))
 

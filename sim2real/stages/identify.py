@@ -72,7 +72,7 @@ def identify(
     fitted = [recording] if isinstance(recording, Recording) else list(recording)
     logs = [*fitted, *hold_out]
     episodes = [log.episode for log in logs]
-    robot = in_world(pipeline.load(), config.world)
+    robot = left_out.offering(in_world(pipeline.load(), config.world), config.terms)
     for log in logs:
         require_units(log, robot)
     units = {**robot.units, **logs[0].units}
@@ -137,7 +137,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the log.
     """
-    robot = in_world(pipeline.load(), config.world)
+    robot = left_out.offering(in_world(pipeline.load(), config.world), config.terms)
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
     logs = [open_recording(path, pipeline, robot) for path in paths]
     fitted = len(logs) - len(config.hold_out)

@@ -16,6 +16,7 @@ from sim2real.identify.folds import folds_of, leave_out, masks
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty import Uncertainty, between_parts, linearise
 from sim2real.identify.verdict import Position
+from sim2real.robots.base import RecordedRobot
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note
 
@@ -25,6 +26,10 @@ _LEAST = 4
 """Segments of which parts can be left out."""
 _STEPS = 8
 """Most steps of a refinement without a part, on C: of a quadruped the loss is within 0.01 % of its end after four."""
+_LEAST_TO_CHOOSE = 3
+"""Parts of which one is left out, and terms chosen by how the others predict each other."""
+_ANY_DELAY_S = 0.1
+"""Which parameters a model has does not depend on its longest delay [s]."""
 _FEWEST = 4
 """Parts from which on they say how much estimates differ."""
 
@@ -48,6 +53,29 @@ def widest(table: ParameterTable, wanted: str) -> ParameterTable:
     return table.with_terms(names)
 
 
+def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
+    """Return the robot with the optional terms that its kind offers, where a flag chooses among some.
+
+    Args:
+        robot: The robot.
+        wanted: As ``widest`` takes it.
+    """
+    offer = getattr(robot, "with_optional_terms", None)
+    return robot if offer is None or wanted in ("own", "none") else offer()
+
+
+def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
+    """Return the robot with its optional terms where parameters are of one.
+
+    Args:
+        robot: The robot.
+        names: Names of parameters that were identified.
+    """
+    offered = offering(robot, "all")
+    terms = {p.name for p in offered.identifiable(_ANY_DELAY_S).parameters if p.term}
+    return offered if offered is not robot and terms & set(names) else robot
+
+
 def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[str, ...]:
     """Return the optional terms without which parts that are left out are predicted worse.
 
@@ -57,7 +85,7 @@ def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[st
         names: Of the recordings; each is left out by itself.
     """
     problem, table = found.problem, found.problem.table
-    parts = masks(problem, folds_of(problem, config.folds, names))
+    parts = masks(problem, folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE))
     choice = terms.choose(terms.statistics(problem, linearise(problem, found.z), parts), table)
     return tuple(n for n, kept in zip(table.terms, choice.kept, strict=True) if kept)
 
@@ -74,7 +102,8 @@ def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[
     if segments < _LEAST:
         note(f"{segments} segments are too few to leave parts out of the fit")
         return ()
-    parts = folds_of(found.problem, min(config.folds, segments // 2), names)
+    least = _LEAST_TO_CHOOSE if config.terms == "auto" else 2
+    parts = folds_of(found.problem, min(config.folds, segments // 2), names, least)
     # From the solution of the linearised problem few steps are left to go. On C they take seconds each, and a program
     # of fewer compiles in as long as two; else the one that refined before is taken.
     few = min(config.refine_steps, _STEPS) if found.problem.engine.name == "c" else config.refine_steps
@@ -135,6 +164,21 @@ def further(errors: np.ndarray) -> float:
     return float(math.exp(logs.mean() + stdtrit(k - 1, 0.95) * logs.std(ddof=1) * math.sqrt(1.0 + 1.0 / k)))
 
 
+def promises(rows: Sequence[Left]) -> dict[str, float]:
+    """Return below which error 95 % of further parts stay, up to the horizon: field -> error, where there are parts.
+
+    The error on the one part that was held out is no such promise: half of all further parts are further off.
+
+    Args:
+        rows: The parts.
+    """
+    found = {field: _finite([row.ahead.get(field) for row in rows]) for row in rows for field in row.ahead}
+    return {field: further(errors) for field, errors in found.items() if errors.size >= _LEAST_PARTS}
+
+
 def _of(rows: Sequence[Left], position: Position, kind: str) -> np.ndarray:
-    found = [getattr(row, kind).get(position.column) for row in rows]
-    return np.array([e for e in found if e is not None and math.isfinite(e)])
+    return _finite([getattr(row, kind).get(position.column) for row in rows])
+
+
+def _finite(errors: Sequence[float | None]) -> np.ndarray:
+    return np.array([e for e in errors if e is not None and math.isfinite(e)])

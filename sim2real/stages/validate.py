@@ -21,7 +21,7 @@ from sim2real.identify.segments import Span, check_log
 from sim2real.identify.verdict import Score, scores
 from sim2real.log.mapping import load_mapping
 from sim2real.robots.mjcf_robot import ROBOT_FILE
-from sim2real.stages import described, identified
+from sim2real.stages import described, identified, left_out
 from sim2real.stages.config import IdentifyConfig, ValidateConfig
 from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.cutting import reach
@@ -88,7 +88,7 @@ def score(
     Raises:
         UsageError: When each recording has parameters of its own: of a new one they are not known.
     """
-    robot = pipeline.load()
+    robot = left_out.having(pipeline.load(), [p.name for p in found.parameters])
     fitting = replace(pipeline.identify, settle_s=found.settle_s)
     model = robot.identifiable(fitting.max_delay_s)
     if own := [p.name for p in model.parameters if p.free and p.per_recording]:
@@ -100,7 +100,7 @@ def score(
         raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
     values = {p.name: known[p.name] for p in model.parameters}
     models = {"identified": values, "nominal": {p.name: p.nominal for p in model.parameters}}
-    promised = {row.column: row for row in found.held_out}
+    promised = {row.column: row.rmse.get("identified") for row in found.held_out} | left_out.promises(found.left_out)
     horizon_s = config.horizon_s or next((row.horizon_s for row in found.held_out), fitting.horizon_s)
     shortest_s = min(end - begin for begin, end in (reach(e, fitting) for e in episodes))
     rows = {}
@@ -113,9 +113,8 @@ def score(
         columns = prediction.samples(whole, models, fitting.settle_s)
         free = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
     for s in judged:
-        told = promised.get(s.position.column)
         at = [r.rmse or np.inf for r in free if r.field == s.position.column and r.model == "identified"]
-        rows[s.position.name] = _row(s, None if told is None else told.rmse.get("identified"), float(np.mean(at)))
+        rows[s.position.name] = _row(s, promised.get(s.position.column), float(np.mean(at)))
     kept = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
     return {
         "pipeline": pipeline.name,

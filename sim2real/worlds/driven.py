@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 from sim2real.worlds.mjx import MjxParams, MjxWorld
 from sim2real.worlds.recorded import command_delay
 
@@ -55,6 +57,7 @@ class DriveParams(MjxParams):
         gain: Torque for each unit of torque or duty.
         released: Share of the drive's damping that is left with torque off: windings that are short-circuited.
         zero: What the encoders read at the model's zero [rad].
+        terms: What friction and drive add to that; None: nothing, which costs nothing.
     """
 
     kp: Value = 0.0
@@ -62,6 +65,7 @@ class DriveParams(MjxParams):
     gain: Value = 1.0
     released: Value = 0.0
     zero: Value = 0.0
+    terms: DriveTerms | None = None
 
 
 class DrivenWorld(MjxWorld):
@@ -75,22 +79,43 @@ class DrivenWorld(MjxWorld):
         rate: Ticks per second [Hz].
         model: The model.
         units: What 1 stands for in the log's own gains ``kp`` and ``kd``, where it has them.
+        terms: Whether there are ``DriveTerms``: they are evaluated before every physics step.
         **options: Options of ``MjxWorld``.
     """
 
     def __init__(
-        self, name: str, rate: float, model: MjModel, units: tuple[float, float] = (1.0, 1.0), **options: Any
+        self,
+        name: str,
+        rate: float,
+        model: MjModel,
+        units: tuple[float, float] = (1.0, 1.0),
+        terms: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(name, rate, model, **options)
         self.units = units
         self.joints = np.array(model.actuator_trnid[: model.nu // 3, 0])
         self.qpos_at, self.qvel_at = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
+        self.law = DriveLaw(self.qpos_at, self.qvel_at) if terms else None
         self.lead_s = 0.5 * float(model.opt.timestep)
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DriveParams:
         """Return the model at its reference, with drives that do nothing."""
         own = super().init_params(rng, graph_state)
-        return DriveParams(own.model, own.qpos, own.qvel)
+        zero = jnp.zeros(len(self.joints))
+        terms = DriveTerms(zero, zero, zero + 0.1, zero, zero, zero) if self.law else None
+        return DriveParams(own.model, own.qpos, own.qvel, terms=terms)
+
+    def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
+        """Return what the law needs of the joints: the model's own friction and limits, and the terms' coefficients."""
+        model, still = params.model, jnp.zeros(len(self.joints))
+        own = {
+            "damping": model.dof_damping[self.qvel_at],
+            "frictionloss": model.dof_frictionloss[self.qvel_at],
+            "limit": jnp.asarray(model.jnt_actfrcrange)[self.joints, 1],
+        }
+        coefficients = {f.name: getattr(params.terms, f.name) for f in fields(DriveTerms)}
+        return {n: still + v for n, v in (own | coefficients).items()}
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, where the actuator's parameters set one.
@@ -101,7 +126,10 @@ class DrivenWorld(MjxWorld):
         return {name: delay + self.lead_s for name, delay in command_delay(graph_state, self.input_name).items()}
 
     def _control(self, step_state: StepState) -> jax.Array:
-        """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command."""
+        """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command.
+
+        With terms, 1 with torque on and 0 with torque off stand behind them: ``(4 * joints,)``.
+        """
         p: DriveParams = step_state.params
         told: DriveCommand = step_state.inputs[self.input_name][-1].data
         still = jnp.zeros(len(self.joints))
@@ -112,7 +140,7 @@ class DrivenWorld(MjxWorld):
         force += still if told.goal_velocity is None else on * kd * told.goal_velocity
         for pushed in (told.torque, told.duty):
             force += still if pushed is None else on * p.gain * pushed
-        return jnp.concatenate([force, kp, kd])
+        return jnp.concatenate([force, kp, kd, *([on] if self.law else [])])
 
 
 def _of_log(gain: Value | None, unit: float) -> Value:

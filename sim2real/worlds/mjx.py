@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 
-from sim2real.composer.c.rollouts import Start, check_steps
+from sim2real.composer.c.rollouts import Start, StepLaw, check_steps
 from sim2real.composer.mjx import gate, stepping, warp
 from sim2real.composer.mjx.import_mjx import mjx
 from sim2real.errors import UsageError
@@ -108,11 +108,13 @@ class MjxWorld(BaseWorld):
         self._engine: ModuleType | WarpEngine = self._warp or stepping
         self._mjx_model: mjx.Model = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
         self._apart = False
+        self.law: StepLaw | None = None
+        """What is set before every physics step from the state then; a subclass's."""
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxParams:
         """Return the model and its reference position at rest."""
         del rng, graph_state
-        return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(self.model.nv))
+        return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, float), jnp.zeros(self.model.nv))
 
     def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
         """Return MJX data at the parameters' start."""
@@ -125,18 +127,30 @@ class MjxWorld(BaseWorld):
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxState:
         """Return positions and velocities at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return MjxState(jnp.asarray(params.qpos, jnp.float32), jnp.asarray(params.qvel, jnp.float32))
+        return MjxState(jnp.asarray(params.qpos, float), jnp.asarray(params.qvel, float))
 
     def step(self, step_state: StepState) -> tuple[StepState, MjxState]:
         """Integrate over one tick under the newest control."""
-        model, advance = step_state.params.model, self._engine.advance
-        data = step_state.state.replace(ctrl=jnp.asarray(self._control(step_state), jnp.float32))
-        if self.substeps == 1:
-            data = advance(model, data, legacy=False)
-        else:
-            data, _ = jax.lax.scan(lambda d, _: (advance(model, d, legacy=False), None), data, length=self.substeps)
-        new = step_state.replace(state=data)
-        return new, MjxState(data.qpos, data.qvel)
+        params, control = step_state.params, self._control(step_state)
+        data = step_state.state
+        data = data if self.law else data.replace(ctrl=jnp.asarray(control, float))
+
+        def once(data: Any, _: Any = None) -> tuple[Any, None]:
+            model = params.model
+            if self.law:
+                law = self.law(jnp, self.law_values(params), control, data.qpos, data.qvel)
+                cast = lambda new, old: jnp.asarray(new, old.dtype)  # noqa: E731
+                data = data.replace(ctrl=cast(law[0], data.ctrl), qfrc_applied=cast(law[1], data.qfrc_applied))
+                model = stepping.with_fields(model, {n: cast(a, getattr(model, n)) for n, a in law[2].items()})
+            return self._engine.advance(model, data, legacy=False), None
+
+        data = once(data)[0] if self.substeps == 1 else jax.lax.scan(once, data, length=self.substeps)[0]
+        return step_state.replace(state=data), MjxState(data.qpos, data.qvel)
+
+    def law_values(self, params: Any) -> dict[str, jax.Array]:
+        """Return the numbers that ``law`` needs; they may differ from copy to copy."""
+        del params
+        return {}
 
     # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
 
@@ -175,9 +189,9 @@ class MjxWorld(BaseWorld):
         return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
 
     def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
-        """Return the step state, and the newest control for each physics step ``(substeps, nu)``."""
-        control = jnp.asarray(self._control(step_state), jnp.float32)
-        return step_state, jnp.broadcast_to(control, (self.substeps, self.model.nu))
+        """Return the step state, and the newest control for each physics step, ``(substeps, nu)`` where no law asks."""
+        control = jnp.asarray(self._control(step_state), float)
+        return step_state, jnp.broadcast_to(control, (self.substeps, *control.shape))
 
     def message(self, state: Any, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
         """Return what the world sends.

@@ -220,8 +220,16 @@ def test_recordings_of_one_name_go_together(three):
     assert found == [Fold("slow", ((0, 0.0, np.inf), (2, 0.0, np.inf))), Fold("fast", ((1, 0.0, np.inf),))]
 
 
-def test_too_little_to_leave_out_is_refused(one, three):
+def test_too_few_recordings_are_divided_into_blocks(three):
+    whole, _ = three
+    for names, least in ((["a", "b", "c"], 4), (["all", "all", "all"], 2)):
+        found = folds_of(whole.problem, 5, names, least)
+        assert len(found) == 6  # two of each recording: five at least
+        assert [f.parts[0][0] for f in found] == [0, 0, 1, 1, 2, 2]
+        assert all(a.parts[0][2] == b.parts[0][1] for a, b in zip(found[::2], found[1::2], strict=True))
+    assert found[0].name.startswith("all, 0 to ")
+
+
+def test_too_little_to_leave_out_is_refused(one):
     with pytest.raises(UsageError, match="cannot be divided into 40 parts"):
         folds_of(one.fit.problem, 40)
-    with pytest.raises(UsageError, match="cannot be divided into 1 parts"):
-        folds_of(three[0].problem, 5, ["all", "all", "all"])

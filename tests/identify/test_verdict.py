@@ -38,7 +38,8 @@ def both(first, second):
 
 
 def spread(misfit=1.0, **verdicts):
-    return SimpleNamespace(verdict=tuple(verdicts.get(n, "accepted") for n in TABLE.names), misfit=misfit)
+    own = tuple(verdicts.get(n, "accepted") for n in TABLE.names)
+    return SimpleNamespace(verdict=own, misfit=misfit, high=np.full(len(own), 0.0123))
 
 
 def check(*groups):
@@ -153,6 +154,13 @@ def test_a_friction_or_a_delay_of_0_is_told_and_accepted(name):
     found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
     assert (found.status, found.flags) == ("accepted", "")
     assert f"{name} comes out at 0, less than which there is not: held there, the same fit" in found.reasons
+
+
+def test_what_is_negligible_is_told_with_its_upper_bound_and_accepted():
+    found = judge(rows(0.1, 1.0), spread(gain="negligible"))
+    assert (found.status, found.flags) == ("accepted", "")
+    said = "gain is negligible: at most 0.012 1 (95 %), and without it the model predicts the same"
+    assert said in found.reasons
 
 
 def test_a_bound_of_0_that_a_user_set_above_the_models_is_a_bound():

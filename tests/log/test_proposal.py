@@ -204,6 +204,16 @@ def test_names_that_the_data_contradicts_are_refused(tmp_path, recorded):
         proposed(followers.write_csv(tmp_path / "run.csv", wrong))
 
 
+@pytest.mark.parametrize("moved", [(), (0,)])
+def test_a_goal_in_radians_is_a_goal_although_joints_stand_still(tmp_path, recorded, moved):
+    t, goal, q = recorded
+    still = np.zeros_like(goal)
+    still[:, moved] = goal[:, moved]
+    seen = still + 1e-3 * np.random.default_rng(0).standard_normal(q.shape)
+    np.savez(tmp_path / "run.npz", t_s=t, q_rad=seen, goal_rad=still)
+    check(tmp_path / "run.npz", proposed(tmp_path / "run.npz"), still, seen)
+
+
 def test_what_goes_with_a_goal_in_mit_mode_is_taken_by_name(tmp_path, recorded):
     t, goal, q = recorded
     more = {

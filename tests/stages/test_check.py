@@ -16,6 +16,7 @@ from sim2real.stages import advice, check
 from sim2real.stages.config import CheckConfig, RecordConfig
 from sim2real.stages.pipeline import load_pipeline
 
+COMMANDS = ("sim2real identify pendulum", "sim2real record pendulum")
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"
 
 
@@ -69,7 +70,7 @@ def test_people_get_tables_and_a_recommendation(judged, capsys):
     said = capsys.readouterr().out
     assert "95 % of the power of actuator.action" in said
     assert "round_trip_delay" in said
-    assert "- next: sim2real identify pendulum" in said
+    assert f"- next: sim2real identify pendulum --log {LOG}" in said
     assert "speed of th" in said
 
 
@@ -89,14 +90,14 @@ def spoiled(judged, **changes):
     ],
 )
 def test_what_is_wrong_with_a_motion_is_told(judged, changes, said):
-    assert said in "\n".join(advice.recommend(spoiled(judged, **changes), "pendulum"))
+    assert said in "\n".join(advice.recommend(spoiled(judged, **changes), *COMMANDS))
 
 
 def test_gaps_short_logs_and_constant_commands_are_told(judged):
     found = spoiled(judged)
     found["recordings"][0]["sampling"] |= {"gaps": 2, "longest_gap_s": 0.5, "duration_s": 8.0}
     found["recordings"][0]["commands"][0] |= {"low_hz": None, "high_hz": None}
-    said = "\n".join(advice.recommend(found, "pendulum"))
+    said = "\n".join(advice.recommend(found, *COMMANDS))
     for part in ("only 8.0 s", "2 gaps", "no command changes"):
         assert part in said
 
@@ -104,7 +105,7 @@ def test_gaps_short_logs_and_constant_commands_are_told(judged):
 def test_how_long_to_record_follows_from_the_worst_parameter(judged):
     found = spoiled(judged)
     found["parameters"][2]["percent_of_nominal"] = 3.0
-    said = "\n".join(advice.recommend(found, "pendulum"))
+    said = "\n".join(advice.recommend(found, *COMMANDS))
     assert "damping is least certain: 3 % of nominal from a minute; 1% takes 9 min" in said
 
 

@@ -1,5 +1,7 @@
 """Robots that are described on the command line: by a model and a log, and as a pipeline that is written for them."""
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import RobotConfig
-from sim2real.stages import described
+from sim2real.stages import advice, described, described_flags
 from sim2real.stages.config import RobotFlags
 from sim2real.stages.pipeline import load_pipeline
 
@@ -52,6 +54,28 @@ def test_a_model_and_a_log_describe_a_robot(workplace):
     names = [p.name for p in found.load().dynamics()]
     assert names == ["kp", "damping", "armature", "frictionloss_pan_joint", "frictionloss_lift_joint"]
     assert found.words == ("--mjcf", "robot.xml")
+
+
+def test_the_next_command_describes_the_robot_again(workplace):
+    told = RobotFlags(mjcf=Path("robot.xml"), joints=("lift_joint", "pan_joint"), parameter=("kp=20",), contacts=True)
+    found = described.from_flags(told, ["run.npz"])
+    asked = replace(found.identify, log=("run.npz",), fix={"delay": 0.0})
+    program, stage, *rest = shlex.split(advice.command(found, asked, Path("runs")))
+    assert (program, stage) == ("sim2real", "identify")
+    again = described_flags.parse_identify(rest, "")
+    assert (again.robot, again.config) == (told, asked)
+
+
+def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsys, recorded):
+    t, goal, q = recorded
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(q.shape)
+    np.savez("run.npz", t_s=t, q_rad=np.stack([q[:, 0], 0 * t], 1) + noise, goal_rad=np.stack([goal[:, 0], 0 * t], 1))
+    assert cli.main(["check", "--mjcf", "robot.xml", "--log", "run.npz"]) == 1
+    out = capsys.readouterr().out
+    assert "lift_joint does not move at all" in out
+    assert "nothing in this data determines frictionloss_lift_joint" in out
+    assert "record instead: slow motion of each joint, with reversals" in out
+    assert "actuator.goal[1]" in out
 
 
 def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):

@@ -14,7 +14,7 @@ from sim2real.identify.uncertainty import Uncertainty
 from sim2real.identify.verdict import Position
 from sim2real.stages import identify
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.left_out import further, sentences, widened, widest
+from sim2real.stages.left_out import further, promises, sentences, widened, widest
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -37,6 +37,13 @@ def test_mean_worst_and_promise_are_said_of_every_position_that_has_errors():
     assert len(said) == 1  # one error in one go is no mean
     assert re.match(r"tilt, up to 0.5 s ahead, .* off by 0.15 rad on average, 0.2 rad at worst of 3; .*0.4", said[0])
     assert sentences([], [ANGLE], 0.5) == []
+
+
+def test_what_is_promised_of_a_field_is_the_bound_on_one_more_part():
+    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=float("nan"))]
+    assert promises(rows) == {"th": pytest.approx(further(np.array([0.1, 0.2])))}
+    assert promises(rows[:1]) == {}
+    assert promises([]) == {}
 
 
 @pytest.fixture

@@ -43,6 +43,30 @@ class Start(NamedTuple):
     warmstart: Array
 
 
+class StepLaw(Protocol):
+    """What is set before every physics step from the state then, by the same function in MJX and around C.
+
+    Attributes:
+        fields: The model's fields that it sets.
+    """
+
+    fields: tuple[str, ...]
+
+    def __call__(
+        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and the fields for the next step.
+
+        Args:
+            xp: ``numpy`` or ``jax.numpy``.
+            values: Numbers of each copy, ``(..., n)``.
+            control: What the world's ``controls`` gave for this step.
+            qpos: Positions ``(..., nq)`` [m or rad].
+            qvel: Velocities ``(..., nv)`` [m/s or rad/s].
+        """
+        ...
+
+
 class OpenLoop(Protocol):
     """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
 
@@ -126,31 +150,45 @@ class Rollouts:
         substeps: Physics steps in a tick.
         names: Fields that differ from copy to copy.
         derives: Whether constants that follow from them are computed for each copy.
+        law: What is set before every step; it costs a call of C for each.
 
     Raises:
         UsageError: When C does not look at a field, or only MJX has it.
     """
 
-    def __init__(self, model: MjModel, substeps: int, names: tuple[str, ...], derives: bool = False) -> None:
+    def __init__(
+        self,
+        model: MjModel,
+        substeps: int,
+        names: tuple[str, ...],
+        derives: bool = False,
+        law: StepLaw | None = None,
+    ) -> None:
         from mujoco import batch  # 30 ms
 
         unknown = sorted(set(names) - batch.MODEL_FIELDS)
         if unknown:
             raise UsageError(f"C MuJoCo has no field {unknown[0]!r} that can differ from copy to copy")
         self._make, self._substeps, self._names, self._derives = batch.Batch, substeps, names, derives
+        self._law = law
         self._model = _general(model, names, derives)
         self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._batch: Any = None
 
     def __call__(
-        self, fields: Mapping[str, np.ndarray], start: Start, controls: np.ndarray
+        self,
+        fields: Mapping[str, np.ndarray],
+        start: Start,
+        controls: np.ndarray,
+        values: Mapping[str, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Roll out every copy.
 
         Args:
             fields: Name -> values, ``(..., *shape)``.
             start: Where the copies start.
-            controls: Shape ``(..., ticks, substeps, nu)``.
+            controls: Shape ``(..., ticks, substeps, nu)``, or what the law takes.
+            values: What the law takes besides, ``(..., n)`` each.
 
         Returns:
             Positions ``(..., 1 + ticks, nq)``, velocities and accelerations ``(..., 1 + ticks, nv)``: at the start, and
@@ -158,7 +196,8 @@ class Rollouts:
         """
         ticks = controls.shape[-3]
         wide = {n: (fields[n], np.ndim(_value(self._model, n))) for n in self._names}
-        arrays = [*((a, 1) for a in start), (controls, 3), *wide.values()]
+        taken = {n: (v, 1) for n, v in (values or {}).items()}
+        arrays = [*((a, 1) for a in start), (controls, 3), *wide.values(), *taken.values()]
         axes = np.broadcast_shapes(*(np.shape(a)[: np.ndim(a) - width] for a, width in arrays))
         count = int(np.prod(axes))
 
@@ -167,7 +206,7 @@ class Rollouts:
             shape = a.shape[a.ndim - width :]
             return np.broadcast_to(a, (*axes, *shape)).reshape(count, *shape)
 
-        rows = {n: flat(*pair) for n, pair in wide.items()}
+        rows, law = ({n: flat(*pair) for n, pair in pairs.items()} for pairs in (wide, taken))
         begin = Start(*(flat(a, 1) for a in start))
         control = flat(controls, 3).reshape(count, ticks * self._substeps, -1)
         found = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
@@ -176,13 +215,16 @@ class Rollouts:
             for first in range(0, count, lanes):
                 part = slice(first, min(first + lanes, count))
                 own = {n: values[part] for n, values in rows.items()}
-                made = self._part(own, Start(*(a[part] for a in begin)), control[part])
+                some_law = {n: values[part] for n, values in law.items()}
+                made = self._part(own, Start(*(a[part] for a in begin)), control[part], some_law)
                 for whole, some in zip(found, made, strict=True):
                     whole[part] = some
         qpos, qvel, qacc = (a.reshape(*axes, *a.shape[1:]) for a in found)
         return qpos, qvel, qacc
 
-    def _part(self, fields: Mapping[str, np.ndarray], start: Start, control: np.ndarray) -> Iterator[np.ndarray]:
+    def _part(
+        self, fields: Mapping[str, np.ndarray], start: Start, control: np.ndarray, law: Mapping[str, np.ndarray]
+    ) -> Iterator[np.ndarray]:
         """Yield positions, velocities and accelerations of some copies, as ``__call__``."""
         batch, count, steps = self._batch, len(control), control.shape[1]
         ids = np.arange(count)
@@ -203,12 +245,33 @@ class Rollouts:
         flags[:] = compiled
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
-        failed |= _failing(count, lambda: batch.rollout(steps, control, record=tuple(out), ids=ids, out=out))
+        if self._law:
+            failed |= self._stepwise(self._law, law, control, out)
+        else:
+            failed |= _failing(count, lambda: batch.rollout(steps, control, record=tuple(out), ids=ids, out=out))
         failed |= batch.warning[:count, :, 1].any(axis=1)
         for name, rows in out.items():
             made = np.concatenate([begun[name][:, None], rows[:, self._substeps - 1 :: self._substeps]], axis=1)
             made[failed] = np.nan
             yield made
+
+    def _stepwise(
+        self, law: StepLaw, values: Mapping[str, np.ndarray], control: np.ndarray, out: Mapping[str, np.ndarray]
+    ) -> np.ndarray:
+        """Step copies one physics step at a time, fill ``out``, and return which of them failed, ``(count,)``."""
+        batch, (count, steps) = self._batch, control.shape[:2]
+        ids, failed = np.arange(count), np.zeros(count, bool)
+        live = {n: batch.bind(n) for n in (*out, "ctrl", "qfrc_applied")}
+        fields = {n: batch.expand(n) for n in law.fields}
+        for k in range(steps):
+            ctrl, applied, changed = law(np, values, control[:, k], live["qpos"][:count], live["qvel"][:count])
+            live["ctrl"][:count], live["qfrc_applied"][:count] = ctrl, applied
+            for name, new in changed.items():
+                fields[name][:count] = new
+            failed |= _failing(count, lambda: batch.step(ids))
+            for name, rows in out.items():
+                rows[:, k] = live[name][:count]
+        return failed
 
     def _lanes(self, count: int, steps: int) -> int:
         """Return how many copies run at a time, and make room for them."""

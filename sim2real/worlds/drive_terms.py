@@ -1,0 +1,80 @@
+"""What the friction and the drive of a joint add beyond constant coefficients: terms that change from step to step.
+
+Dry friction stays MuJoCo's own constraint, so that a joint sticks; only how large it is follows the state. The same
+lines run in MJX and, on arrays of copies, between the steps of C MuJoCo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flax import struct
+
+from sim2real.graph.base import Base
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Value
+
+
+@struct.dataclass
+class DriveTerms(Base):
+    """Coefficients, each of shape ``(joints,)``; with 0 a term adds nothing.
+
+    Attributes:
+        load: Dry friction of gears, as a share of the torque that the drive puts through them [1].
+        static: Dry friction at standstill beyond that in motion (Stribeck effect, Tustin's form) [N m].
+        stribeck_rad_s: Speed at which 1/e of it is left [rad/s].
+        drag: Friction proportional to the square of the speed [N m s^2/rad^2].
+        bias: By how much dry friction is larger upwards than on average, and smaller downwards [N m].
+        back_emf: What the motor's voltage takes off its torque per speed, with torque on, beyond its limit [N m s/rad].
+    """
+
+    load: Value = 0.0
+    static: Value = 0.0
+    stribeck_rad_s: Value = 0.1
+    drag: Value = 0.0
+    bias: Value = 0.0
+    back_emf: Value = 0.0
+
+
+class DriveLaw:
+    """Sets damping and dry friction of a ``DrivenWorld``'s joints before every step.
+
+    Args:
+        qpos_at: Shape ``(joints,)``: where the joints' positions are.
+        qvel_at: Shape ``(joints,)``: where their velocities are; all that the model has.
+    """
+
+    fields: tuple[str, ...] = ("dof_damping", "dof_frictionloss")
+    """What it sets of the model, ``(nv,)`` each."""
+
+    def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray) -> None:
+        self._qpos_at, self._qvel_at, self._joints = qpos_at, qvel_at, np.argsort(qvel_at)
+
+    def __call__(
+        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and fields of the model for the next step.
+
+        Args:
+            xp: ``numpy`` or ``jax.numpy``.
+            values: Coefficients and the model's own ``damping``, ``frictionloss`` and ``limit``, ``(..., joints)``.
+            control: Forces, stiffnesses, dampings, and 1 with torque on: ``(..., 4 * joints)``.
+            qpos: Positions ``(..., nq)`` [rad].
+            qvel: Velocities ``(..., nv)`` [rad/s].
+        """
+        v, count = values, len(self._joints)
+        force, kp, kd, on = (control[..., i * count : (i + 1) * count] for i in range(4))
+        angle, speed = qpos[..., self._qpos_at], qvel[..., self._qvel_at]
+        fast = xp.abs(speed)
+        braked = on * v["back_emf"]
+        drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
+        stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
+        damping = v["damping"] + v["drag"] * fast + braked
+        friction = v["frictionloss"] + stuck + v["load"] * xp.abs(drive)
+        # Friction that differs by direction is a mean one and a constant torque: it sticks in the same band.
+        applied = -v["bias"] + 0.0 * speed
+        rows = damping[..., self._joints], friction[..., self._joints]
+        return control[..., : 3 * count], applied[..., self._joints], dict(zip(self.fields, rows, strict=True))
