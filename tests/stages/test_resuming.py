@@ -77,7 +77,7 @@ def settings(own, target, **changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": "2"}, r"other settings: seed = 1 there and 2 here[\s\S]*hint: .*it was: sim2real "),
+        ({"seed": "2"}, r"other settings: seed = 1 there and 2 here[\s\S]*hint: .*it was: sim2real"),
         ({"ppo.gamma": "0.5"}, r"ppo.gamma = 0.99 there and 0.5 here"),
     ],
 )
