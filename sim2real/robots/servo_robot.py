@@ -31,7 +31,7 @@ from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
-from sim2real.robots.parts import GoalTask
+from sim2real.robots.parts import REFERENCE, GoalTask
 from sim2real.robots.seen import Feature, servo_terms
 from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
@@ -125,8 +125,8 @@ class ServoRobot(LoopRobot):
         return {"task": state.reward, "speed": -0.01 * jnp.mean((action / self.servos.speed) ** 2)}
 
     def true_state(self, state: Any) -> Any:
-        """Return positions and velocities of all that moves in the model, and the task's variables."""
-        return state.data.qpos, state.data.qvel, state.variables
+        """Return positions and velocities of all that moves in the model, and the servos' setpoints."""
+        return state.data.qpos, state.data.qvel, state.variables[REFERENCE]
 
     def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
         """Return what the policy sees of the present, in the order of ``features``.

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.graph.base import GraphState
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
 from sim2real.hardware.config import GateLimits
@@ -26,6 +27,8 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.robots import states
 from sim2real.robots.base import RecordedRobot, Robot, checked
 from sim2real.runtime.compiled import CompiledGraph
+from sim2real.train.env import TrainingTask
+from sim2real.train.tasks import EndingTask, PrivilegedTask, terms_of
 
 _EPISODE_S = 0.2
 
@@ -100,9 +103,10 @@ def check_simulation(robot: Robot) -> None:
 
     def episode(key: jax.Array) -> Any:
         gs = graph.init(key, params=robot.simulation_params(values, None, 0))
-        return task.observe(graph.observe(gs)[1]), graph.rollout(gs, record=recorded)[1]
+        return task.observe(graph.observe(gs)[1]), graph.rollout(gs, record=recorded)[1], _judged(task, gs)
 
-    seen, records = jax.jit(episode)(jax.random.key(0))
+    seen, records, judged = jax.jit(episode)(jax.random.key(0))
+    _check_judgement(judged)
     _hold(seen.shape == (robot.observation_size,), f"the policy sees {seen.shape}, not ({robot.observation_size},)")
     _hold(task.observation_size == robot.observation_size, f"the task shows {task.observation_size} entries")
     _hold(bool(jnp.isfinite(seen).all()), f"the policy sees {seen}")
@@ -144,6 +148,24 @@ def _check_start(model: IdentifiableModel, nodes: Mapping[str, Any]) -> None:
     _include(nodes, set(params), "nodes with parameters")
     for name, leaf in ((n, x) for n, own in params.items() for x in jax.tree_util.tree_leaves(own)):
         _hold(bool(jnp.isfinite(leaf).all()), f"a parameter of {name!r} is {leaf} at nominal values")
+
+
+def _judged(task: TrainingTask, graph_state: GraphState) -> dict[str, Any]:
+    """Return what a task says of the graph's state."""
+    reward = task.reward(graph_state, jnp.asarray(task.action_low))
+    said = {f"reward {name!r}": term for name, term in terms_of(reward).items()} or {"reward": reward}
+    said |= {"success": task.success(graph_state)}
+    said |= {"terminated": task.terminated(graph_state)} if isinstance(task, EndingTask) else {}
+    return said | ({"privileged": task.privileged(graph_state)} if isinstance(task, PrivilegedTask) else {})
+
+
+def _check_judgement(judged: Mapping[str, Any]) -> None:
+    for name, value in judged.items():
+        size = 1 if name == "privileged" else 0
+        _hold(np.ndim(value) == size, f"{name} of a state has shape {np.shape(value)}")
+        _hold(bool(np.isfinite(value).all()), f"{name} of a state is {value}")
+        if name in ("success", "terminated"):
+            _hold(value.dtype == np.bool_, f"{name} of a state is {value}, not a bool")
 
 
 def _check_score(robot: Robot, measured: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) -> None:

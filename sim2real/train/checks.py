@@ -7,12 +7,18 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
 
+FINITE = {
+    "finite_observation": ("the observation", "reset or step"),
+    "finite_privileged": ("what the value function sees besides the observation", "privileged"),
+}
+"""Figures that say which entries were finite: what they are of, and what makes it."""
+
 
 def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig, names: list[str]) -> None:
     """Raise if a value is not finite or no episode ended; causes are checked before their consequences.
 
     Args:
-        values: Name -> shape ``(num_seeds,)``, and ``finite_observation``, ``(num_seeds, O)``.
+        values: Name -> shape ``(num_seeds,)``; those in ``FINITE`` have a second axis, of the entries.
         env_steps: Number of rows so far.
         config: Settings.
         names: Who is who, such as ``seed 0``.
@@ -23,12 +29,13 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
     """
     for seed, name in enumerate(names):
         when = f"({name}, within {env_steps} rows)"
-        entries = np.flatnonzero(~values["finite_observation"][seed])
-        if entries.size:
-            raise Sim2RealError(
-                f"entries {entries.tolist()} of the observation are not finite {when}",
-                hint="the environment's reset or step makes them: check what these entries divide by or integrate",
-            )
+        for part, (what, maker) in FINITE.items():
+            entries = np.flatnonzero(~values[part][seed]) if part in values else np.empty(0)
+            if entries.size:
+                raise Sim2RealError(
+                    f"entries {entries.tolist()} of {what} are not finite {when}",
+                    hint=f"the environment's {maker} makes them: check what these entries divide by or integrate",
+                )
         if not np.isfinite(values["reward"][seed]):
             raise Sim2RealError(
                 f"the reward is not finite {when}", hint="check what the environment's reward divides by"

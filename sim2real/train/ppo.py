@@ -19,7 +19,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
-from sim2real.train.checks import check_values
+from sim2real.train.checks import FINITE, check_values
 from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.networks import Policy
 from sim2real.train.protocol import TrainingEnvironment, check_environment, metric_names
@@ -111,7 +111,7 @@ def _advance(
     count = len(now.log) + 1
     env_steps = count * config.updates_per_evaluation * config.steps_per_update
     check_values(values, env_steps, config, names)
-    del values["finite_observation"]
+    values = {name: value for name, value in values.items() if name not in FINITE}
     log = [*now.log, Progress(count, config.evaluations, env_steps, time.perf_counter() + offset_s, values)]
     evaluation, seed = best_of(history_of(log))
     return Checkpoint(state, policies, policies[seed] if evaluation == count - 1 else now.best, log)
@@ -159,6 +159,6 @@ def _epoch(
         lambda state, _: update(env, config, state), state, length=config.updates_per_evaluation
     )
     policy = make_policy(env, state.params, state.normaliser)
-    finite = stats.pop("finite_observation").all(0)
-    values = {name: leaf.mean(0) for name, leaf in stats.items()} | {"finite_observation": finite}
+    finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
+    values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
     return state, policy, values | evaluate(env, config, policy, keys(state)[2])

@@ -219,7 +219,8 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
 
     Returns:
         The next state, and figures of the update: the parts of the loss and the mean ``reward`` and ``value`` per row,
-        unscaled, each of shape ``()``; and ``finite_observation``, shape ``(O,)``, bool.
+        unscaled, each of shape ``()``; ``finite_observation``, shape ``(O,)``, bool; and ``finite_privileged``, shape
+        ``(P,)``, bool, where the value function sees more.
     """
     key_play, key_shuffle, _ = keys(state)
     policy = make_policy(env, state.params, state.normaliser)
@@ -247,6 +248,8 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
         "value": jnp.sum(batch.weight * batch.value) / jnp.maximum(batch.weight.sum(), 1.0) / config.reward_scale,
         "finite_observation": jnp.isfinite(rows.following).all((0, 1)),
     }
+    if rows.privileged_following is not None:
+        stats |= {"finite_privileged": jnp.isfinite(rows.privileged_following).all((0, 1))}
     normaliser, privileged = update_normaliser(state.normaliser, rows.observation, rows.valid), None
     if state.privileged is not None and rows.privileged is not None:
         privileged = update_normaliser(state.privileged, rows.privileged, rows.valid)

@@ -49,6 +49,7 @@ def test_who_does_not_fit_is_noticed(changes, said, tmp_path):
     [
         ({"joints": {"hinge": {"position": "angle"}}}, "fields of joints: there are th, thdot, but not angle"),
         ({"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),
+        ({"reward": lambda _, state, action: {"voltage": action}}, r"reward 'voltage' of a state has shape \(1,\)"),
         ({"observation": load_pipeline("pendulum").load().observation[:2]}, r"the policy sees \(19,\), not \(15,\)"),
     ],
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from environments import Coin, Constant
 
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
 from sim2real.train.ppo import train
@@ -43,6 +43,17 @@ class Scalar(Coin):
 def test_an_environment_that_shows_nothing_more_is_refused(env, message):
     with pytest.raises(UsageError, match=message):
         train(env, dataclasses.replace(CONFIG, privileged=True), jax.random.key(0))
+
+
+class Infinite(Coin):
+    def privileged(self, state):
+        return jnp.stack([state["coin"], jnp.inf])
+
+
+def test_what_is_no_number_is_named():
+    config = dataclasses.replace(CONFIG, privileged=True, total_steps=1, num_envs=8, epochs=1)
+    with pytest.raises(Sim2RealError, match=r"entries \[1\] of what the value function sees besides[\s\S]*privileged"):
+        train(Infinite(), config, jax.random.key(0))
 
 
 def test_parameters_of_any_size_are_told_apart():
