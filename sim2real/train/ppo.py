@@ -18,6 +18,7 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig as PPOConfig
+from sim2real.train.devices import placements
 from sim2real.train.networks import Policy, init_mlp
 from sim2real.train.protocol import TrainingEnvironment, check_environment
 from sim2real.train.rollout import Copies, evaluate
@@ -92,7 +93,10 @@ def train(
     check_environment(env)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     state = _init(env, config, key if typed else jax.random.wrap_key_data(key))
-    epoch = jax.jit(jax.vmap(lambda state: _epoch(env, config, state)), donate_argnums=0).lower(state).compile()
+    where = placements(state, config)
+    state = state if where is None else jax.device_put(state, where)
+    one = jax.vmap(lambda state: _epoch(env, config, state))
+    epoch = jax.jit(one, donate_argnums=0, out_shardings=where and (where, None, None)).lower(state).compile()
     compiled = time.perf_counter()
     log: list[Progress] = []
     snapshots: list[Policy] = []
