@@ -67,6 +67,8 @@ class PPOConfig:
     """Number of evaluations, evenly spaced, the last one at the end; progress is reported after each."""
     eval_envs: int = 128
     """Number of copies in an evaluation; each plays one episode without exploration noise."""
+    devices: int = 1
+    """Number of this host's devices that seeds and copies are divided among; the results are the same."""
     eval_steps: int = 250
     """Rows of an evaluation; no episode may be longer. The first training episodes are staggered over as many rows."""
 

@@ -21,6 +21,7 @@ from sim2real.errors import UsageError
 from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.checks import FINITE, check_values
 from sim2real.train.config import PPOConfig as PPOConfig
+from sim2real.train.devices import placements
 from sim2real.train.networks import Policy
 from sim2real.train.protocol import TrainingEnvironment, check_environment, metric_names
 from sim2real.train.result import Progress as Progress
@@ -67,12 +68,15 @@ def train(
     key = key if typed else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
     state, numbers = make_start(env, sweep.configs(config), key), swept_numbers(sweep, config.num_seeds)
+    where = placements(state, config)
+    state = state if where is None else jax.device_put(state, where)
     one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), state))
-    lowered = jax.jit(one, donate_argnums=0).lower(state, numbers)
+    lowered = jax.jit(one, donate_argnums=0, out_shardings=where and (where, None, None)).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
     identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume else None
     if resume and identity:
         now = load_checkpoint(resume, identity, now.state, lowered.out_info[1])
+        now = now if where is None else now._replace(state=jax.device_put(now.state, where))
     first, before_s = len(now.log), now.log[-1].elapsed_s if now.log else 0.0
     epoch = partial(_advance, lowered.compile(), numbers, config, sweep.names(config.num_seeds), before_s - start)
     compiled = time.perf_counter()

@@ -1,0 +1,62 @@
+"""Seeds and copies divided among eight devices: the same training, within float error."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
+from sim2real.train.devices import placements
+
+SCRIPT = """
+import dataclasses, json
+import jax
+import numpy as np
+from environments import Bandit
+from sim2real.train.config import PPOConfig
+from sim2real.train.ppo import train
+
+config = PPOConfig(
+    num_seeds=2, num_envs=32, minibatches=4, rollout_steps=4, total_steps=512, hidden=(8,), evaluations=2, eval_steps=2,
+    eval_envs=16,
+)
+found = {}
+for devices in (1, 8):
+    result = train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3))
+    leaves = jax.tree.leaves(jax.device_get(result.policies))
+    found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_eight_devices_learn_what_one_learns():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=300, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert len(found["1"]) > 10
+    for one, eight in zip(found["1"], found["8"], strict=True):
+        np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
+
+
+def test_devices_that_are_not_there_are_refused():
+    with pytest.raises(UsageError, match="devices=64, but JAX finds 1 on this host"):
+        placements(SimpleNamespace(), PPOConfig(devices=64))
+
+
+def test_copies_that_cannot_be_divided_are_refused(monkeypatch):
+    monkeypatch.setattr("jax.local_devices", lambda: [SimpleNamespace(device_kind="cpu")] * 8)
+    with pytest.raises(UsageError, match="8 devices cannot divide 2 seeds of 6 copies: 4 devices a seed"):
+        placements(SimpleNamespace(), PPOConfig(devices=8, num_seeds=2, num_envs=6, minibatches=2))
