@@ -15,6 +15,8 @@ from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 
 BUNDLE, HISTORY = "bundle", "history.json"
+REWARD = "reward/"
+"""What curves of a named term of the reward begin with."""
 _AGAIN = "run `sim2real train` again"
 
 
@@ -57,6 +59,11 @@ class History:
         best = self.best_seed
         check(len(self.settings) in (0, self.returns.shape[1]), f"{len(self.settings)} settings of the curves")
         check(best is None or 0 <= best < self.returns.shape[1], f"no curve of seed {best}")
+
+    @property
+    def terms(self) -> dict[str, np.ndarray]:
+        """Term of the reward -> what it added to the return ``(K, seeds)``; empty where terms have no names."""
+        return {n.removeprefix(REWARD): curve for n, curve in self.others.items() if n.startswith(REWARD)}
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

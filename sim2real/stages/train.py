@@ -34,7 +34,6 @@ from sim2real.train.networks import Policy
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 from sim2real.train.sweep import Sweep, named
-from sim2real.train.tasks import REWARD
 
 
 def train(
@@ -176,13 +175,12 @@ def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> 
 
 def _terms(history: History) -> tuple[list[list[Any]], list[str]] | None:
     """Return what each named term of the reward added to the return of the kept policy's seed, at each evaluation."""
-    names = [name for name in history.others if name.startswith(REWARD)]
-    if not names:
+    if not history.terms:
         return None
     own = history.best_seed or 0
-    columns = [history.steps.astype(int), history.returns[:, own], *(history.others[name][:, own] for name in names)]
+    columns = [history.steps.astype(int), history.returns[:, own], *(c[:, own] for c in history.terms.values())]
     rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
-    return rows, ["steps", "return", *(f"of it {name.removeprefix(REWARD)}" for name in names)]
+    return rows, ["steps", "return", *(f"of it {name}" for name in history.terms)]
 
 
 def _tried(history: History) -> tuple[list[list[Any]], list[str]]:

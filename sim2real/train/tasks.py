@@ -10,11 +10,10 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
+from sim2real.artifacts.bundle import REWARD as REWARD
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 
-REWARD = "reward/"
-"""Before the name of a term in the metrics: the term's sum over an episode."""
 Rewards = jax.Array | Mapping[str, jax.Array]
 """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
 

@@ -73,11 +73,22 @@ def train_section(artifact: StageFolder) -> PageSection:
         Tile("time", f"{curves.seconds[-1]:.0f} s"),
     ]
     figure = FigureBlock(figures.training(curves, "train-curves"), "Evaluations during training, in simulation.")
-    rows = [[str(seed), number(float(curves.returns[-1, seed])), f"{last[seed]:.1%}"] for seed in range(seeds)]
-    table = TableBlock("Each seed at the end", ("seed", "return", "success"), rows)
     lead = "A policy for the identified model, with the timing of the robot."
-    blocks = [figure, table, *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
+    blocks = [figure, _seeds(curves), *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
     return PageSection("train", "Train", lead, tiles, blocks)
+
+
+def _seeds(curves: History) -> TableBlock:
+    """Return how each seed does at the end, with the settings that it tried, and what each term of the reward added."""
+    tried = ("settings",) if curves.settings else ()
+    rows = [
+        [str(seed), *curves.settings[seed : seed + 1], *map(number, values), f"{curves.success[-1, seed]:.1%}"]
+        for seed, values in enumerate(
+            zip(*(c[-1].tolist() for c in (curves.returns, *curves.terms.values())), strict=True)
+        )
+    ]
+    header = ("seed", *tried, "return", *(f"of it {name}" for name in curves.terms), "success")
+    return TableBlock("Each seed at the end", header, rows, text_columns=(1,) if tried else ())
 
 
 def _drawn_blocks(artifact: StageFolder) -> list[Block]:

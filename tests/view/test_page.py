@@ -229,6 +229,18 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     assert "truth" not in words
 
 
+def test_what_was_swept_and_what_each_term_of_the_reward_added_are_shown(only):
+    run = only("identify", "train")
+    document = synthetic_run.history(2)
+    terms = {f"reward/{n}": [[share * v for v in row] for row in document["returns"]] for n, share in TERMS.items()}
+    document |= {"settings": ["gamma=0.9", "gamma=0.99"], "best_seed": 1, "others": terms}
+    (run / "train" / "history.json").write_text(json.dumps(document))
+    text = Page(report(run).read_text(encoding="utf-8")).words
+    assert {"settings", "gamma=0.9", "gamma=0.99", "of it angle", "of it voltage"} <= set(text)
+    assert not [word for word in text if "reward/" in word]
+
+
+TERMS = {"angle": 0.75, "voltage": 0.25}
 MALFORMED = {
     "no JSON": ("identify", "parameters.json", b"{", "parameters.json is malformed"),
     "no parameters": ("identify", "parameters.json", b"{}", "missing required field"),
