@@ -146,14 +146,16 @@ def test_a_world_gets_the_values_and_the_start_that_were_asked_for(table):
 
 def test_a_policy_is_trained_from_the_robots_own_starts_with_draws_of_the_worlds_parameters(table):
     oiled = in_world(table, "oiled")
-    draws = {"drag": np.array([7.0, 7.5])}
+    late = {"sensor_delay": np.array([0.004, 0.006]), "actuator_delay": np.array([0.011, 0.015])}
+    draws = {"drag": np.array([7.0, 7.5]), **late}
     nodes, task = oiled.training({**VALUES, "drag": 4.0}, draws, {}, True)
     assert type(nodes["world"]).__name__ == "Oiled"
     params = [task.params(jax.random.key(i)) for i in range(8)]
     assert {float(p["world"].drag) for p in params} == {7.0, 7.5}
     assert {float(p["world"].loop) for p in params} == {20.0}
     assert np.ptp([p["agent"].aim for p in params]) > 2.0
-    assert np.ptp([p["sensor"].delay for p in params]) > 1e-4
+    trips = {round(float(p["sensor"].delay + p["actuator"].delay), 6) for p in params}
+    assert trips == {0.015, 0.021}
     at_rest = oiled.simulation_params({**VALUES, "drag": 4.0}, None, trial=1)
     assert float(at_rest["world"].drag) == 4.0
     np.testing.assert_allclose(at_rest["agent"].aim, table.aim(1))
