@@ -13,7 +13,7 @@ PIPELINE = Pipeline(
     package=__name__,
     # Slower motion cannot tell a delay from the rotors' inertia: these servos' motion lags as little by either.
     record=RecordConfig(amplitude=0.4, low_hz=0.2, high_hz=6.0, gate=GATE),
-    # At the data sheet's torque limit no error is large enough to feel it: a refinement alone never finds a lower one.
+    # Friction, torque limits and delays have several optima between them: a search comes before the refinement.
     identify=IdentifyConfig(
         initial_state="measured",
         skip_s=0.3,

@@ -82,7 +82,9 @@ class SO101Robot(ServoRobot):
         """Return what may be identified: servos of one model, each with friction and brake of its own."""
         found = standard.parameters(SHEET, JOINTS, own=("damping", "friction"))
         full, about = SHEET.full_rad, "error from which on it pushes no harder"
-        return found + [Parameter(f"saturation_{j}", "rad", full, full / 10, full * 2, about=about) for j in SATURATES]
+        # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
+        limit = Parameter("", "rad", full, full / 10, full * 2, about=about, begin=full / 4)
+        return found + [replace(limit, name=f"saturation_{j}") for j in SATURATES]
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
         """Open the arm with the calibration of the one on this port, with torque off; see ``Robot.connect``."""

@@ -42,6 +42,8 @@ class Parameter:
         off: Its value where that term is left out; default: the nominal one.
         vanishes: Whether nothing lies below 0, and 0 is possible, as for a friction: on a logarithmic scale an estimate
             only comes near, and counts as negligible where the model without it is as good.
+        begin: Where a search begins; None: at the nominal value. A limit that no motion reaches at the data sheet's
+            value is found from below: there the data feel it.
         narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
     """
 
@@ -61,6 +63,7 @@ class Parameter:
     term: str = ""
     off: float | None = None
     vanishes: bool = False
+    begin: float | None = None
     narrowed: bool = False
     excite: str = ""
 
@@ -166,7 +169,8 @@ class ParameterTable:
     def with_nominal(self, values: Mapping[str, float]) -> ParameterTable:
         """Return the table with other nominal values, from which a search starts; unknown names are ignored."""
         return ParameterTable(
-            (replace(p, nominal=float(values.get(p.name, p.nominal))) for p in self.parameters), self.recordings
+            (replace(p, nominal=float(values[p.name]), begin=None) if p.name in values else p for p in self.parameters),
+            self.recordings,
         )
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> ParameterTable:
@@ -284,12 +288,13 @@ class ParameterTable:
         return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
-        """Return where a search begins, ``(P,)``: at the nominal values, for delays at a share of their interval.
+        """Return where a search begins, ``(P,)``: each parameter where it says, delays at a share of their interval.
 
         Where that is the lower bound, a little above: at a bound nothing moves.
         """
         at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
-        first = {p.name: p.nominal if p.kind != "delay" else at(p, share) for p in self.parameters}
+        own = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
+        first = {p.name: own[p.name] if p.kind != "delay" else at(p, share) for p in self.parameters}
         for p in self.parameters:
             if p.kind != "delay" and p.transform == "linear" and p.nominal == p.low:
                 first[p.name] = at(p, _ABOVE)

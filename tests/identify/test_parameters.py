@@ -292,3 +292,15 @@ def test_other_bounds():
         table.with_bounds({"delay": (0.02, 0.06)})
     with pytest.raises(UsageError, match="--max-delay-s"):
         table.with_bounds({"delay": (0.0, 0.04)})
+
+
+def test_a_search_begins_where_a_parameter_says_until_it_has_an_estimate():
+    limit = Parameter("limit", "rad", 0.4, 0.04, 0.8, begin=0.1)
+    table = ParameterTable([limit, Parameter("gain", "1", 2.0, 0.5, 8.0)])
+    first = table.decode(jnp.asarray(table.start()))
+    assert float(first["limit"]) == pytest.approx(0.1, rel=1e-3)
+    assert float(first["gain"]) == pytest.approx(2.0, rel=1e-3)
+    again = table.with_nominal({"limit": 0.17})
+    assert float(again.decode(jnp.asarray(again.start()))["limit"]) == pytest.approx(0.17, rel=1e-3)
+    other = table.with_nominal({"gain": 3.0})
+    assert float(other.decode(jnp.asarray(other.start()))["limit"]) == pytest.approx(0.1, rel=1e-3)
