@@ -35,3 +35,6 @@ napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 # Rooms may use the same class name; a reference by the bare name then has several targets.
 suppress_warnings = ["ref.python"]
+# Warp is an extra, whose wheel has 150 MB: its modules are documented without it.
+_WARP = "mujoco.mjx.third_party.mujoco_warp"
+autodoc_mock_imports = ["warp", _WARP, f"{_WARP}._src"]
