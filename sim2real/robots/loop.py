@@ -112,19 +112,23 @@ def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> di
     return {**values, DELAYS[0]: sensor, DELAYS[1]: total - sensor}
 
 
-def drawn_in_a_loop(values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return samples of parameters with the sensor's delay as it is, as far as the sum of both delays allows.
+def drawn_in_a_loop(
+    values: Mapping[str, float], draws: Mapping[str, np.ndarray], tick_s: float, spread_s: float
+) -> dict[str, np.ndarray]:
+    """Return samples of parameters with the sensor's delay as ``in_a_loop`` has it, as far as the sum of both allows.
 
     All that the sum varies by is then in the actuator's delay: a policy sees only the sum.
 
     Args:
-        values: What ``in_a_loop`` returns.
-        draws: Samples of some parameters, each of shape ``(K,)``, of both delays or of neither [s].
+        values: Parameters by name, with both delays [s] or neither; a delay that is not drawn is as here.
+        draws: Samples of some parameters, each of shape ``(K,)``, delays in [s].
+        tick_s: The world's period [s].
+        spread_s: Largest deviation of an episode's delay from its value [s].
     """
-    if not set(DELAYS) <= set(draws):
+    if not (set(DELAYS) & set(draws) and set(DELAYS) <= set(values)):
         return dict(draws)
-    total = draws[DELAYS[0]] + draws[DELAYS[1]]
-    sensor = np.minimum(values[DELAYS[0]], total)
+    total = np.asarray(sum(draws.get(name, values[name]) for name in DELAYS))
+    sensor = np.minimum(in_a_loop(values, tick_s, spread_s)[DELAYS[0]], total)
     return {**draws, DELAYS[0]: sensor, DELAYS[1]: total - sensor}
 
 

@@ -213,8 +213,9 @@ class LoopRobot(Robot):
             delays: Whether the graph has delays.
         """
         roles, world = self.roles, self.make_world()
-        values = in_a_loop(values, self.tick_s, self.delay_spread_s)
-        draws, spread_s = drawn_in_a_loop(values, draws), self.delay_spread_s
+        spread_s = self.delay_spread_s
+        draws = drawn_in_a_loop(values, draws, self.tick_s, spread_s)
+        values = in_a_loop(values, self.tick_s, spread_s)
         bounds = delay_bounds(values, self.tick_s, spread_s, self.lead_s, draws) if delays else None
         names = (roles.sensor, roles.supervisor, roles.actuator)
         on_sensor, on_agent, on_actuator = (

@@ -91,7 +91,8 @@ def prepare(
     if found is not None:
         timing = timing or timing_of(found)
         recorded = Recorded.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
-    nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, set(DELAYS) <= set(values))
+    delayed = recorded is not None or set(DELAYS) <= set(values)
+    nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, delayed)
     if recorded:
         recorded.transport_to(nodes)
     noise = _disturb(nodes[robot.roles.sensor], found, config)

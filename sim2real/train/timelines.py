@@ -230,7 +230,7 @@ def _cut(
     last = np.full(count, np.iinfo(np.int64).max)
     rate_hz = nodes[supervisor].rate
     while True:
-        timeline = draw(nodes, episode_s, count)
+        timeline = draw(nodes, episode_s, count, stretches.seed)
         vertex = timeline.vertices[supervisor]
         gaps = np.diff(vertex.start[:, : int(vertex.count.min())], axis=1)
         first = np.where(gaps > periods * TICKS_PER_S / rate_hz, np.arange(1, gaps.shape[1] + 1), last[:, None])

@@ -96,8 +96,7 @@ def test_a_row_of_draws_is_drawn_together_and_the_rest_is_fixed(drawn):
 
 
 def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
-    values = in_a_loop(VALUES, TICK_S, SPREAD_S)
-    found = drawn_in_a_loop(values, {"gain": np.arange(3.0), **LATE})
+    found = drawn_in_a_loop(VALUES, {"gain": np.arange(3.0), **LATE}, TICK_S, SPREAD_S)
     np.testing.assert_allclose(found["sensor_delay"] + found["actuator_delay"], [0.016, 0.023, 0.005])
     # What the loop's sensor needs, as long as the sum has it.
     np.testing.assert_allclose(found["sensor_delay"], [0.013, 0.013, 0.005])
@@ -107,7 +106,14 @@ def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
     row = drawn["gain"].astype(int)
     for name in DELAYS:
         np.testing.assert_allclose(drawn[name], found[name][row], rtol=1e-6)
-    assert drawn_in_a_loop(values, {"gain": np.arange(3.0)}).keys() == {"gain"}
+    assert drawn_in_a_loop(VALUES, {"gain": np.arange(3.0)}, TICK_S, SPREAD_S).keys() == {"gain"}
+
+
+def test_one_delay_that_is_drawn_alone_moves_the_sum():
+    """A sensor's delay below a tick cannot be simulated: the sum is what counts, and the other delay is as it was."""
+    found = drawn_in_a_loop(VALUES, {"sensor_delay": np.array([0.002, 0.03])}, TICK_S, SPREAD_S)
+    np.testing.assert_allclose(found["sensor_delay"] + found["actuator_delay"], [0.003, 0.031])
+    np.testing.assert_allclose(found["sensor_delay"], [0.003, 0.013])
 
 
 @pytest.mark.parametrize("draws", [{}, LATE])
