@@ -28,7 +28,7 @@ QUICK = {
             "--train.ppo.total-steps=512",
             "--train.ppo.num-envs=16",
         ),
-        *("--train.ppo.minibatches=2", "--train.ppo.evaluations=1", "--train.ppo.eval-envs=4"),
+        *("--train.ppo.minibatches=2", "--train.ppo.evaluations=1"),
         *("--deploy.episodes=1", "--deploy.duration-s=1"),
     ],
 }

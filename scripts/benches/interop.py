@@ -91,7 +91,7 @@ def brax(env: Any, config: PPOConfig, seed: int) -> Curve:
         num_timesteps=config.total_steps,
         episode_length=adapted.max_episode_length,
         num_envs=config.num_envs,
-        num_eval_envs=config.eval_envs,
+        num_eval_envs=config.num_envs,
         num_evals=config.evaluations + 1,  # the first one is before the training
         deterministic_eval=True,
         unroll_length=config.rollout_steps,

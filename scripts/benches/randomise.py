@@ -121,7 +121,7 @@ def train_config(pipeline: Any, way: str, seed: int, options: argparse.Namespace
     """Return the training's configuration for one of ``WAYS``."""
     told = dict(WAYS[way])
     top = {n: told.pop(n) for n in ("model", "randomise") if n in told}
-    few = {"minibatches": 2, "evaluations": 1, "eval_envs": 4} if options.envs < pipeline.train.ppo.minibatches else {}
+    few = {"minibatches": 2, "evaluations": 1} if options.envs < pipeline.train.ppo.minibatches else {}
     ppo = replace(pipeline.train.ppo, total_steps=options.steps, num_envs=options.envs, **few)
     vary = replace(pipeline.train.vary, **told)
     return replace(pipeline.train, seed=seed, force=True, vary=vary, ppo=ppo, **top)

@@ -154,7 +154,8 @@ def sensitivity(
     """
     loops = _in_one_loop(robot, models)
     columns = {name: jnp.asarray([m[name] for m in loops], jnp.float32) for name in loops[0]}
-    config = PPOConfig(eval_envs=_EPISODES, eval_steps=env.length + 1)
+    rows = env.length + 1
+    config = PPOConfig(num_envs=_EPISODES, minibatches=1, rollout_steps=rows, eval_steps=rows)
     key = jax.random.key(seed)
 
     def play(values: dict[str, jax.Array]) -> jax.Array:

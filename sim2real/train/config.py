@@ -20,7 +20,7 @@ class PPOConfig:
     num_seeds: int = 1
     """Number of policies that are trained in parallel with different random numbers; the best one is kept."""
     num_envs: int = 256
-    """Number of copies of the environment per seed."""
+    """Number of copies of the environment per seed; in an evaluation each plays one episode."""
     rollout_steps: int = 32
     """Number of rows (environment steps) that each copy plays between two updates."""
     total_steps: int = 1_000_000
@@ -65,8 +65,6 @@ class PPOConfig:
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10
     """Number of evaluations, evenly spaced, the last one at the end; progress is reported after each."""
-    eval_envs: int = 128
-    """Number of copies in an evaluation; each plays one episode without exploration noise."""
     devices: int = 1
     """Number of this host's devices that seeds and copies are divided among; the results are the same."""
     eval_steps: int = 250
@@ -111,6 +109,11 @@ class PPOConfig:
     def updates_per_evaluation(self) -> int:
         """Number of updates between two evaluations."""
         return -(-self.total_steps // (self.steps_per_update * self.evaluations))
+
+    @property
+    def rollouts_per_test(self) -> int:
+        """Number of rollouts in which every episode ends."""
+        return -(-self.eval_steps // self.rollout_steps)
 
     @property
     def updates(self) -> int:

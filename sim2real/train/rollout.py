@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment, get_privileged
+from sim2real.train.protocol import TrainingEnvironment, get_privileged, metric_names
 
 
 class Copies(NamedTuple):
@@ -38,6 +38,7 @@ class Rows(NamedTuple):
         truncated: Shape ``(T, N)``.
         valid: Shape ``(T, N)``.
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
+        metrics: Name -> shape ``(T, N)``: the environment's, after the row.
         privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
         privileged_following: Shape ``(T, N, P)``: the same after the row.
     """
@@ -49,12 +50,35 @@ class Rows(NamedTuple):
     truncated: jax.Array
     valid: jax.Array
     following: jax.Array
+    metrics: dict[str, jax.Array]
     privileged: jax.Array | None = None
     privileged_following: jax.Array | None = None
 
 
-_Carry = tuple[Copies, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]
-"""Copies, which of them run, which ended by themselves, their returns, and their metrics."""
+class Tested(NamedTuple):
+    """What N copies have shown in a test: one episode each.
+
+    Attributes:
+        running: Shape ``(N,)``, bool: the episode has not ended yet.
+        terminated: Shape ``(N,)``, bool: it ended by itself.
+        figures: Name -> shape ``(N,)``: ``return``, the sum of the rewards, and the environment's metrics, which may
+            have a ``return`` of their own, as they were at the end.
+    """
+
+    running: jax.Array
+    terminated: jax.Array
+    figures: dict[str, jax.Array]
+
+
+def pick(condition: jax.Array, new: T, old: T) -> T:
+    """Return ``new`` or ``old``.
+
+    Args:
+        condition: Shape ``()``, bool: whether it is ``new``.
+        new: Any arrays.
+        old: Like ``new``.
+    """
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def select(mask: jax.Array, new: T, old: T) -> T:
@@ -73,7 +97,13 @@ def select(mask: jax.Array, new: T, old: T) -> T:
 
 
 def collect(
-    env: TrainingEnvironment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    policy: Policy,
+    copies: Copies,
+    update: jax.Array,
+    key: jax.Array,
+    testing: jax.Array | None = None,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
@@ -87,8 +117,9 @@ def collect(
         config: Numbers of copies and rows.
         policy: The policy; it does not change during the rollout.
         copies: The copies after the last rollout; ignored if ``update`` is 0.
-        update: Shape ``()``, int32: number of updates so far.
+        update: Shape ``()``, int32: number of updates so far, in a test of rollouts.
         key: Source of resets, noise and the environment's own randomness.
+        testing: Shape ``()``, bool: play without exploration noise, and cut no episode; default: false.
 
     Returns:
         The copies after the rollout, and the rows.
@@ -98,9 +129,10 @@ def collect(
     fresh = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, count)))
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
-    spread = jnp.exp(policy.log_std)
+    spread = jnp.exp(policy.log_std) if testing is None else jnp.where(testing, 0.0, jnp.exp(policy.log_std))
     see = get_privileged(env, config)
     cut = 1 + jnp.arange(count) * config.eval_steps // count
+    cut = cut if testing is None else jnp.where(testing, 0, cut)
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
         noise, keys, number = x
@@ -116,6 +148,7 @@ def collect(
             truncated=truncated,
             valid=step.valid,
             following=step.observation,
+            metrics=step.metrics,
             privileged=None if see is None else jax.vmap(see)(now.state),
             privileged_following=None if see is None else jax.vmap(see)(step.state),
         )
@@ -123,6 +156,45 @@ def collect(
 
     numbers = update * rows + jnp.arange(1, rows + 1)
     return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
+
+
+def untested(env: TrainingEnvironment, config: PPOConfig) -> Tested:
+    """Return what is known before a test."""
+    names = metric_names(env)
+    zeros, no = jnp.zeros(config.num_envs), jnp.zeros(config.num_envs, bool)
+    return Tested(~no, no, dict.fromkeys(["return", *names], zeros))
+
+
+def watch(tested: Tested, rows: Rows, config: PPOConfig) -> Tested:
+    """Return what is known after more rows of a test.
+
+    Args:
+        tested: What was known before.
+        rows: T rows of the N copies.
+        config: How the rewards were scaled.
+    """
+    end = rows.terminated | rows.truncated
+    runs = tested.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
+    last = runs & end
+    figures = {"return": rows.reward / config.reward_scale} | rows.metrics
+    own = "return" in rows.metrics
+    kept = {n: jnp.where(runs if n == "return" and not own else last, v, 0.0).sum(0) for n, v in figures.items()}
+    return Tested(
+        running=tested.running & ~last.any(0),
+        terminated=tested.terminated | (last & rows.terminated).any(0),
+        figures={name: tested.figures[name] + value for name, value in kept.items()},
+    )
+
+
+def figures_of(tested: Tested) -> dict[str, jax.Array]:
+    """Return the figures' means over the episodes that ended, each of shape ``()``.
+
+    With them ``finished``, the share of the episodes that ended, and ``terminated``, that of those which did by
+    themselves.
+    """
+    share = jnp.mean(jnp.where(tested.running, 0.0, 1.0))
+    figures = {"terminated": jnp.where(tested.terminated, 1.0, 0.0)} | tested.figures
+    return {n: jnp.mean(jnp.where(tested.running, 0.0, v)) / share for n, v in figures.items()} | {"finished": share}
 
 
 def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
@@ -139,25 +211,14 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
         ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the
         fraction of those that ended by themselves. Each of shape ``()``.
     """
-    key_reset, key_step = jax.random.split(key)
-    copies = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs)))
-    names = jax.eval_shape(lambda key: env.step(env.reset(key)[0], policy.low, key).metrics, key)
-    zeros = jnp.zeros(config.eval_envs)
-    running = jnp.ones(config.eval_envs, bool)
-    start = (copies, running, ~running, zeros, {name: zeros for name in names})
+    shapes = jax.eval_shape(jax.vmap(env.reset), jax.random.split(key, config.num_envs))
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
 
-    def row(carry: _Carry, key: jax.Array) -> tuple[_Carry, None]:
-        copies, running, fallen, total, metrics = carry
-        keys = jax.random.split(key, config.eval_envs)
-        step = jax.vmap(env.step)(copies.state, jax.vmap(policy.get_action)(copies.observation), keys)
-        ends = running & (step.terminated | step.truncated)
-        total = total + jnp.where(running, step.reward, 0.0)
-        metrics = {name: jnp.where(ends, value, metrics[name]) for name, value in step.metrics.items()}
-        fallen = fallen | (ends & step.terminated)
-        return (Copies(step.state, step.observation), running & ~ends, fallen, total, metrics), None
+    def rollout(carry: tuple[Copies, Tested], i: jax.Array) -> tuple[tuple[Copies, Tested], None]:
+        copies, tested = carry
+        played, rows = collect(env, config, policy, copies, i, jax.random.fold_in(key, i), jnp.asarray(True))
+        return (played, watch(tested, rows, config)), None
 
-    (_, running, fallen, total, metrics), _ = jax.lax.scan(row, start, jax.random.split(key_step, config.eval_steps))
-    share = jnp.mean(jnp.where(running, 0.0, 1.0))
-    figures = {"terminated": jnp.where(fallen, 1.0, 0.0), "return": total} | metrics
-    mean = {name: jnp.mean(jnp.where(running, 0.0, v)) / share for name, v in figures.items()}
-    return mean | {"finished": share}
+    start = blank, untested(env, config)
+    (_, tested), _ = jax.lax.scan(rollout, start, jnp.arange(config.rollouts_per_test))
+    return figures_of(tested)

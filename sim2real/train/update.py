@@ -15,7 +15,7 @@ from sim2real.train.networks import Policy, apply_mlp, entropy, log_prob
 from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
 from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.protocol import TrainingEnvironment
-from sim2real.train.rollout import Copies, Rows, collect
+from sim2real.train.rollout import Copies, Rows
 
 
 class TrainState(NamedTuple):
@@ -206,8 +206,10 @@ def keys(state: TrainState) -> jax.Array:
     return jax.random.split(jax.random.fold_in(state.key, state.update), 3)
 
 
-def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
-    """Play one rollout and update the networks and the normaliser.
+def update(
+    env: TrainingEnvironment, config: PPOConfig, state: TrainState, copies: Copies, rows: Rows
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Update the networks and the normaliser after a rollout.
 
     Each minibatch has all rows of some of the copies: shuffling N indices is cheap, and a copy's rows are adjacent in
     memory. The normaliser is updated after the networks: log densities are those of the policy that played the rows.
@@ -215,17 +217,16 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
     Args:
         env: The environment.
         config: Settings.
-        state: The state before.
+        state: The state before the rollout.
+        copies: The copies after it.
+        rows: What they played, by the policy of that state.
 
     Returns:
         The next state, and figures of the update: the parts of the loss and the mean ``reward`` and ``value`` per row,
         unscaled, each of shape ``()``; ``finite_observation``, shape ``(O,)``, bool; and ``finite_privileged``, shape
         ``(P,)``, bool, where the value function sees more.
     """
-    key_play, key_shuffle, _ = keys(state)
-    policy = make_policy(env, state.params, state.normaliser)
-    copies, rows = collect(env, config, policy, state.copies, state.update, key_play)
-    batch = prepare(state, policy, rows, config)
+    batch = prepare(state, make_policy(env, state.params, state.normaliser), rows, config)
     optimiser = make_optimiser(config)
 
     def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
@@ -239,7 +240,7 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
     shuffles = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
-        jax.random.split(key_shuffle, config.epochs)
+        jax.random.split(keys(state)[1], config.epochs)
     )
     index = shuffles.reshape(config.epochs * config.minibatches, -1)
     (params, optimiser_state), parts = jax.lax.scan(minibatch, (state.params, state.optimiser), index)

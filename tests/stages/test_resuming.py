@@ -15,7 +15,7 @@ from sim2real.stages.resuming import CHECKPOINT
 TINY = [
     *("train", "pendulum", "--model", "nominal", "--episode-s", "0.5", "--timelines", "2", "--seed", "1"),
     *("--ppo.total-steps", "96", "--ppo.num-envs", "4", "--ppo.minibatches", "1", "--ppo.evaluations", "3"),
-    *("--ppo.rollout-steps", "4", "--ppo.eval-envs", "2", "--ppo.epochs", "1", "--ppo.hidden", "4"),
+    *("--ppo.rollout-steps", "4", "--ppo.epochs", "1", "--ppo.hidden", "4"),
 ]
 
 

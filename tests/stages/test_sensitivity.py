@@ -73,7 +73,10 @@ def judged():
     robot = with_room(Holding(), models)
     nodes, task = robot.training(found.values, {}, {}, True)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
-    policy = SimpleNamespace(low=np.array([-2.0]), get_action=lambda observation: jnp.array([VOLTS]))
+    one = jnp.ones(1)
+    policy = SimpleNamespace(
+        low=-2.0 * one, log_std=one, get_mean=lambda observation: VOLTS * one, to_action=lambda u: u
+    )
     return sensitivity(robot, env, policy, moves, models, seed=0)
 
 

@@ -153,3 +153,19 @@ class Constant:
             valid,
             {"policy_steps": acted},
         )
+
+
+class Counter(Constant):
+    """Observes the start's number plus the rows since then."""
+
+    def reset(self, key):
+        start = jnp.floor(1000.0 * jax.random.uniform(key)) * 100.0
+        return {"start": start, "row": jnp.int32(0)}, start[None]
+
+    def step(self, state, action, key):
+        row = state["row"] + 1
+        seen = state["start"] + row
+        yes = jnp.bool_(True)
+        return Step(
+            {**state, "row": row}, seen[None], jnp.float32(2), row >= self.length, ~yes, yes, {"rows": row * 1.0}
+        )

@@ -13,7 +13,7 @@ from sim2real.train.ppo import train
 
 CONFIG = PPOConfig(
     num_seeds=2, num_envs=8, minibatches=2, rollout_steps=4, total_steps=256, hidden=(4,), evaluations=4, eval_steps=3,
-    eval_envs=8, epochs=1,
+    epochs=1,
 )  # fmt: skip
 KEY = jax.random.key(3)
 

@@ -24,7 +24,6 @@ from sim2real.train.ppo import train
 
 config = PPOConfig(
     num_seeds=2, num_envs=32, minibatches=4, rollout_steps=4, total_steps=512, hidden=(8,), evaluations=2, eval_steps=2,
-    eval_envs=16,
 )
 found = {}
 for devices in (1, 8):

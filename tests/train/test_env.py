@@ -67,7 +67,7 @@ def test_nothing_follows_a_fall_and_the_value_goes_on_where_time_is_up(played):
     following[:-1][~ended[:-1]] = value[1:][~ended[:-1]]
     empty = np.zeros((*shape, 0))
     flags = (rows.terminated, rows.truncated, rows.valid)
-    made = Rows(empty, empty, *map(jnp.asarray, (rows.reward, *flags)), following=empty)
+    made = Rows(empty, empty, *map(jnp.asarray, (rows.reward, *flags)), following=empty, metrics={})
     found = np.asarray(gae(made, jnp.asarray(value), jnp.asarray(following), 0.9, 0.8))
     for i in range(COPIES):
         expected = slow(*(leaf[:, i] for leaf in (rows.reward, *flags, value, following)), 0.9, 0.8)

@@ -13,7 +13,7 @@ GAMMA, LAMBDA = 0.9, 0.8
 
 def make_rows(reward, terminated, truncated, valid):
     empty = jnp.zeros((*reward.shape, 0))
-    return Rows(empty, empty, *map(jnp.asarray, (reward, terminated, truncated, valid)), following=empty)
+    return Rows(empty, empty, *map(jnp.asarray, (reward, terminated, truncated, valid)), following=empty, metrics={})
 
 
 @pytest.mark.parametrize("valid_share", [1.0, 0.6])

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environments import Bandit, Constant, Pendulum
+from environments import Bandit, Constant, Counter, Pendulum
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
@@ -17,7 +17,7 @@ from sim2real.train.update import keys
 
 SMALL = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=80_000, hidden=(32,), evaluations=4, eval_steps=20,
-    eval_envs=64, gamma=0.9, reward_scale=0.5,
+    gamma=0.9, reward_scale=0.5,
 )  # fmt: skip
 TINY = dataclasses.replace(SMALL, total_steps=1, hidden=(4,), evaluations=1, epochs=1, minibatches=1)
 
@@ -64,6 +64,15 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     for name in ("return", "value_loss", "entropy"):
         np.testing.assert_allclose(alone.history[name][:, 0], result.history[name][:, 0], rtol=2e-2, atol=1e-3)
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
+
+
+@pytest.mark.parametrize("rollout_steps", [2, 8])
+def test_a_test_within_training_plays_one_whole_episode_per_copy(rollout_steps):
+    """Also where it takes several rollouts, and where episodes for training are cut before."""
+    config = dataclasses.replace(TINY, rollout_steps=rollout_steps, eval_steps=5, evaluations=2)
+    history = train(Counter(length=5), config, jax.random.key(0)).history
+    for name, value in {"return": 10.0, "rows": 5.0, "finished": 1.0, "terminated": 1.0}.items():
+        np.testing.assert_array_equal(history[name], value, name)
 
 
 def test_no_key_is_used_twice():

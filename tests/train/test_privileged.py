@@ -15,7 +15,7 @@ from sim2real.train.ppo import train
 
 CONFIG = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=16_000, hidden=(16,), evaluations=1, eval_steps=20,
-    eval_envs=8, gamma=0.9, reward_scale=0.5, gae_lambda=0.5,
+    gamma=0.9, reward_scale=0.5, gae_lambda=0.5,
 )  # fmt: skip
 
 

@@ -4,33 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environments import Constant
+from environments import Counter
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy, init_mlp
-from sim2real.train.protocol import Step
 from sim2real.train.rollout import Copies, collect, evaluate
-
-
-class Counter(Constant):
-    """Observes the start's number plus the rows since then."""
-
-    def reset(self, key):
-        start = jnp.floor(1000.0 * jax.random.uniform(key)) * 100.0
-        return {"start": start, "row": jnp.int32(0)}, start[None]
-
-    def step(self, state, action, key):
-        row = state["row"] + 1
-        seen = state["start"] + row
-        yes = jnp.bool_(True)
-        return Step(
-            {**state, "row": row}, seen[None], jnp.float32(2), row >= self.length, ~yes, yes, {"rows": row * 1.0}
-        )
 
 
 @pytest.fixture(scope="module")
 def config():
-    return PPOConfig(num_envs=8, minibatches=1, rollout_steps=12, eval_envs=5, eval_steps=16, reward_scale=0.5)
+    return PPOConfig(num_envs=8, minibatches=1, rollout_steps=12, eval_steps=16, reward_scale=0.5)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from sim2real.train.sweep import SWEPT, Sweep, named
 
 CONFIG = PPOConfig(
     num_seeds=2, num_envs=16, minibatches=2, rollout_steps=4, total_steps=512, hidden=(4,), evaluations=2, eval_steps=3,
-    eval_envs=8, epochs=2, entropy_coef=0.01, schedule="adaptive",
+    epochs=2, entropy_coef=0.01, schedule="adaptive",
 )  # fmt: skip
 KEY = jax.random.key(1)
 

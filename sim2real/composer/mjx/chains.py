@@ -1,4 +1,4 @@
-"""Chains of bodies on the CPU: the pose of a link is computed once, not again for every link beyond it."""
+"""Chains of bodies: the pose of a link is computed once, not again for every link beyond it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ def hold_links() -> None:
     """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link.
 
     On a CPU XLA fuses the whole chain, and computes each link's pose where it is used: twice as often with every link.
-    Six in a row (SO-101), 256 copies: 2.9 ms for ``mjx.kinematics`` instead of 151. On a GPU, XLA weighs that itself.
+    Six in a row (SO-101), 256 copies: 2.9 ms for ``mjx.kinematics`` instead of 151. On a GPU it runs as
+    fast as without, and compiles faster: 25 s instead of 29 for the training of three links on an H200.
     """
     scan._nvmap = _held
 
 
 def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
-    if carry is not None and jax.default_backend() == "cpu":
+    if carry is not None:
         carry = jax.tree.map(_barrier, carry)
     return _vmap(f, carry, *args)
 
