@@ -31,6 +31,7 @@ from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_int
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitivity, with_room
 from sim2real.train.networks import Policy
+from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 from sim2real.train.sweep import Sweep, named
@@ -78,7 +79,10 @@ def train(
     weak = None
     if config.sensitivity:
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
-    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes, sensitivity=weak)
+    policy = result.best
+    bundle = Bundle(
+        contract, policy.to_weights(), _history(result), made.episodes, None, weak, policy.spec, export_graph(policy)
+    )
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.train.architectures import Factory
 from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.checks import FINITE, check_values
 from sim2real.train.config import PPOConfig as PPOConfig
@@ -28,7 +29,8 @@ from sim2real.train.result import Progress as Progress
 from sim2real.train.result import TrainResult as TrainResult
 from sim2real.train.result import best_of, history_of
 from sim2real.train.rollout import evaluate
-from sim2real.train.start import make_start, swept_numbers
+from sim2real.train.sequences import ActorCritic
+from sim2real.train.start import make_networks, make_start, swept_numbers
 from sim2real.train.sweep import Sweep as Sweep
 from sim2real.train.sweep import with_numbers
 from sim2real.train.update import TrainState, keys, make_policy, update
@@ -42,6 +44,8 @@ def train(
     checkpoint: Path | None = None,
     resume: Path | None = None,
     sweep: Sweep | None = None,
+    actor: Factory | None = None,
+    critic: Factory | None = None,
 ) -> TrainResult:
     """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
@@ -55,6 +59,9 @@ def train(
         resume: Such a file to go on from. The result is that of a training that was never interrupted, bit for bit on
             one machine.
         sweep: Settings to try side by side; None: those of ``config``.
+        actor: Makes the actor, a module of flax.linen or a ``Network``, with this number of outputs; None: ``config``
+            names it.
+        critic: The same for the value function.
 
     Raises:
         UsageError: The environment breaks its protocol, no evaluation episode ended within ``eval_steps``, or what is
@@ -67,10 +74,11 @@ def train(
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
-    state, numbers = make_start(env, sweep.configs(config), key), swept_numbers(sweep, config.num_seeds)
+    networks = make_networks(env, config, actor, critic)
+    state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
     where = placements(state, config)
     state = state if where is None else jax.device_put(state, where)
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), state))
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
     lowered = jax.jit(one, donate_argnums=0, out_shardings=where and (where, None, None)).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
     identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume else None
@@ -156,13 +164,13 @@ def _is_over(config: PPOConfig, log: list[Progress]) -> bool:
 
 
 def _epoch(
-    env: TrainingEnvironment, config: PPOConfig, state: TrainState
+    env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, state: TrainState
 ) -> tuple[TrainState, Policy, dict[str, jax.Array]]:
     """Train one seed up to its next evaluation, and evaluate it."""
     state, stats = jax.lax.scan(
-        lambda state, _: update(env, config, state), state, length=config.updates_per_evaluation
+        lambda state, _: update(env, config, networks, state), state, length=config.updates_per_evaluation
     )
-    policy = make_policy(env, state.params, state.normaliser)
+    policy = make_policy(env, config, networks, state.params, state.normaliser)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
     return state, policy, values | evaluate(env, config, policy, keys(state)[2])

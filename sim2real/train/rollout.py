@@ -18,10 +18,14 @@ class Copies(NamedTuple):
     Attributes:
         state: Their states; leaves of shape ``(N, ...)``.
         observation: Shape ``(N, O)``: their observations.
+        carry: What the actor carries from step to step; leaves of shape ``(N, ...)``.
+        critic_carry: The same of the value function.
     """
 
     state: Any
     observation: jax.Array
+    carry: Any = ()
+    critic_carry: Any = ()
 
 
 T = TypeVar("T")
@@ -72,6 +76,11 @@ def select(mask: jax.Array, new: T, old: T) -> T:
     return jax.tree.map(pick, new, old)
 
 
+def spread(carry: T, count: int) -> T:
+    """Return what is carried into a first step for each of N copies."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), carry)
+
+
 def collect(
     env: TrainingEnvironment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
 ) -> tuple[Copies, Rows]:
@@ -95,19 +104,21 @@ def collect(
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    fresh = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, count)))
+    begun = jax.vmap(env.reset)(jax.random.split(key_reset, count))
+    fresh = Copies(*begun, spread(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
-    spread = jnp.exp(policy.log_std)
+    std = jnp.exp(policy.log_std)
     see = get_privileged(env, config)
     cut = 1 + jnp.arange(count) * config.eval_steps // count
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
         noise, keys, number = x
-        u = jax.vmap(lambda observation, z: policy.get_mean(observation) + spread * z)(now.observation, noise)
+        carry, mean = jax.vmap(policy.get_mean)(now.carry, now.observation)
+        u = mean + std * noise
         step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
         truncated = step.truncated | (number == cut)
-        following = Copies(step.state, step.observation)
+        following = Copies(step.state, step.observation, select(step.valid, carry, now.carry), now.critic_carry)
         out = Rows(
             observation=now.observation,
             u=u,
@@ -140,7 +151,8 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
         fraction of those that ended by themselves. Each of shape ``()``.
     """
     key_reset, key_step = jax.random.split(key)
-    copies = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs)))
+    begun = jax.vmap(env.reset)(jax.random.split(key_reset, config.eval_envs))
+    copies = Copies(*begun, spread(policy.initial_carry(), config.eval_envs))
     names = jax.eval_shape(lambda key: env.step(env.reset(key)[0], policy.low, key).metrics, key)
     zeros = jnp.zeros(config.eval_envs)
     running = jnp.ones(config.eval_envs, bool)
@@ -149,12 +161,14 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
     def row(carry: _Carry, key: jax.Array) -> tuple[_Carry, None]:
         copies, running, fallen, total, metrics = carry
         keys = jax.random.split(key, config.eval_envs)
-        step = jax.vmap(env.step)(copies.state, jax.vmap(policy.get_action)(copies.observation), keys)
+        carry, action = jax.vmap(policy.step)(copies.carry, copies.observation)
+        step = jax.vmap(env.step)(copies.state, action, keys)
+        following = Copies(step.state, step.observation, select(step.valid, carry, copies.carry))
         ends = running & (step.terminated | step.truncated)
         total = total + jnp.where(running, step.reward, 0.0)
         metrics = {name: jnp.where(ends, value, metrics[name]) for name, value in step.metrics.items()}
         fallen = fallen | (ends & step.terminated)
-        return (Copies(step.state, step.observation), running & ~ends, fallen, total, metrics), None
+        return (following, running & ~ends, fallen, total, metrics), None
 
     (_, running, fallen, total, metrics), _ = jax.lax.scan(row, start, jax.random.split(key_step, config.eval_steps))
     share = jnp.mean(jnp.where(running, 0.0, 1.0))
