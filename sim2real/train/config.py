@@ -68,6 +68,9 @@ class PPOConfig:
     privileged: bool = False
     """The value function sees the world's true state and the episode's parameters besides the observation, as it is
     needed in simulation only; the policy sees the observation alone."""
+    teacher: bool = False
+    """The policy sees the true state and the parameters, too: a teacher, to distil a student from; no robot can run
+    it."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10

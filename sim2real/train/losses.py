@@ -13,6 +13,9 @@ from sim2real.train.networks import entropy, log_prob, log_slope
 from sim2real.train.rollout import Rows
 from sim2real.train.sequences import ActorCritic, unroll
 
+LEAST_LOG_STD = -3.0
+"""Least logarithm of a student's noise, as the likelihood of what it imitates perfectly has no bound."""
+
 
 class Batch(NamedTuple):
     """Rows prepared for the loss: T of each of N copies.
@@ -25,6 +28,7 @@ class Batch(NamedTuple):
         value: Shape ``(N, T)``: value estimates before the update.
         advantage: Shape ``(N, T)``.
         weight: Shape ``(N, T)``: 1 in rows with a policy step, else 0.
+        advice: Shape ``(N, T, A)``: what a teacher would have done, within [-1, 1]; None: there is none.
         noise: Shape ``(N, T, A)``: ``u`` in deviations from its mean; None where actions are not squashed.
         end: Shape ``(N, T)``, bool: rows that end an episode.
         actor_carry: What the actor carried into the first row; leaves of shape ``(N, ...)``.
@@ -38,6 +42,7 @@ class Batch(NamedTuple):
     value: jax.Array
     advantage: jax.Array
     weight: jax.Array
+    advice: jax.Array | None
     noise: jax.Array | None
     end: jax.Array
     actor_carry: Any
@@ -86,7 +91,7 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
 def loss(
     params: dict[str, Any], batch: Batch, config: PPOConfig, networks: ActorCritic
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows.
+    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows; with a teacher, that of imitating it.
 
     Args:
         params: As in ``TrainState``.
@@ -102,11 +107,19 @@ def loss(
     value = _outputs(networks.critic, params["value"], batch.critic_carry, seen, batch)[:, 0]
     batch = jax.tree.map(_flat, batch._replace(actor_carry=(), critic_carry=()))
     weight = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
-    centred = batch.advantage - jnp.sum(weight * batch.advantage)
-    advantage = centred / jnp.sqrt(jnp.sum(weight * centred**2) + 1e-8)
     squashed = batch.noise is not None
     log_ratio = jax.vmap(lambda u, m: log_prob(u, m, params["log_std"], squashed))(batch.u, mean) - batch.log_prob
     ratio = jnp.exp(log_ratio)
+    bonus = entropy(params["log_std"])
+    if batch.noise is not None:  # what tanh takes away, on average over the policy's own samples
+        drawn = mean + jnp.exp(params["log_std"]) * batch.noise
+        bonus = bonus + jnp.sum(weight * jax.vmap(log_slope)(drawn))
+    parts = {"entropy": bonus, "kl": jnp.sum(weight * (ratio - 1.0 - log_ratio))}
+    if batch.advice is not None:
+        guess = jnp.tanh(mean) if squashed else mean
+        return _imitation(guess, batch.advice, jnp.maximum(params["log_std"], LEAST_LOG_STD), weight, parts)
+    centred = batch.advantage - jnp.sum(weight * batch.advantage)
+    advantage = centred / jnp.sqrt(jnp.sum(weight * centred**2) + 1e-8)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     policy_loss = -jnp.sum(weight * jnp.minimum(advantage * ratio, advantage * clipped))
     moved = value - batch.value
@@ -114,18 +127,25 @@ def loss(
     # The target is value + advantage, so its distance from value + moved is moved - advantage.
     error = jnp.maximum((moved - batch.advantage) ** 2, (held - batch.advantage) ** 2)
     value_loss = 0.5 * jnp.sum(weight * error)
-    bonus = entropy(params["log_std"])
-    if batch.noise is not None:  # what tanh takes away, on average over the policy's own samples
-        drawn = mean + jnp.exp(params["log_std"]) * batch.noise
-        bonus = bonus + jnp.sum(weight * jax.vmap(log_slope)(drawn))
-    parts = {
+    parts |= {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
-        "entropy": bonus,
-        "kl": jnp.sum(weight * (ratio - 1.0 - log_ratio)),
         "clip_share": jnp.sum(jnp.where(jnp.abs(ratio - 1.0) > config.clip, weight, 0.0)),
     }
     return policy_loss + config.value_coef * value_loss - config.entropy_coef * bonus, parts
+
+
+def _imitation(
+    guess: jax.Array, advice: jax.Array, log_std: jax.Array, weight: jax.Array, parts: dict[str, jax.Array]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Return the negative log likelihood of a teacher's actions (DAgger, Ross et al. 2011, on the newest rollout).
+
+    The policy acts, so its own mistakes are what it is corrected in. The noise that it acts with becomes as large as
+    what it cannot tell.
+    """
+    likelihood = jax.vmap(lambda a, g: log_prob(a, g, log_std))(advice, guess)
+    error = jnp.sqrt(jnp.sum(weight * jnp.mean((guess - advice) ** 2, -1)))
+    return -jnp.sum(weight * likelihood), parts | {"imitation_error": error}
 
 
 def _outputs(network: Network, params: Any, carry: Any, x: jax.Array, batch: Batch) -> jax.Array:

@@ -33,6 +33,7 @@ from sim2real.train.sequences import ActorCritic
 from sim2real.train.start import make_networks, make_start, swept_numbers
 from sim2real.train.sweep import Sweep as Sweep
 from sim2real.train.sweep import with_numbers
+from sim2real.train.teacher import TeacherEnvironment
 from sim2real.train.update import TrainState, keys, make_policy, update
 
 
@@ -46,6 +47,7 @@ def train(
     sweep: Sweep | None = None,
     actor: Factory | None = None,
     critic: Factory | None = None,
+    teacher: Policy | None = None,
 ) -> TrainResult:
     """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
@@ -62,6 +64,7 @@ def train(
         actor: Makes the actor, a module of flax.linen or a ``Network``, with this number of outputs; None: ``config``
             names it.
         critic: The same for the value function.
+        teacher: A policy to imitate, in place of learning from rewards; it may see what only simulation knows.
 
     Raises:
         UsageError: The environment breaks its protocol, no evaluation episode ended within ``eval_steps``, or what is
@@ -70,11 +73,12 @@ def train(
     """
     start = time.perf_counter()
     check_environment(env)
+    env = TeacherEnvironment(env) if config.teacher else env
     _check_target(env, config)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
-    networks = make_networks(env, config, actor, critic)
+    networks = make_networks(env, config, actor, critic, teacher)
     state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
     where = placements(state, config)
     state = state if where is None else jax.device_put(state, where)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
 from sim2real.train.protocol import TrainingEnvironment, get_privileged
+from sim2real.train.teacher import advice
 
 
 class Copies(NamedTuple):
@@ -44,6 +46,7 @@ class Rows(NamedTuple):
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
         privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
         privileged_following: Shape ``(T, N, P)``: the same after the row.
+        advice: Shape ``(T, N, A)``: what a teacher would have done; None: there is none.
     """
 
     observation: jax.Array
@@ -55,6 +58,7 @@ class Rows(NamedTuple):
     following: jax.Array
     privileged: jax.Array | None = None
     privileged_following: jax.Array | None = None
+    advice: jax.Array | None = None
 
 
 _Carry = tuple[Copies, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]
@@ -82,7 +86,13 @@ def spread(carry: T, count: int) -> T:
 
 
 def collect(
-    env: TrainingEnvironment, config: PPOConfig, policy: Policy, copies: Copies, update: jax.Array, key: jax.Array
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    policy: Policy,
+    copies: Copies,
+    update: jax.Array,
+    key: jax.Array,
+    teacher: Policy | None = None,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
@@ -98,6 +108,7 @@ def collect(
         copies: The copies after the last rollout; ignored if ``update`` is 0.
         update: Shape ``()``, int32: number of updates so far.
         key: Source of resets, noise and the environment's own randomness.
+        teacher: Whose advice is asked for in every row, while the policy acts.
 
     Returns:
         The copies after the rollout, and the rows.
@@ -129,6 +140,7 @@ def collect(
             following=step.observation,
             privileged=None if see is None else jax.vmap(see)(now.state),
             privileged_following=None if see is None else jax.vmap(see)(step.state),
+            advice=None if teacher is None else jax.vmap(partial(advice, env, teacher))(now.state, now.observation),
         )
         return select(step.terminated | truncated, fresh, following), out
 

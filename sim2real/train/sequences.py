@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 
 from sim2real.train.architectures import Network, is_recurrent
+from sim2real.train.networks import Policy
 from sim2real.train.rollout import select, spread
 
 
@@ -18,11 +19,13 @@ class ActorCritic(NamedTuple):
         actor: Gives the mean of the actions.
         critic: Gives the value.
         name: The actor's, as a bundle has it.
+        teacher: Whom the actor imitates; None: it learns from rewards.
     """
 
     actor: Network
     critic: Network
     name: str
+    teacher: Policy | None = None
 
 
 class Unrolled(NamedTuple):

@@ -9,15 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.train.architectures import Factory, make_network, name_of
 from sim2real.train.config import PPOConfig
+from sim2real.train.networks import Policy
 from sim2real.train.normaliser import Normaliser
 from sim2real.train.optimiser import make_optimiser, set_rate
-from sim2real.train.protocol import TrainingEnvironment, get_privileged
+from sim2real.train.protocol import TrainingEnvironment
 from sim2real.train.rollout import Copies
 from sim2real.train.sequences import ActorCritic
 from sim2real.train.sweep import Sweep
+from sim2real.train.teacher import check_teacher, size_of
 from sim2real.train.update import TrainState
 
 if TYPE_CHECKING:
@@ -62,7 +63,11 @@ def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, np.ndarray]:
 
 
 def make_networks(
-    env: TrainingEnvironment, config: PPOConfig, actor: Factory | None = None, critic: Factory | None = None
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    actor: Factory | None = None,
+    critic: Factory | None = None,
+    teacher: Policy | None = None,
 ) -> ActorCritic:
     """Return the networks of a training.
 
@@ -71,10 +76,13 @@ def make_networks(
         config: Names them.
         actor: Makes the actor; default: as ``config`` says.
         critic: Makes the value function; default: as ``config`` says, and that the actor.
+        teacher: Whom the actor shall imitate; None: it learns from rewards.
 
     Raises:
         UsageError: There is no such network, or it does not fit.
     """
+    if teacher is not None:
+        check_teacher(env, config, teacher)
     kind = actor or config.network
     judge = critic or config.critic or kind
     size, actions = env.observation_size, np.shape(env.action_low)[0]
@@ -82,16 +90,13 @@ def make_networks(
         actor=make_network(kind, config.hidden, size, actions),
         critic=make_network(judge, config.hidden, size + (privileged_size(env, config) or 0), 1),
         name=name_of(kind),
+        teacher=teacher,
     )
 
 
 def privileged_size(env: TrainingEnvironment, config: PPOConfig) -> int | None:
     """Return how much the value function sees besides the observation; None: it is not asked for."""
-    see = get_privileged(env, config)
-    if see is None:
-        return None
-    state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))[0]
-    return _length(jax.eval_shape(see, state).shape)
+    return size_of(env) if config.privileged else None
 
 
 def _repeated(carry: T, count: tuple[int, ...]) -> T:
@@ -113,12 +118,6 @@ def _networks(
     if config.schedule == "adaptive":
         optimiser = set_rate(optimiser, np.float32(config.learning_rate))
     return params, optimiser, _normaliser(size), None if more is None else _normaliser(more)
-
-
-def _length(shape: tuple[int, ...]) -> int:
-    if len(shape) != 1:
-        raise UsageError(f"what the environment's `privileged` returns must be a vector, it has shape {shape}")
-    return shape[0]
 
 
 def _normaliser(size: int) -> Any:

@@ -14,11 +14,12 @@ from sim2real.policy.network import NetworkSpec
 from sim2real.train.config import PPOConfig
 from sim2real.train.losses import Batch, gae, loss
 from sim2real.train.networks import Policy, log_prob
-from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
+from sim2real.train.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
 from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.protocol import TrainingEnvironment
 from sim2real.train.rollout import Copies, Rows, collect
 from sim2real.train.sequences import ActorCritic, unroll
+from sim2real.train.teacher import TeacherEnvironment
 
 
 class TrainState(NamedTuple):
@@ -59,15 +60,16 @@ def make_policy(
         params: As in ``TrainState``.
         normaliser: Statistics of the observations.
     """
+    known = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
     return Policy(
         params=params["actor"],
         log_std=params["log_std"],
         mean=normaliser.mean,
-        std=jnp.sqrt(normaliser.var + 1e-6),
+        std=deviations(normaliser, known),
         low=jnp.asarray(env.action_low, jnp.float32),
         high=jnp.asarray(env.action_high, jnp.float32),
         network=networks.actor,
-        spec=NetworkSpec(networks.name, config.squash),
+        spec=NetworkSpec(networks.name, config.squash, known),
     )
 
 
@@ -113,6 +115,7 @@ def prepare(
         value=value,
         advantage=gae(rows, value, following, config.gamma, config.gae_lambda),
         weight=rows.valid.astype(jnp.float32),
+        advice=rows.advice,
         noise=(rows.u - played) * jnp.exp(-policy.log_std) if squash else None,
         end=end,
         actor_carry=(),
@@ -152,7 +155,7 @@ def update(
     """
     key_play, key_shuffle, _ = keys(state)
     policy = make_policy(env, config, networks, state.params, state.normaliser)
-    copies, rows = collect(env, config, policy, state.copies, state.update, key_play)
+    copies, rows = collect(env, config, policy, state.copies, state.update, key_play, networks.teacher)
     batch, critic_carry = prepare(state, policy, rows, config, networks)
     copies = copies._replace(critic_carry=critic_carry)
     optimiser = make_optimiser(config)

@@ -49,7 +49,7 @@ def test_the_entropy_is_that_of_the_actions():
     u, row = MEAN + jnp.exp(LOG_STD) * noise, jnp.zeros((1, 20_000))
     layers = ((np.zeros((1, 1), np.float32), np.asarray(MEAN)),)
     params = {"actor": layers, "log_std": LOG_STD, "value": layers}
-    batch = Batch(row[..., None], None, u, row, row, row, row + 1.0, noise, row > 0, (), ())
+    batch = Batch(row[..., None], None, u, row, row, row, row + 1.0, None, noise, row > 0, (), ())
     parts = loss(params, batch, PPOConfig(squash=True), ActorCritic(MLP((1,)), MLP((1,)), "mlp"))[1]
     monte_carlo = -jax.vmap(lambda u: log_prob(u, MEAN, LOG_STD, squash=True))(u[0]).mean()
     assert float(parts["entropy"]) == pytest.approx(float(monte_carlo), abs=0.02)
