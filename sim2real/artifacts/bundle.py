@@ -11,8 +11,9 @@ import numpy as np
 from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, malformed, read_json, write_json
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
+from sim2real.policy.bundle import read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
+from sim2real.policy.network import NetworkSpec
 
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
@@ -92,6 +93,8 @@ class Bundle:
         episodes: What its episodes were drawn from; None where only the policy was copied.
         sensitivity: How the policy does where a parameter is wrong; None where that was not simulated.
         path: Its folder; None before it was saved.
+        spec: What the policy's network is.
+        graph: The policy as an ONNX model, of a network that is not one of ours; not read again by ``load``.
     """
 
     contract: PolicyContract
@@ -100,6 +103,8 @@ class Bundle:
     episodes: Episodes | None = None
     path: Path | None = None
     sensitivity: Sensitivity | None = None
+    spec: NetworkSpec = field(default_factory=NetworkSpec)
+    graph: bytes | None = None
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into the folder of a train stage.
@@ -107,7 +112,7 @@ class Bundle:
         Returns:
             Output -> name of the file or folder in it.
         """
-        save_bundle(folder / BUNDLE, self.weights, self.contract)
+        save_bundle(folder / BUNDLE, self.weights, self.contract, None, self.spec, self.graph)
         written = {"bundle": BUNDLE}
         if self.history is not None:
             self.history.save(folder / HISTORY)
@@ -130,10 +135,10 @@ class Bundle:
             Sim2RealError: When a file is missing, damaged or of a format that this version does not know.
         """
         folder = path / BUNDLE if (path / BUNDLE).is_dir() else path
-        contract = load_bundle(folder).contract
+        contract, spec = read_contract(folder)
         beside = folder.with_name(HISTORY)
         history = History.load(beside) if beside.is_file() else None
         episodes = Episodes.load(folder.parent) if folder.with_name(EPISODES).is_file() else None
         other = folder.with_name(SENSITIVITY)
         weak = Sensitivity.load(other) if other.is_file() else None
-        return Bundle(contract, read_weights(folder), history, episodes, folder, weak)
+        return Bundle(contract, read_weights(folder), history, episodes, folder, weak, spec)

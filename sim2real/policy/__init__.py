@@ -6,4 +6,5 @@ from sim2real.policy.bundle import save_bundle as save_bundle
 from sim2real.policy.contract import ActionTerm as ActionTerm
 from sim2real.policy.contract import ObservationTerm as ObservationTerm
 from sim2real.policy.contract import PolicyContract as PolicyContract
+from sim2real.policy.network import NetworkSpec as NetworkSpec
 from sim2real.policy.runner import PolicyRunner as PolicyRunner

@@ -6,7 +6,7 @@ import hashlib
 import importlib.util
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,22 @@ from safetensors import SafetensorError
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy.contract import PolicyContract
-from sim2real.policy.onnx_graph import build_onnx
-from sim2real.policy.runner import BACKENDS, OBSERVATION_CLIP, NumpyBackend, OnnxBackend, PolicyRunner, layers_of
+from sim2real.policy.network import NetworkSpec
+from sim2real.policy.onnx_graph import build_onnx, with_contract
+from sim2real.policy.runner import (
+    BACKENDS,
+    BESIDES,
+    OBSERVATION_CLIP,
+    NumpyBackend,
+    OnnxBackend,
+    PolicyRunner,
+    gru_of,
+    layers_of,
+    require,
+)  # fmt: skip
 
-FORMAT_VERSION = 1
+FORMAT_VERSIONS = (1, 2)
+"""1: a perceptron whose output is clipped. 2: the file says what the network is; who knows 1 alone must refuse it."""
 WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
 PARITY = 1e-5
 """Largest difference between the actions of numpy and ONNX that an export accepts, as a fraction of their range."""
@@ -33,7 +45,12 @@ LEAST_STD = 1e-6
 
 
 def save_bundle(
-    folder: str | Path, weights: Mapping[str, np.ndarray], contract: PolicyContract, samples: np.ndarray | None = None
+    folder: str | Path,
+    weights: Mapping[str, np.ndarray],
+    contract: PolicyContract,
+    samples: np.ndarray | None = None,
+    spec: NetworkSpec | None = None,
+    graph: bytes | None = None,
 ) -> Path:
     """Write a bundle; ``policy.json`` is written last, so that a folder that has it is complete.
 
@@ -41,8 +58,10 @@ def save_bundle(
         folder: The folder; made if it does not exist. A bundle in it is replaced.
         weights: As ``Policy.to_weights`` returns them.
         contract: Observations, actions and rate of the policy.
-        samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared if
-            onnxruntime is installed. None: drawn from the normaliser.
+        samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared, as those
+            of one episode, if onnxruntime is installed. None: drawn from the normaliser.
+        spec: What the network is; default: a perceptron whose output is clipped.
+        graph: The policy as an ONNX model, of a network that is not one of ours.
 
     Returns:
         The folder.
@@ -50,15 +69,20 @@ def save_bundle(
     Raises:
         Sim2RealError: Weights and contract do not fit each other, or numpy and ONNX give different actions.
     """
+    spec = spec or NetworkSpec()
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
-    _check_fit(weights, contract)
-    graph = build_onnx(weights, contract)
-    if importlib.util.find_spec("onnxruntime") is not None:
-        _check_parity(weights, graph, contract, samples)
+    _check_fit(weights, contract, spec)
+    if (graph is None) != spec.own:
+        raise UsageError(f"network {spec.name!r} needs {'no ONNX model' if spec.own else 'an ONNX model'} of its own")
+    graph = build_onnx(weights, contract, spec) if graph is None else with_contract(graph, contract)
+    if spec.own and importlib.util.find_spec("onnxruntime") is not None:
+        _check_parity(weights, graph, contract, spec, samples)
     files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
+    plain = spec == NetworkSpec()
     about = {
-        "format_version": FORMAT_VERSION,
+        "format_version": FORMAT_VERSIONS[0] if plain else FORMAT_VERSIONS[1],
         **contract.to_dict(),
+        **({} if plain else {"network": spec.to_dict()}),
         "normaliser": {
             "mean": weights["mean"].tolist(),
             "std": weights["std"].tolist(),
@@ -77,30 +101,46 @@ def save_bundle(
     return folder
 
 
-def load_bundle(folder: str | Path, backend: str = "numpy") -> PolicyRunner:
+def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
     """Read a bundle.
 
     Args:
         folder: A folder that ``save_bundle`` has written.
-        backend: ``"numpy"``, or, if onnxruntime is installed, ``"onnx"``.
+        backend: ``"numpy"``, or, if onnxruntime is installed, ``"onnx"``, which runs networks of any kind; default:
+            numpy if it runs this network.
 
     Returns:
         The policy, ready to run.
 
     Raises:
-        UsageError: The backend is unknown or not installed.
-        Sim2RealError: A file is missing, damaged or of a format that this version does not know.
+        UsageError: The backend is unknown, not installed or does not run this network.
+        Sim2RealError: A file is missing, damaged or of a format that this version does not know, or the policy is a
+            teacher.
     """
-    if backend not in BACKENDS:
+    if backend not in (None, *BACKENDS):
         raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
-    folder = Path(folder)
-    about = _read_about(folder)
-    contract = PolicyContract.from_dict(about)
+    contract, spec = read_contract(folder)
+    spec.refuse_teacher()
     weights = read_weights(folder)
-    _check_fit(weights, contract)
+    if (backend or "numpy") == "numpy" and spec.own:
+        return PolicyRunner(contract, NumpyBackend(weights, spec))
     if backend == "numpy":
-        return PolicyRunner(contract, NumpyBackend(weights))
-    return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, about)))
+        raise UsageError(f"numpy does not run network {spec.name!r}", hint="backend='onnx' runs any")
+    folder = Path(folder)
+    return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, _read_about(folder))))
+
+
+def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
+    """Return what a bundle's policy expects and promises, and what its network is.
+
+    Raises:
+        Sim2RealError: A file is missing, damaged or of a format that this version does not know, or they do not fit.
+    """
+    about = _read_about(Path(folder))
+    contract = PolicyContract.from_dict(about)
+    spec = NetworkSpec() if about["format_version"] == 1 else NetworkSpec.from_dict(about.get("network"))
+    _check_fit(read_weights(folder), contract, spec)
+    return contract, spec
 
 
 def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
@@ -132,9 +172,9 @@ def _read_about(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
         raise Sim2RealError(f"{path} is no JSON: {error}", hint="copy or export the bundle again") from error
     version = about.get("format_version") if isinstance(about, dict) else None
-    if version != FORMAT_VERSION:
+    if type(version) is not int or version not in FORMAT_VERSIONS:
         raise Sim2RealError(
-            f"{path} has format version {version!r}, this sim2real reads {FORMAT_VERSION}",
+            f"{path} has format version {version!r}, this sim2real reads {' and '.join(map(str, FORMAT_VERSIONS))}",
             hint="export the policy again, or install the sim2real that wrote it (see 'versions' in the file)",
         )
     if not isinstance(about.get("files"), dict):
@@ -161,17 +201,30 @@ def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
     return content
 
 
-def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> None:
-    """Raise unless the weights are finite and their shapes fit each other and the contract's sizes and bounds."""
-    layers = layers_of(weights)
+def _shapes(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Any]:
+    """Return the shape of each array, as the others and the contract ask for it."""
+    require(weights, BESIDES)
     size, actions = contract.observation_size, len(contract.action)
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
+    if not spec.own:
+        return {name: weights[name].shape for name in weights} | expected
     width = size
+    if spec.name == "gru":
+        width = gru_of(weights)["recurrent"].shape[0]
+        wide = 3 * width
+        expected |= {"gru.kernel": (size, wide), "gru.recurrent": (width, wide), "gru.bias": (wide,)}
+    layers = layers_of(weights)
     for i, (kernel, _) in enumerate(layers):
         out = actions if i == len(layers) - 1 else kernel.shape[-1]
         expected |= {f"layers.{i}.kernel": (width, out), f"layers.{i}.bias": (out,)}
         width = out
-    for name, shape in expected.items():
+    return expected
+
+
+def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> None:
+    """Raise unless the weights are finite and their shapes fit each other and the contract's sizes and bounds."""
+    size, actions = contract.observation_size, len(contract.action)
+    for name, shape in _shapes(weights, contract, spec).items():
         if weights[name].shape != shape:
             raise Sim2RealError(
                 f"the policy's {name} has shape {weights[name].shape}, the contract asks for {shape}",
@@ -184,9 +237,10 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> N
                 f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {LARGEST:g} is the most",
                 hint="no training ends there: train the policy again, and scale observations that are this large",
             )
-    if weights["std"].min() < LEAST_STD:
+    least = weights["std"][: size - spec.privileged].min()  # parameters that only simulation knows are of any size
+    if least < LEAST_STD:
         raise Sim2RealError(
-            f"the policy divides by standard deviations down to {weights['std'].min():g}; {LEAST_STD:g} is the least",
+            f"the policy divides by standard deviations down to {least:g}; {LEAST_STD:g} is the least",
             hint="train the policy again",
         )
     for side in ("low", "high"):
@@ -196,19 +250,47 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> N
 
 
 def _check_parity(
-    weights: Mapping[str, np.ndarray], graph: bytes, contract: PolicyContract, samples: np.ndarray | None
+    weights: Mapping[str, np.ndarray],
+    graph: bytes,
+    contract: PolicyContract,
+    spec: NetworkSpec,
+    samples: np.ndarray | None,
 ) -> None:
     """Raise unless numpy and ONNX give the same actions on the samples."""
-    if samples is None:
-        noise = np.random.default_rng(0).normal(size=(64, contract.observation_size))
-        samples = weights["mean"] + 2.0 * weights["std"] * noise
-    by_numpy = PolicyRunner(contract, NumpyBackend(weights))
-    by_onnx = PolicyRunner(contract, OnnxBackend(graph))
-    difference = np.array([by_numpy.act(sample) - by_onnx.act(sample) for sample in samples])
-    worst = np.abs(difference / (weights["high"] - weights["low"])).max(initial=0.0)
-    if worst > PARITY:
+    samples = draw_samples(weights) if samples is None else samples
+    by_numpy, by_onnx = PolicyRunner(contract, NumpyBackend(weights, spec)), PolicyRunner(contract, OnnxBackend(graph))
+    check_parity(weights, [by_numpy.act(sample) for sample in samples], [by_onnx.act(sample) for sample in samples])
+
+
+def draw_samples(weights: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return observations to compare on, shape ``(64, O)``: those of the training, twice as far apart."""
+    noise = np.random.default_rng(0).normal(size=(64, len(weights["mean"])))
+    return (weights["mean"] + 2.0 * weights["std"] * noise).astype(np.float32)
+
+
+def check_parity(
+    weights: Mapping[str, np.ndarray],
+    ones: Sequence[np.ndarray],
+    others: Sequence[np.ndarray],
+    who: str = "numpy",
+    most: float = PARITY,
+) -> None:
+    """Compare the actions of an export.
+
+    Args:
+        weights: Those of the policy.
+        ones: Actions ``(A,)`` without ONNX.
+        others: The same with it.
+        who: What made the first.
+        most: Largest difference, as a fraction of the actions' range.
+
+    Raises:
+        Sim2RealError: They differ by more.
+    """
+    worst = np.abs(np.subtract(ones, others) / (weights["high"] - weights["low"])).max(initial=0.0)
+    if not worst <= most:
         raise Sim2RealError(
-            f"numpy and ONNX disagree by {worst:.2e} of the action range, {PARITY:.0e} is allowed",
+            f"{who} and ONNX disagree by {worst:.2e} of the action range, {most:.0e} is allowed",
             hint="a normaliser with tiny standard deviations or huge weights loses float32's precision",
         )
 

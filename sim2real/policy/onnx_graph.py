@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim2real.policy.contract import PolicyContract
-from sim2real.policy.runner import OBSERVATION_CLIP, layers_of
+from sim2real.policy.network import NetworkSpec
+from sim2real.policy.runner import INITIAL_CARRY, OBSERVATION_CLIP, gru_of, layers_of
+
+if TYPE_CHECKING:
+    from onnx import NodeProto, ValueInfoProto
 
 OPSET = 17
 IR_VERSION = 8  # that of the ONNX release with opset 17, not the newest, so that older runtimes on a robot load it
 
 
-def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> bytes:
+def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec | None = None) -> bytes:
     """Return the serialised model: ``observation (1, O)`` -> ``action (1, A)``, float32.
 
-    The batch axis is there because ONNX's Gemm takes matrices only. The contract is stored in the model's metadata.
-    """
-    from onnx import TensorProto, checker, helper, numpy_helper
+    The batch axis is there because ONNX's Gemm takes matrices only. A network that remembers has an input ``carry_0``
+    and an output ``next_carry_0`` besides.
 
+    Args:
+        weights: Those of one of our own networks.
+        contract: Stored in the model's metadata.
+        spec: Which of them; default: a perceptron whose output is clipped.
+    """
+    from onnx import helper
+
+    spec = spec or NetworkSpec()
     low, high = weights["low"], weights["high"]
     constants = {
         "mean": weights["mean"],
@@ -35,8 +47,14 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> b
     nodes = [
         helper.make_node("Sub", ["observation", "mean"], ["centred"]),
         helper.make_node("Div", ["centred", "std"], ["scaled"]),
-        helper.make_node("Clip", ["scaled", "clip_low", "clip_high"], ["x0"]),
+        helper.make_node("Clip", ["scaled", "clip_low", "clip_high"], ["x0" if spec.name == "mlp" else "x"]),
     ]
+    initial = []
+    if spec.name == "gru":
+        gru = gru_of(weights)
+        initial = [np.zeros(len(gru["recurrent"]), np.float32)]
+        constants |= {f"gru_{name}": array for name, array in gru.items()}
+        nodes += _gru_nodes()
     layers = layers_of(weights)
     for i, (kernel, bias) in enumerate(layers):
         constants |= {f"kernel{i}": kernel, f"bias{i}": bias}
@@ -44,26 +62,92 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> b
         nodes.append(helper.make_node("Gemm", [f"x{i}", f"kernel{i}", f"bias{i}"], ["u" if last else f"y{i}"]))
         if not last:
             nodes.append(helper.make_node("Tanh", [f"y{i}"], [f"x{i + 1}"]))
+    bound = ["u"] if spec.squash else ["u", "minus_one", "one"]
     nodes += [
-        helper.make_node("Clip", ["u", "minus_one", "one"], ["bounded"]),
+        helper.make_node("Tanh" if spec.squash else "Clip", bound, ["bounded"]),
         helper.make_node("Add", ["bounded", "one"], ["shifted"]),
         helper.make_node("Mul", ["shifted", "half_range"], ["stretched"]),
         helper.make_node("Add", ["stretched", "low"], ["action"]),
     ]
+    arrays = {name: np.asarray(value, np.float32) for name, value in constants.items()}
+    sizes = contract.observation_size, len(contract.action)
+    return with_contract(make_model(nodes, arrays, sizes, initial), contract)
+
+
+def make_model(
+    nodes: Sequence[NodeProto],
+    constants: Mapping[str, np.ndarray],
+    sizes: tuple[int, int],
+    initial: Sequence[np.ndarray],
+) -> bytes:
+    """Return the serialised model of a policy.
+
+    Args:
+        nodes: From ``observation (1, O)`` and ``carry_<i> (1, ...)`` to ``action (1, A)`` and ``next_carry_<i>``.
+        constants: Name -> array that they take.
+        sizes: Numbers of entries of observation and action.
+        initial: What is carried into an episode's first step.
+    """
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    def described(name: str, shape: tuple[int, ...]) -> ValueInfoProto:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, *shape])
+
+    carried = [np.shape(array) for array in initial]
     graph = helper.make_graph(
-        nodes,
+        list(nodes),
         "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, [1, contract.observation_size])],
-        [helper.make_tensor_value_info("action", TensorProto.FLOAT, [1, len(contract.action)])],
-        [numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in constants.items()],
+        [described("observation", sizes[:1]), *(described(f"carry_{i}", s) for i, s in enumerate(carried))],
+        [described("action", sizes[1:]), *(described(f"next_carry_{i}", s) for i, s in enumerate(carried))],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    properties = {
+    if initial:
+        helper.set_model_props(model, {INITIAL_CARRY: json.dumps([np.asarray(array).tolist() for array in initial])})
+    checker.check_model(model, full_check=True)
+    return model.SerializeToString()
+
+
+def with_contract(graph: bytes, contract: PolicyContract) -> bytes:
+    """Return a serialised model with the contract in its metadata."""
+    import onnx
+
+    model = onnx.load_from_string(graph)
+    properties = {entry.key: entry.value for entry in model.metadata_props} | {
         "observation_names": ",".join(contract.observation_names),
         "action_names": ",".join(term.name for term in contract.action),
         "rate_hz": repr(contract.rate_hz),
         "contract": json.dumps(contract.to_dict()),
     }
-    helper.set_model_props(model, properties)
-    checker.check_model(model, full_check=True)
+    onnx.helper.set_model_props(model, properties)
     return model.SerializeToString()
+
+
+def _gru_nodes() -> list[NodeProto]:
+    """Return a gated recurrent unit from ``x`` and ``carry_0`` to ``next_carry_0`` and ``x0``.
+
+    ONNX's own GRU has other axes, and a second bias that ours has not.
+    """
+    from onnx import helper
+
+    def node(kind: str, takes: str, gives: str, **options: Any) -> NodeProto:
+        return helper.make_node(kind, takes.split(), gives.split(), **options)
+
+    return [
+        node("Gemm", "x gru_kernel gru_bias", "seen"),
+        node("MatMul", "carry_0 gru_recurrent", "kept"),
+        node("Split", "seen", "seen_r seen_z seen_n", axis=1),
+        node("Split", "kept", "kept_r kept_z kept_n", axis=1),
+        node("Add", "seen_r kept_r", "sum_r"),
+        node("Add", "seen_z kept_z", "sum_z"),
+        node("Sigmoid", "sum_r", "r"),
+        node("Sigmoid", "sum_z", "z"),
+        node("Mul", "r kept_n", "reset_n"),
+        node("Add", "seen_n reset_n", "sum_n"),
+        node("Tanh", "sum_n", "n"),
+        node("Sub", "one z", "new"),
+        node("Mul", "new n", "added"),
+        node("Mul", "z carry_0", "held"),
+        node("Add", "added held", "next_carry_0"),
+        node("Identity", "next_carry_0", "x0"),
+    ]

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.policy.contract import PolicyContract
+from sim2real.policy.network import NetworkSpec
 
 OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations, which is part of the bundle's format."""
 
+INITIAL_CARRY = "initial_carry"
+"""Where an ONNX file has what is carried into an episode's first step, in its metadata: a list of arrays, as JSON."""
 BACKENDS = ("numpy", "onnx")
-
+BESIDES = ("log_std", "mean", "std", "low", "high")
+"""Arrays of a policy besides those of its network."""
+PARTS, GRU_ARRAYS = ("kernel", "bias"), ("kernel", "recurrent", "bias")
+"""Arrays of a layer, and of a gated recurrent unit: ``gru.kernel``, ..."""
 
 T = TypeVar("T")
 
@@ -23,7 +30,11 @@ class Backend(Protocol):
     """Maps a finite observation, float32 of shape ``(1, O)``, to an action, shape ``(1, A)``."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action."""
+        """Return the action; a network that remembers goes on from the one before."""
+        ...
+
+    def reset(self) -> None:
+        """Start an episode: forget what was before."""
         ...
 
 
@@ -34,14 +45,32 @@ def layers_of(weights: Mapping[str, T]) -> list[tuple[T, T]]:
         Sim2RealError: A layer, the normaliser or a bound is missing.
     """
     count = sum(name.startswith("layers.") and name.endswith(".kernel") for name in weights)
-    names = [f"layers.{i}.{part}" for i in range(max(count, 1)) for part in ("kernel", "bias")]
-    missing = sorted({*names, "log_std", "mean", "std", "low", "high"} - set(weights))
+    require(weights, [*(f"layers.{i}.{part}" for i in range(max(count, 1)) for part in PARTS), *BESIDES])
+    return [(weights[f"layers.{i}.kernel"], weights[f"layers.{i}.bias"]) for i in range(count)]
+
+
+def gru_of(weights: Mapping[str, T]) -> dict[str, T]:
+    """Return the arrays of the gated recurrent unit by their names in ``GRU_ARRAYS``.
+
+    Raises:
+        Sim2RealError: One is missing.
+    """
+    require(weights, [f"gru.{name}" for name in GRU_ARRAYS])
+    return {name: weights[f"gru.{name}"] for name in GRU_ARRAYS}
+
+
+def require(weights: Mapping[str, object], names: Iterable[str]) -> None:
+    """Raise unless all arrays are there.
+
+    Raises:
+        Sim2RealError: It names those that are missing.
+    """
+    missing = sorted(set(names) - set(weights))
     if missing:
         raise Sim2RealError(
             f"the policy's weights lack {', '.join(missing)}; available: {', '.join(sorted(weights)) or 'none'}",
             hint="weights come from Policy.to_weights()",
         )
-    return [(weights[f"layers.{i}.kernel"], weights[f"layers.{i}.bias"]) for i in range(count)]
 
 
 class NumpyBackend:
@@ -49,20 +78,40 @@ class NumpyBackend:
 
     Args:
         weights: As ``Policy.to_weights`` returns them, float32.
+        spec: What the network is, one of ours; default: a perceptron whose output is clipped.
     """
 
-    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, weights: Mapping[str, np.ndarray], spec: NetworkSpec | None = None) -> None:
+        spec = spec or NetworkSpec()
         self._layers = layers_of(weights)
+        self._gru = gru_of(weights) if spec.name == "gru" else None
+        self._squash = spec.squash
         self._mean, self._std = weights["mean"], weights["std"]
         self._low, self._half_range = weights["low"], 0.5 * (weights["high"] - weights["low"])
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._carry = np.zeros(0 if self._gru is None else len(self._gru["recurrent"]), np.float32)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the action, shape ``(..., A)``, for an observation, shape ``(..., O)``."""
         x = np.clip((observation - self._mean) / self._std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        if self._gru is not None:
+            x = self._carry = _gru_step(self._gru, self._carry, x)
         for kernel, bias in self._layers[:-1]:
             x = np.tanh(x @ kernel + bias)
         kernel, bias = self._layers[-1]
-        return self._low + self._half_range * (np.clip(x @ kernel + bias, -1.0, 1.0) + 1.0)
+        u = x @ kernel + bias
+        return self._low + self._half_range * ((np.tanh(u) if self._squash else np.clip(u, -1.0, 1.0)) + 1.0)
+
+
+def _gru_step(gru: Mapping[str, np.ndarray], carry: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the state of a gated recurrent unit after another input; see ``sim2real.train.architectures.GRU``."""
+    seen, kept = np.split(x @ gru["kernel"] + gru["bias"], 3, -1), np.split(carry @ gru["recurrent"], 3, -1)
+    # The logistic function by tanh, as exp overflows.
+    reset, update = (0.5 * (1.0 + np.tanh(0.5 * (a + b))) for a, b in zip(seen[:2], kept[:2], strict=True))
+    return (1.0 - update) * np.tanh(seen[2] + reset * kept[2]) + update * carry
 
 
 class OnnxBackend:
@@ -90,10 +139,21 @@ class OnnxBackend:
             self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors share no public base class
             raise Sim2RealError(f"onnxruntime cannot load the policy: {error}") from error
+        about = self._session.get_modelmeta().custom_metadata_map
+        first = json.loads(about.get(INITIAL_CARRY, "[]"))
+        self._first = {f"carry_{i}": np.array(value, np.float32)[None] for i, value in enumerate(first)}
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._carry = self._first
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the action, shape ``(1, A)``, for an observation, shape ``(1, O)``."""
-        return np.asarray(self._session.run(["action"], {"observation": observation})[0])
+        names = ["action", *(f"next_{name}" for name in self._first)]
+        action, *carry = self._session.run(names, {"observation": observation, **self._carry})
+        self._carry = dict(zip(self._first, carry, strict=True))
+        return np.asarray(action)
 
 
 class PolicyRunner:
@@ -109,6 +169,10 @@ class PolicyRunner:
         self._backend = backend
         self._low = np.array([term.low for term in contract.action], np.float32)
         self._high = np.array([term.high for term in contract.action], np.float32)
+
+    def reset(self) -> None:
+        """Start an episode: a policy that remembers forgets the one before."""
+        self._backend.reset()
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return the action, float32 of shape ``(A,)`` within the contract's bounds.

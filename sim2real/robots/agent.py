@@ -23,7 +23,8 @@ class AgentParams(Base):
     """The agent's parameters for an episode.
 
     Attributes:
-        policy: A pytree with ``get_action(observation)``; None: the goals stay constant.
+        policy: A pytree with ``get_action(observation)``, or, if it remembers, with ``initial_carry()`` and
+            ``step(carry, observation)``; None: the goals stay constant.
         aim: Shape ``(k,)``: what the task asks for in this episode, e.g. a target [the task's units].
         start: Shape ``(joints,)``: goals at the start [rad].
     """
@@ -41,10 +42,28 @@ class AgentState(Base):
         goal: Shape ``(joints,)``: the goals [rad].
         past: Shape ``(history, 3 * joints)``: positions [rad], velocities [rad/s] and goals [rad] of the last steps,
             newest first.
+        carry: What a policy that remembers carries from step to step.
     """
 
     goal: Any
     past: Any
+    carry: Any = ()
+
+
+def first_carry(policy: Any) -> Any:
+    """Return what a policy carries into an episode's first step; ``()`` where it remembers nothing."""
+    return policy.initial_carry() if hasattr(policy, "initial_carry") else ()
+
+
+def decide(policy: Any, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+    """Return what a policy carries on, and its action.
+
+    Args:
+        policy: See ``AgentParams``.
+        carry: What it carries into this step.
+        observation: Shape ``(O,)``.
+    """
+    return policy.step(carry, observation) if hasattr(policy, "step") else (carry, policy.get_action(observation))
 
 
 class GoalAgent(BaseNode):
@@ -89,7 +108,8 @@ class GoalAgent(BaseNode):
         """Return the goals at the start, and a history of zeros."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         start = jnp.asarray(params.start, jnp.float32)
-        return AgentState(goal=start, past=jnp.zeros((self._history, 3 * start.size)))
+        past = jnp.zeros((self._history, 3 * start.size))
+        return AgentState(goal=start, past=past, carry=first_carry(params.policy))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Decision:
         """Return a message with the goals at the start."""
@@ -107,15 +127,17 @@ class GoalAgent(BaseNode):
         reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
         goal = jnp.clip(state.goal + jnp.asarray(action, jnp.float32) / self.rate, self._low, self._high)
         row = jnp.concatenate([reading.position, reading.velocity, goal]).astype(jnp.float32)
-        new = AgentState(goal=goal, past=jnp.concatenate([row[None], state.past])[: self._history])
+        new = state.replace(goal=goal, past=jnp.concatenate([row[None], state.past])[: self._history])
         decision = Decision(goal, jnp.asarray(step_state.params.aim, jnp.float32))
         return step_state.replace(state=new), decision
 
     def step(self, step_state: StepState) -> tuple[StepState, Decision]:
         """Make a step with the policy's action."""
-        policy = step_state.params.policy
-        action = jnp.zeros_like(self._low) if policy is None else policy.get_action(self.observe(step_state))
-        return self.act(step_state, action)
+        policy, state = step_state.params.policy, step_state.state
+        if policy is None:
+            return self.act(step_state, jnp.zeros_like(self._low))
+        carry, action = decide(policy, state.carry, self.observe(step_state))
+        return self.act(step_state.replace(state=state.replace(carry=carry)), action)
 
 
 @struct.dataclass
@@ -125,10 +147,12 @@ class Past(Base):
     Attributes:
         observations: Shape ``(history, features)``.
         actions: Shape ``(history, actions)``.
+        carry: What a policy that remembers carries from step to step.
     """
 
     observations: Any
     actions: Any
+    carry: Any = ()
 
 
 class DirectAgent(BaseNode):
@@ -169,8 +193,8 @@ class DirectAgent(BaseNode):
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Past:
         """Return an empty history."""
-        del rng, graph_state
-        return Past(*(jnp.zeros((self._history, size)) for size in self._sizes))
+        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
+        return Past(*(jnp.zeros((self._history, size)) for size in self._sizes), carry=first_carry(params.policy))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a message with zeros."""
@@ -185,7 +209,7 @@ class DirectAgent(BaseNode):
     def act(self, step_state: StepState, action: Any) -> tuple[StepState, Any]:
         """Return the new step state and the message for an action ``(actions,)``."""
         past = step_state.state
-        new = Past(
+        new = past.replace(
             observations=jnp.concatenate([self._now(step_state)[None], past.observations[:-1]]),
             actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], past.actions[:-1]]),
         )
@@ -193,9 +217,11 @@ class DirectAgent(BaseNode):
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Make a step with the policy's action."""
-        policy = step_state.params.policy
-        action = jnp.zeros(self._sizes[1]) if policy is None else policy.get_action(self.observe(step_state))
-        return self.act(step_state, action)
+        policy, past = step_state.params.policy, step_state.state
+        if policy is None:
+            return self.act(step_state, jnp.zeros(self._sizes[1]))
+        carry, action = decide(policy, past.carry, self.observe(step_state))
+        return self.act(step_state.replace(state=past.replace(carry=carry)), action)
 
     def _now(self, step_state: StepState) -> jax.Array:
         return self._features(step_state.inputs[self._sensor][-1].data)

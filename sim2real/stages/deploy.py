@@ -148,6 +148,7 @@ def _find_bundle(
 
 def _load_policy(robot: Robot, bundle: Bundle) -> Policy:
     """Return the policy, once it is known that it fits the robot."""
+    bundle.spec.refuse_teacher()
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
     expected, found = ([(t.name, tuple(t.units), t.history) for t in c.observation] for c in (robot, contract))
     if found != expected or contract.rate_hz != robot.rate_hz:
@@ -169,7 +170,7 @@ def _load_policy(robot: Robot, bundle: Bundle) -> Policy:
                 f"this robot bears {most.low:g} to {most.high:g}",
                 hint="train a policy for this pipeline",
             )
-    return Policy.from_weights(dict(bundle.weights))
+    return Policy.from_weights(bundle.weights, bundle.spec)
 
 
 def _identified(pipeline: Pipeline, run_dir: Path) -> Identification | None:

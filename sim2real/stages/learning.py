@@ -7,6 +7,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction
 
+from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.train.sweep import Sweep
 
@@ -20,6 +21,11 @@ class LearningConfig:
     sweep: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
     every seed, the best policy of all is kept."""
+    distil: str | None = None
+    """Teacher to imitate, in place of learning from rewards: a run in which one was trained with --ppo.teacher, or a
+    bundle."""
+    checkpoint: bool = True
+    """Write all of the training into a file after each evaluation, to go on from with --resume."""
     tensorboard: bool = False
     """Write the curves for TensorBoard while training goes on, into the stage's folder 'tensorboard'."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -28,3 +34,8 @@ class LearningConfig:
     def __post_init__(self) -> None:
         """Check that what is swept can be."""
         Sweep.parse(self.sweep).configs(self.ppo)
+        if self.distil is not None and self.ppo.teacher:
+            raise UsageError(
+                "a student sees what a robot shows, not what only simulation knows",
+                hint="train it without --ppo.teacher, or a teacher without --distil",
+            )

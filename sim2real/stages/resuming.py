@@ -17,7 +17,7 @@ from sim2real.stages.targets import find_run
 
 CHECKPOINT = "checkpoint.safetensors"
 NEWEST = "newest"
-_MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard")
+_MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard", "checkpoint")
 """Settings that do not change how training goes; which parameters they are is told by their digest."""
 
 

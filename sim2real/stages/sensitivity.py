@@ -21,6 +21,7 @@ from sim2real.robots.training import LoopTask
 from sim2real.train.config import PPOConfig
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.rollout import evaluate
+from sim2real.train.teacher import seen_by
 
 TIMELINES = 8
 """Timelines that the episodes are drawn from."""
@@ -159,7 +160,7 @@ def sensitivity(
     key = jax.random.key(seed)
 
     def play(values: dict[str, jax.Array]) -> jax.Array:
-        game = GraphEnvironment(env.graph, moved_task(env.task, values))
+        game = seen_by(policy, GraphEnvironment(env.graph, moved_task(env.task, values)))
         return evaluate(game, config, policy, key)["success"]
 
     found = np.asarray(program(jax.vmap(play))(columns), np.float64)

@@ -21,6 +21,7 @@ from sim2real.robots.base import Robot
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
+from sim2real.stages.distilling import as_taught, find_teacher, teacher_of
 from sim2real.stages.events import event_files
 from sim2real.stages.explaining import explain
 from sim2real.stages.interruption import patiently
@@ -31,6 +32,7 @@ from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_int
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitivity, with_room
 from sim2real.train.networks import Policy
+from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
 from sim2real.train.sweep import Sweep, named
@@ -44,6 +46,7 @@ def train(
     checkpoint: Path | None = None,
     resume: Path | None = None,
     watch: Callable[[Progress], None] | None = None,
+    teacher: Bundle | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
@@ -56,6 +59,7 @@ def train(
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
         resume: Such a file, of the same training, to go on from.
         watch: Called after each evaluation.
+        teacher: Whom the policy imitates; None: it learns from rewards.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -69,16 +73,29 @@ def train(
     config = config or pipeline.train
     made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
+    own = contract_of(made.robot, made.env.task, made.values)
+    master = None if teacher is None else teacher_of(teacher, own)
     with progress(ppo.evaluations, "train (compiling)") as bar:
         key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
         result = patiently(
-            lambda: learn(made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep)
+            lambda: learn(
+                made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep, teacher=master
+            )
         )
-    contract = contract_of(made.robot, made.env.task, made.values)
     weak = None
     if config.sensitivity:
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
-    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes, sensitivity=weak)
+    policy = result.best
+    bundle = Bundle(
+        as_taught(own, policy),
+        policy.to_weights(),
+        _history(result),
+        made.episodes,
+        None,
+        weak,
+        policy.spec,
+        export_graph(policy),
+    )
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
@@ -135,12 +152,16 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         if identification.verdict.status != "accepted":
             note(f"trains on an identification that is not accepted: {identification.verdict.status}")
     inputs = {} if path is None else {"parameters": path}
+    teacher = None
+    if config.distil is not None:
+        teacher, inputs["teacher"] = find_teacher(pipeline.name, config.distil, root)
     if config.explain:
         return explain(pipeline, config, identification, inputs, root, run_dir)
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         resume = None if interrupted is None else interrupted.folder / CHECKPOINT
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
-            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume, watch=watch)
+            kept = checkpoint if config.checkpoint else None
+            bundle, about = train(pipeline, config, identification, None, kept, resume, watch, teacher)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256

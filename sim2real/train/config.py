@@ -57,10 +57,20 @@ class PPOConfig:
     reward_scale: float = 0.05
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and value network."""
+    """Widths of the hidden layers of actor and value network; of a gru its own, then those of the layers after it."""
+    network: str = "mlp"
+    """Actor and value network: 'mlp', a perceptron; 'gru', which remembers; or package.module:Class of a module of
+    flax.linen or a Network of your own."""
+    critic: str | None = None
+    """Value network, if it is another one than the actor."""
+    squash: bool = False
+    """Bound actions by tanh, a squashed Gaussian; default: clip them, which reaches full actions sooner."""
     privileged: bool = False
     """The value function sees the world's true state and the episode's parameters besides the observation, as it is
     needed in simulation only; the policy sees the observation alone."""
+    teacher: bool = False
+    """The policy sees the true state and the parameters, too: a teacher, to distil a student from; no robot can run
+    it."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10

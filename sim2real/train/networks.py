@@ -1,59 +1,29 @@
-"""The policy and its networks.
+"""The policy: a network, the normaliser of its observations, and the distribution of its actions.
 
-A policy is a pytree of arrays, so it can be a node's parameters and pass through jit, vmap and files. Networks are
-plain functions over tuples of arrays, as a multilayer perceptron needs no module system. All functions take one
-observation; use ``jax.vmap`` for more.
+A policy is a pytree of arrays, so it can be a node's parameters and pass through jit, vmap and files. All functions
+take one observation; use ``jax.vmap`` for more.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sim2real.errors import Sim2RealError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import Base
-from sim2real.policy.runner import OBSERVATION_CLIP, layers_of
-
-Layers = tuple[tuple[jax.Array, jax.Array], ...]
-
-
-def init_mlp(rng: np.random.Generator, sizes: tuple[int, ...], last_gain: float) -> Layers:
-    """Draw orthogonal kernels (gain sqrt(2), in the last layer ``last_gain``) and zero biases.
-
-    In numpy, as compiling a QR decomposition that runs once takes longer.
-
-    Args:
-        rng: Source of the kernels.
-        sizes: Widths of the input, of each hidden layer and of the output.
-        last_gain: Gain of the last layer.
-
-    Returns:
-        One pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer, float32.
-    """
-    gains = [np.sqrt(2.0)] * (len(sizes) - 2) + [last_gain]
-    layers = []
-    for n_in, n_out, gain in zip(sizes[:-1], sizes[1:], gains, strict=True):
-        q, r = np.linalg.qr(rng.normal(size=(max(n_in, n_out), min(n_in, n_out))))
-        q = q * np.sign(np.diagonal(r))  # QR's choice of signs would make the distribution non-uniform
-        kernel = gain * (q if n_in >= n_out else q.T)
-        layers.append((kernel.astype(np.float32), np.zeros(n_out, np.float32)))
-    return tuple(layers)
+from sim2real.policy.network import OWN, NetworkSpec
+from sim2real.policy.runner import BESIDES, GRU_ARRAYS, OBSERVATION_CLIP, PARTS, gru_of, layers_of, require
+from sim2real.train.architectures import GRU, MLP, Factory, Network, is_recurrent, make_network, name_of
 
 
-def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
-    """Return the output ``(n_out,)`` of tanh layers and a linear last layer for an input ``x (n_in,)``."""
-    for kernel, bias in layers[:-1]:
-        x = jnp.tanh(x @ kernel + bias)
-    kernel, bias = layers[-1]
-    return x @ kernel + bias
-
-
-def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Return the log density of ``u`` under a normal distribution with a diagonal covariance.
+def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array, squash: bool = False) -> jax.Array:
+    """Return the log density of ``u`` under a normal distribution with a diagonal covariance, or that of ``tanh(u)``.
 
     Written out: importing distrax takes 1.7 s, a fifth of a training of the pendulum, which compiles and runs as fast
     with it.
@@ -62,12 +32,19 @@ def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
         u: Shape ``(A,)``.
         mean: Shape ``(A,)``.
         log_std: Shape ``(A,)``: logarithms of the standard deviations.
+        squash: Return the density of ``tanh(u)``, that of ``u`` divided by the slope of tanh.
 
     Returns:
         Shape ``()``.
     """
     z = (u - mean) * jnp.exp(-log_std)
-    return -jnp.sum(0.5 * z**2 + log_std + 0.5 * math.log(2.0 * math.pi))
+    density = -jnp.sum(0.5 * z**2 + log_std + 0.5 * math.log(2.0 * math.pi))
+    return density - log_slope(u) if squash else density
+
+
+def log_slope(u: jax.Array) -> jax.Array:
+    """Return the logarithm of the volume by which tanh stretches at ``u``, shape ``(A,)``; exact for large ``u``."""
+    return jnp.sum(2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)))
 
 
 def entropy(log_std: jax.Array) -> jax.Array:
@@ -77,38 +54,60 @@ def entropy(log_std: jax.Array) -> jax.Array:
 
 @struct.dataclass
 class Policy(Base):
-    """A Gaussian policy: the observation is normalised, tanh layers give the mean, which is clipped and scaled.
+    """A Gaussian policy: the observation is normalised, the network gives the mean, which is bounded and scaled.
 
-    The mean is clipped to [-1, 1], not squashed by tanh: tasks such as a swing-up need full actions, which tanh reaches
-    only for very large means, and train more slowly with it.
+    By default the mean is clipped to [-1, 1], not squashed by tanh: tasks such as a swing-up need full actions, which
+    tanh reaches only for very large means, and train more slowly with it.
 
     Attributes:
-        layers: One pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
+        params: The network's parameters; of a perceptron one pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
         log_std: Shape ``(A,)``: logarithm of the exploration noise, in units of half the action range.
         mean: Shape ``(O,)``: the observation's mean.
         std: Shape ``(O,)``: the observation's standard deviation.
         low: Shape ``(A,)``: lower bound of the action.
         high: Shape ``(A,)``: upper bound of the action.
+        network: The network, as functions of its parameters.
+        spec: What it is, in words that a file can hold.
     """
 
-    layers: Layers
+    params: Any
     log_std: jax.Array
     mean: jax.Array
     std: jax.Array
     low: jax.Array
     high: jax.Array
+    network: Network = struct.field(pytree_node=False)
+    spec: NetworkSpec = struct.field(pytree_node=False, default=NetworkSpec())
+
+    def initial_carry(self) -> Any:
+        """Return what is carried into an episode's first step; ``()`` if nothing is."""
+        return self.network.initial_carry()
 
     def normalise(self, observation: jax.Array) -> jax.Array:
         """Return the network's input for ``observation``, both of shape ``(O,)``."""
         return jnp.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
-    def get_mean(self, observation: jax.Array) -> jax.Array:
-        """Return the mean of the Gaussian, shape ``(A,)``, before clipping and scaling."""
-        return apply_mlp(self.layers, self.normalise(observation))
+    def get_mean(self, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+        """Return what is carried on, and the mean of the Gaussian, shape ``(A,)``, before it is bounded and scaled."""
+        return self.network.apply(self.params, carry, self.normalise(observation))
+
+    def bound(self, u: jax.Array) -> jax.Array:
+        """Return ``u``, shape ``(A,)``, within [-1, 1]: clipped, or squashed by tanh."""
+        return jnp.tanh(u) if self.spec.squash else jnp.clip(u, -1.0, 1.0)
 
     def to_action(self, u: jax.Array) -> jax.Array:
-        """Clip ``u``, shape ``(A,)``, to [-1, 1] and scale it to [low, high]."""
-        return self.low + 0.5 * (self.high - self.low) * (jnp.clip(u, -1.0, 1.0) + 1.0)
+        """Bound ``u``, shape ``(A,)``, and scale it to [low, high]."""
+        return self.low + 0.5 * (self.high - self.low) * (self.bound(u) + 1.0)
+
+    def step(self, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+        """Return what is carried on, and the action without exploration noise, shape ``(A,)``.
+
+        Args:
+            carry: What ``initial_carry`` returned at the episode's start, or the step before.
+            observation: Shape ``(O,)``, in the units that the policy was trained with.
+        """
+        carry, u = self.get_mean(carry, observation)
+        return carry, self.to_action(u)
 
     def get_action(self, observation: jax.Array, rng: jax.Array | None = None) -> jax.Array:
         """Return the action, shape ``(A,)``, for an observation, shape ``(O,)``.
@@ -116,8 +115,16 @@ class Policy(Base):
         Args:
             observation: In the units that the policy was trained with.
             rng: JAX key of the exploration noise; None: no noise.
+
+        Raises:
+            UsageError: The policy remembers, so that an observation alone does not tell its action.
         """
-        u = self.get_mean(observation)
+        if is_recurrent(self.network):
+            raise UsageError(
+                f"a policy of network {self.spec.name!r} remembers: its action does not follow from an observation",
+                hint="call step(carry, observation), beginning each episode with initial_carry()",
+            )
+        _, u = self.get_mean(self.initial_carry(), observation)
         if rng is not None:
             u = u + jnp.exp(self.log_std) * jax.random.normal(rng, u.shape, u.dtype)
         return self.to_action(u)
@@ -133,19 +140,64 @@ class Policy(Base):
                 f"one policy was expected, this one has leading axes {np.shape(self.log_std)[:-1]}",
                 hint="pick a seed first: policies[0], or TrainResult.best",
             )
-        weights = {name: getattr(self, name) for name in ("log_std", "mean", "std", "low", "high")}
-        for i, (kernel, bias) in enumerate(self.layers):
-            weights |= {f"layers.{i}.kernel": kernel, f"layers.{i}.bias": bias}
+        weights = {name: getattr(self, name) for name in BESIDES} | _to_arrays(self.spec.name, self.params)
         return {name: np.asarray(value, np.float32) for name, value in weights.items()}
 
     @classmethod
-    def from_weights(cls, weights: dict[str, np.ndarray]) -> Policy:
+    def from_weights(
+        cls, weights: Mapping[str, np.ndarray], spec: NetworkSpec | None = None, factory: Factory | None = None
+    ) -> Policy:
         """Return the policy from the arrays that ``to_weights`` returns.
 
+        Args:
+            weights: The arrays.
+            spec: What the network is; default: a perceptron whose mean is clipped.
+            factory: Makes the network of a user; default: what has the name that ``spec`` has.
+
         Raises:
-            Sim2RealError: An array is missing.
+            Sim2RealError: An array is missing or of another shape.
+            UsageError: The network cannot be imported.
         """
+        spec = spec or NetworkSpec()
         arrays = {name: jnp.asarray(value, jnp.float32) for name, value in weights.items()}
+        network, params = _from_arrays(spec.name if factory is None else factory, arrays)
+        return cls(params=params, **{name: arrays[name] for name in BESIDES}, network=network, spec=spec)
+
+
+def _to_arrays(name: str, params: Any) -> dict[str, Any]:
+    """Return the parameters of a network by name."""
+    if name not in OWN:
+        return dict(_named(params))
+    layers = params if name == "mlp" else params["layers"]
+    arrays = {} if name == "mlp" else {f"gru.{part}": params[part] for part in GRU_ARRAYS}
+    return arrays | {f"layers.{i}.{p}": a for i, ab in enumerate(layers) for p, a in zip(PARTS, ab, strict=True)}
+
+
+def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[Network, Any]:
+    """Return a network, and its parameters from what ``_to_arrays`` returned."""
+    if kind in OWN:
         layers = tuple(layers_of(arrays))
-        rest = ("log_std", "mean", "std", "low", "high")
-        return cls(layers=layers, **{name: arrays[name] for name in rest})
+        widths = tuple(bias.shape[0] for _, bias in layers)
+        if kind == "mlp":
+            return MLP(widths), layers
+        gru = gru_of(arrays)
+        return GRU((gru["recurrent"].shape[0], *widths)), {**gru, "layers": layers}
+    require(arrays, BESIDES)
+    inputs, outputs = arrays["mean"].size, arrays["log_std"].size
+    network = make_network(kind, (), inputs, outputs)
+    example = network.init(np.random.default_rng(0), inputs, 1.0)
+    like = _named(example)
+    require(arrays, [name for name, _ in like])
+    for name, leaf in like:
+        if leaf.shape != arrays[name].shape:
+            raise Sim2RealError(
+                f"the policy's {name} has shape {arrays[name].shape}, that of {name_of(kind)} has {leaf.shape}",
+                hint="the network is another one than was trained: go back to the code that the bundle was made with",
+            )
+    return network, jax.tree.unflatten(jax.tree.structure(example), [arrays[name] for name, _ in like])
+
+
+def _named(params: Any) -> list[tuple[str, Any]]:
+    """Return the arrays of a user's network with their paths as names."""
+    found = jax.tree_util.tree_leaves_with_path(params)
+    return [(f"network.{jax.tree_util.keystr(path, simple=True, separator='.')}", leaf) for path, leaf in found]

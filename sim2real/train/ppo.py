@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.train.architectures import Factory
 from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.checks import FINITE, check_values
 from sim2real.train.compilation import compile_lowered, small_random_numbers
@@ -29,9 +30,11 @@ from sim2real.train.result import Progress as Progress
 from sim2real.train.result import TrainResult as TrainResult
 from sim2real.train.result import best_of, history_of
 from sim2real.train.rollout import Copies, Tested, collect, figures_of, pick, untested, watch
-from sim2real.train.start import make_start, swept_numbers
+from sim2real.train.sequences import ActorCritic
+from sim2real.train.start import make_networks, make_start, swept_numbers
 from sim2real.train.sweep import Sweep as Sweep
 from sim2real.train.sweep import with_numbers
+from sim2real.train.teacher import TeacherEnvironment
 from sim2real.train.update import TrainState, keys, make_policy, update
 
 
@@ -43,6 +46,9 @@ def train(
     checkpoint: Path | None = None,
     resume: Path | None = None,
     sweep: Sweep | None = None,
+    actor: Factory | None = None,
+    critic: Factory | None = None,
+    teacher: Policy | None = None,
 ) -> TrainResult:
     """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
@@ -56,6 +62,10 @@ def train(
         resume: Such a file to go on from. The result is that of a training that was never interrupted, bit for bit on
             one machine.
         sweep: Settings to try side by side; None: those of ``config``.
+        actor: Makes the actor, a module of flax.linen or a ``Network``, with this number of outputs; None: ``config``
+            names it.
+        critic: The same for the value function.
+        teacher: A policy to imitate, in place of learning from rewards; it may see what only simulation knows.
 
     Raises:
         UsageError: The environment breaks its protocol, no evaluation episode ended within ``eval_steps``, or what is
@@ -64,14 +74,16 @@ def train(
     """
     start = time.perf_counter()
     check_environment(env)
+    env = TeacherEnvironment(env) if config.teacher else env
     _check_target(env, config)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     key = key if typed else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
-    state, numbers = make_start(env, sweep.configs(config), key), swept_numbers(sweep, config.num_seeds)
+    networks = make_networks(env, config, actor, critic, teacher)
+    state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
     where = placements(state, config)
     state = state if where is None else jax.device_put(state, where)
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), state))
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
     with small_random_numbers():
         lowered = jax.jit(one, donate_argnums=0, out_shardings=where and (where, None, None)).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
@@ -160,7 +172,7 @@ def _is_over(config: PPOConfig, log: list[Progress]) -> bool:
 
 
 def _epoch(
-    env: TrainingEnvironment, config: PPOConfig, state: TrainState
+    env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, state: TrainState
 ) -> tuple[TrainState, Policy, dict[str, jax.Array]]:
     """Train one seed up to its next evaluation, and evaluate it.
 
@@ -174,11 +186,12 @@ def _epoch(
         testing, (key_play, _, key_test) = i >= count, keys(state)
         key = pick(testing, jax.random.fold_in(key_test, i), key_play)
         number = jnp.where(testing, i - count, state.update)
-        policy = make_policy(env, state.params, state.normaliser)
-        played, rows = collect(env, config, policy, pick(testing, actors, state.copies), number, key, testing)
+        policy = make_policy(env, config, networks, state.params, state.normaliser)
+        copies = pick(testing, actors, state.copies)
+        played, rows = collect(env, config, policy, copies, number, key, networks.teacher, testing)
 
         def learn() -> tuple[TrainState, Tested, dict[str, jax.Array]]:
-            state_after, stats = update(env, config, state, played, rows)
+            state_after, stats = update(env, config, networks, state, played, rows)
             return state_after, tested, stats
 
         def test() -> tuple[TrainState, Tested, dict[str, jax.Array]]:
@@ -193,4 +206,5 @@ def _epoch(
     stats = jax.tree.map(lambda leaf: leaf[:count], stats)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
-    return state, make_policy(env, state.params, state.normaliser), values | figures_of(tested)
+    policy = make_policy(env, config, networks, state.params, state.normaliser)
+    return state, policy, values | figures_of(tested)

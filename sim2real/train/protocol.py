@@ -95,14 +95,21 @@ def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[Any
     Raises:
         UsageError: It is asked for, and the environment cannot.
     """
-    if not config.privileged:
-        return None
+    return sees_more(env).privileged if config.privileged else None
+
+
+def sees_more(env: TrainingEnvironment) -> PrivilegedEnvironment:
+    """Return an environment that can show more than the policy sees.
+
+    Raises:
+        UsageError: It cannot.
+    """
     if not isinstance(env, PrivilegedEnvironment):
         raise UsageError(
             f"a value function cannot see more than the policy in a {type(env).__name__}: it has no `privileged`",
-            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged",
+            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged and --ppo.teacher",
         )
-    return env.privileged
+    return env
 
 
 def check_environment(env: TrainingEnvironment) -> None:

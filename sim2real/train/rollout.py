@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
 from sim2real.train.protocol import TrainingEnvironment, get_privileged, metric_names
+from sim2real.train.teacher import advice
 
 
 class Copies(NamedTuple):
@@ -18,10 +20,14 @@ class Copies(NamedTuple):
     Attributes:
         state: Their states; leaves of shape ``(N, ...)``.
         observation: Shape ``(N, O)``: their observations.
+        carry: What the actor carries from step to step; leaves of shape ``(N, ...)``.
+        critic_carry: The same of the value function.
     """
 
     state: Any
     observation: jax.Array
+    carry: Any = ()
+    critic_carry: Any = ()
 
 
 T = TypeVar("T")
@@ -41,6 +47,7 @@ class Rows(NamedTuple):
         metrics: Name -> shape ``(T, N)``: the environment's, after the row.
         privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
         privileged_following: Shape ``(T, N, P)``: the same after the row.
+        advice: Shape ``(T, N, A)``: what a teacher would have done; None: there is none.
     """
 
     observation: jax.Array
@@ -53,6 +60,7 @@ class Rows(NamedTuple):
     metrics: dict[str, jax.Array]
     privileged: jax.Array | None = None
     privileged_following: jax.Array | None = None
+    advice: jax.Array | None = None
 
 
 class Tested(NamedTuple):
@@ -96,6 +104,11 @@ def select(mask: jax.Array, new: T, old: T) -> T:
     return jax.tree.map(pick, new, old)
 
 
+def spread(carry: T, count: int) -> T:
+    """Return what is carried into a first step for each of N copies."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), carry)
+
+
 def collect(
     env: TrainingEnvironment,
     config: PPOConfig,
@@ -103,6 +116,7 @@ def collect(
     copies: Copies,
     update: jax.Array,
     key: jax.Array,
+    teacher: Policy | None = None,
     testing: jax.Array | None = None,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
@@ -119,6 +133,7 @@ def collect(
         copies: The copies after the last rollout; ignored if ``update`` is 0.
         update: Shape ``()``, int32: number of updates so far, in a test of rollouts.
         key: Source of resets, noise and the environment's own randomness.
+        teacher: Whose advice is asked for in every row, while the policy acts.
         testing: Shape ``()``, bool: play without exploration noise, and cut no episode; default: false.
 
     Returns:
@@ -126,20 +141,22 @@ def collect(
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    fresh = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, count)))
+    begun = jax.vmap(env.reset)(jax.random.split(key_reset, count))
+    fresh = Copies(*begun, spread(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
-    spread = jnp.exp(policy.log_std) if testing is None else jnp.where(testing, 0.0, jnp.exp(policy.log_std))
+    std = jnp.exp(policy.log_std) if testing is None else jnp.where(testing, 0.0, jnp.exp(policy.log_std))
     see = get_privileged(env, config)
     cut = 1 + jnp.arange(count) * config.eval_steps // count
     cut = cut if testing is None else jnp.where(testing, 0, cut)
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
         noise, keys, number = x
-        u = jax.vmap(lambda observation, z: policy.get_mean(observation) + spread * z)(now.observation, noise)
+        carry, mean = jax.vmap(policy.get_mean)(now.carry, now.observation)
+        u = mean + std * noise
         step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
         truncated = step.truncated | (number == cut)
-        following = Copies(step.state, step.observation)
+        following = Copies(step.state, step.observation, select(step.valid, carry, now.carry), now.critic_carry)
         out = Rows(
             observation=now.observation,
             u=u,
@@ -151,6 +168,7 @@ def collect(
             metrics=step.metrics,
             privileged=None if see is None else jax.vmap(see)(now.state),
             privileged_following=None if see is None else jax.vmap(see)(step.state),
+            advice=None if teacher is None else jax.vmap(partial(advice, env, teacher))(now.state, now.observation),
         )
         return select(step.terminated | truncated, fresh, following), out
 
@@ -213,10 +231,11 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
     """
     shapes = jax.eval_shape(jax.vmap(env.reset), jax.random.split(key, config.num_envs))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
+    blank = blank._replace(carry=spread(policy.initial_carry(), config.num_envs))
 
     def rollout(carry: tuple[Copies, Tested], i: jax.Array) -> tuple[tuple[Copies, Tested], None]:
         copies, tested = carry
-        played, rows = collect(env, config, policy, copies, i, jax.random.fold_in(key, i), jnp.asarray(True))
+        played, rows = collect(env, config, policy, copies, i, jax.random.fold_in(key, i), testing=jnp.asarray(True))
         return (played, watch(tested, rows, config)), None
 
     start = blank, untested(env, config)

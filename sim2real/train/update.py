@@ -10,19 +10,23 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from sim2real.policy.network import NetworkSpec
 from sim2real.train.config import PPOConfig
-from sim2real.train.networks import Policy, apply_mlp, entropy, log_prob
-from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
+from sim2real.train.losses import Batch, gae, loss
+from sim2real.train.networks import Policy, log_prob
+from sim2real.train.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
 from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.protocol import TrainingEnvironment
 from sim2real.train.rollout import Copies, Rows
+from sim2real.train.sequences import ActorCritic, unroll
+from sim2real.train.teacher import TeacherEnvironment
 
 
 class TrainState(NamedTuple):
     """Everything that training carries from update to update, for one seed.
 
     Attributes:
-        params: ``{"actor": Layers, "log_std": (A,), "value": Layers}``.
+        params: ``{"actor": ..., "log_std": (A,), "value": ...}``: those of the networks, and of the noise.
         optimiser: State of the optimiser.
         normaliser: Statistics of the observations so far.
         privileged: Statistics of what the value function sees besides; None: it sees the observation alone.
@@ -44,132 +48,45 @@ _Learnt = tuple[Any, optax.OptState]
 """Parameters, and the state of the optimiser."""
 
 
-class Batch(NamedTuple):
-    """Rows prepared for the loss; leading axes ``(N, T)`` or flat.
-
-    Attributes:
-        x: Shape ``(..., O)``: normalised observations.
-        critic: Shape ``(..., O + P)``: what the value function is given; None: it is ``x``.
-        u: Shape ``(..., A)``: the policy's samples.
-        log_prob: Shape ``(...)``: log density of ``u`` under the policy that drew it.
-        value: Shape ``(...)``: value estimates before the update.
-        advantage: Shape ``(...)``.
-        weight: Shape ``(...)``: 1 in rows with a policy step, else 0.
-    """
-
-    x: jax.Array
-    critic: jax.Array | None
-    u: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
-    advantage: jax.Array
-    weight: jax.Array
-
-
-def make_policy(env: TrainingEnvironment, params: dict[str, Any], normaliser: Normaliser) -> Policy:
+def make_policy(
+    env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, params: dict[str, Any], normaliser: Normaliser
+) -> Policy:
     """Return the policy with the given parameters and normaliser.
 
     Args:
         env: Gives the action bounds.
+        config: Says whether actions are squashed.
+        networks: Its actor is the policy's.
         params: As in ``TrainState``.
         normaliser: Statistics of the observations.
     """
+    known = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
     return Policy(
-        layers=params["actor"],
+        params=params["actor"],
         log_std=params["log_std"],
         mean=normaliser.mean,
-        std=jnp.sqrt(normaliser.var + 1e-6),
+        std=deviations(normaliser, known),
         low=jnp.asarray(env.action_low, jnp.float32),
         high=jnp.asarray(env.action_high, jnp.float32),
+        network=networks.actor,
+        spec=NetworkSpec(networks.name, config.squash, known),
     )
 
 
-def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_lambda: float) -> jax.Array:
-    """Return generalised advantage estimates (Schulman et al. 2016) of rows, some of which have no policy step.
-
-    The reward of a row without a policy step is added, undiscounted, to the reward of the policy step before it; the
-    discount applies once per policy step. At an episode's end the sum stops; after truncation the value of the final
-    observation is added.
-
-    Args:
-        rows: T rows of N copies.
-        value: Shape ``(T, N)``: value of ``rows.observation``.
-        following: Shape ``(T, N)``: value of ``rows.following``.
-        gamma: Discount per policy step.
-        gae_lambda: Lambda of the estimator, 0 to 1.
-
-    Returns:
-        Shape ``(T, N)``; meaningless in rows without a policy step.
-    """
-
-    def back(
-        carry: tuple[jax.Array, jax.Array, jax.Array], x: tuple[Rows, jax.Array, jax.Array]
-    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
-        later_advantage, later_value, later_reward = carry  # of the next policy step, and of the rows before it
-        row, value, following = x
-        end = row.terminated | row.truncated
-        later_value = jnp.where(end, jnp.where(row.terminated, 0.0, following), later_value)
-        later_advantage = jnp.where(end, 0.0, later_advantage)
-        reward = row.reward + jnp.where(end, 0.0, later_reward)
-        advantage = reward + gamma * (later_value + gae_lambda * later_advantage) - value
-        carry = (
-            jnp.where(row.valid, advantage, later_advantage),
-            jnp.where(row.valid, value, later_value),
-            jnp.where(row.valid, 0.0, reward),
-        )
-        return carry, advantage
-
-    zeros = jnp.zeros_like(value[0])
-    return jax.lax.scan(back, (zeros, following[-1], zeros), (rows, value, following), reverse=True)[1]
-
-
-def loss(params: dict[str, Any], batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows.
-
-    Args:
-        params: As in ``TrainState``.
-        batch: The rows, with one leading axis.
-        config: Clip ranges and weights.
-
-    Returns:
-        The loss, and its parts by name; each of shape ``()``.
-    """
-    weight = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
-    centred = batch.advantage - jnp.sum(weight * batch.advantage)
-    advantage = centred / jnp.sqrt(jnp.sum(weight * centred**2) + 1e-8)
-    log_ratio = jax.vmap(lambda u, x: log_prob(u, apply_mlp(params["actor"], x), params["log_std"]))(batch.u, batch.x)
-    log_ratio = log_ratio - batch.log_prob
-    ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
-    policy_loss = -jnp.sum(weight * jnp.minimum(advantage * ratio, advantage * clipped))
-    critic = batch.x if batch.critic is None else batch.critic
-    moved = jax.vmap(lambda x: apply_mlp(params["value"], x)[0])(critic) - batch.value
-    held = jnp.clip(moved, -config.value_clip, config.value_clip)
-    # The target is value + advantage, so its distance from value + moved is moved - advantage.
-    error = jnp.maximum((moved - batch.advantage) ** 2, (held - batch.advantage) ** 2)
-    value_loss = 0.5 * jnp.sum(weight * error)
-    bonus = entropy(params["log_std"])
-    parts = {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "entropy": bonus,
-        "kl": jnp.sum(weight * (ratio - 1.0 - log_ratio)),
-        "clip_share": jnp.sum(jnp.where(jnp.abs(ratio - 1.0) > config.clip, weight, 0.0)),
-    }
-    return policy_loss + config.value_coef * value_loss - config.entropy_coef * bonus, parts
-
-
-def prepare(state: TrainState, policy: Policy, rows: Rows, config: PPOConfig) -> Batch:
+def prepare(
+    state: TrainState, policy: Policy, rows: Rows, config: PPOConfig, networks: ActorCritic
+) -> tuple[Batch, Any]:
     """Return the batch of a rollout: normalised observations, values, log densities and advantages.
 
     Args:
-        state: Its value network and normalisers are used.
+        state: The state before the rollout; its value network and normalisers are used.
         policy: The policy that played the rows.
         rows: T rows of N copies.
         config: Discount and lambda.
+        networks: Actor and value function.
 
     Returns:
-        The batch with leading axes ``(N, T)``.
+        The batch, and what the value function carries on after the last row.
     """
 
     def over_rows(function: Callable[..., jax.Array], *leaves: jax.Array) -> jax.Array:
@@ -184,18 +101,28 @@ def prepare(state: TrainState, policy: Policy, rows: Rows, config: PPOConfig) ->
 
     x, x_following = over_rows(policy.normalise, rows.observation), over_rows(policy.normalise, rows.following)
     critic, critic_following = judged(x, rows.privileged), judged(x_following, rows.privileged_following)
-    value = over_rows(lambda x: apply_mlp(state.params["value"], x)[0], critic)
-    following = over_rows(lambda x: apply_mlp(state.params["value"], x)[0], critic_following)
+    end, copies, squash = rows.terminated | rows.truncated, state.copies, policy.spec.squash
+    played = unroll(networks.actor, policy.params, copies.carry, x, rows.valid, end).y
+    judge = unroll(
+        networks.critic, state.params["value"], copies.critic_carry, critic, rows.valid, end, critic_following
+    )
+    value, following = judge.y[..., 0], jnp.asarray(judge.following)[..., 0]
     batch = Batch(
         x=x,
         critic=None if state.privileged is None else critic,
         u=rows.u,
-        log_prob=over_rows(lambda u, x: log_prob(u, apply_mlp(policy.layers, x), policy.log_std), rows.u, x),
+        log_prob=over_rows(lambda u, mean: log_prob(u, mean, policy.log_std, squash), rows.u, played),
         value=value,
         advantage=gae(rows, value, following, config.gamma, config.gae_lambda),
         weight=rows.valid.astype(jnp.float32),
+        advice=rows.advice,
+        noise=(rows.u - played) * jnp.exp(-policy.log_std) if squash else None,
+        end=end,
+        actor_carry=(),
+        critic_carry=(),
     )
-    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
+    batch = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
+    return batch._replace(actor_carry=copies.carry, critic_carry=copies.critic_carry), judge.carry
 
 
 def keys(state: TrainState) -> jax.Array:
@@ -207,16 +134,23 @@ def keys(state: TrainState) -> jax.Array:
 
 
 def update(
-    env: TrainingEnvironment, config: PPOConfig, state: TrainState, copies: Copies, rows: Rows
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    networks: ActorCritic,
+    state: TrainState,
+    copies: Copies,
+    rows: Rows,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Update the networks and the normaliser after a rollout.
 
-    Each minibatch has all rows of some of the copies: shuffling N indices is cheap, and a copy's rows are adjacent in
-    memory. The normaliser is updated after the networks: log densities are those of the policy that played the rows.
+    Each minibatch has all rows of some of the copies: shuffling N indices is cheap, a copy's rows are adjacent in
+    memory, and networks that remember need them in their order. The normaliser is updated after the networks: log
+    densities are those of the policy that played the rows.
 
     Args:
         env: The environment.
         config: Settings.
+        networks: Actor and value function.
         state: The state before the rollout.
         copies: The copies after it.
         rows: What they played, by the policy of that state.
@@ -226,13 +160,15 @@ def update(
         unscaled, each of shape ``()``; ``finite_observation``, shape ``(O,)``, bool; and ``finite_privileged``, shape
         ``(P,)``, bool, where the value function sees more.
     """
-    batch = prepare(state, make_policy(env, state.params, state.normaliser), rows, config)
+    policy = make_policy(env, config, networks, state.params, state.normaliser)
+    batch, critic_carry = prepare(state, policy, rows, config, networks)
+    copies = copies._replace(critic_carry=critic_carry)
     optimiser = make_optimiser(config)
 
     def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
         params, optimiser_state = carry
-        part = jax.tree.map(lambda leaf: leaf[index].reshape(-1, *leaf.shape[2:]), batch)
-        (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config)
+        part = jax.tree.map(lambda leaf: leaf[index], batch)
+        (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config, networks)
         if config.schedule == "adaptive":
             rate = adapt_rate(get_rate(optimiser_state), parts["kl"], config.target_kl)
             optimiser_state, parts = set_rate(optimiser_state, rate), parts | {"learning_rate": rate}

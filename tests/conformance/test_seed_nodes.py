@@ -24,7 +24,7 @@ from sim2real.graph.schedule import draw
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compiled import CompiledGraph
-from sim2real.train.networks import init_mlp
+from sim2real.train.architectures import MLP, init_mlp
 
 SEEDS = Path(os.environ.get("SIM2REAL_SEEDS", Path(__file__).parents[3] / "shared" / "seeds"))
 TUTORIAL = sorted(SEEDS.glob("001_*.txt"))
@@ -207,8 +207,8 @@ def test_a_policy_of_ours_acts_in_the_agent(tutorial):
     nodes = robot(tutorial, sensor="SimSensor", actuator="SimActuator")
     rng = np.random.default_rng(0)
     policy = Policy(
-        layers=init_mlp(rng, (19, 8, 1), 1.0), log_std=jnp.zeros(1), mean=jnp.zeros(19), std=jnp.ones(19),
-        low=-2.0 * jnp.ones(1), high=2.0 * jnp.ones(1),
+        params=init_mlp(rng, (19, 8, 1), 1.0), log_std=jnp.zeros(1), mean=jnp.zeros(19), std=jnp.ones(19),
+        low=-2.0 * jnp.ones(1), high=2.0 * jnp.ones(1), network=MLP((8, 1)),
     )  # fmt: skip
     params = {"agent": nodes["agent"].init_params().replace(policy=policy, init_method="random")}
     graph = CompiledGraph(nodes, "agent", draw(nodes, 1.0))

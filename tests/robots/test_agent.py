@@ -1,8 +1,10 @@
 """The policy's node: goals that a policy moves, and what it is shown."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
@@ -145,3 +147,29 @@ def test_a_direct_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_
     np.testing.assert_array_equal(policy.shown[0], np.zeros(8))
     np.testing.assert_array_equal(policy.shown[2], [20, -20, 10, -10, 0, 0, 1.5, 0.5])
     np.testing.assert_array_equal(agent.init_output().goal, [0.0])
+
+
+@struct.dataclass
+class Counting:
+    """A policy that remembers in how many steps it was asked."""
+
+    first: float
+
+    def initial_carry(self):
+        return jnp.zeros(())
+
+    def step(self, carry, observation):
+        return carry + 1.0, jnp.full(2, self.first + carry)
+
+
+@pytest.mark.parametrize("kind", ["goal", "direct"])
+def test_a_policy_that_remembers_goes_on_and_begins_anew_with_each_episode(kind):
+    agent = make_agent() if kind == "goal" else DirectAgent("agent", RATE_HZ, lambda m: m.position, (2, 2), 2, Goals)
+    for _ in range(2):
+        step_state, _ = started(agent, policy=Counting(0.1))
+        sent = []
+        for _ in range(3):
+            step_state, message = agent.step(seeing(step_state, [0.0, 0.0], [0.0, 0.0]))
+            sent.append(np.asarray(jax.tree.leaves(message)[0]))
+        moved = np.diff([START, *sent], axis=0) * RATE_HZ if kind == "goal" else sent
+        np.testing.assert_allclose(moved, np.array([[0.1], [1.1], [2.1]]) * np.ones(2), rtol=1e-4)

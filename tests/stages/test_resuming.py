@@ -106,9 +106,13 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
         stage.check_same_parameters(found, other)
 
 
-def test_a_sweep_names_what_it_tried(tmp_path, capsys):
-    assert cli.main([*TINY, "--runs", str(tmp_path), "--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2"]) == 0
+def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
+    report, left = stage._report, []
+    monkeypatch.setattr(stage, "_report", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT))))
+    options = ("--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2", "--no-checkpoint")
+    assert cli.main([*TINY, "--runs", str(tmp_path), *options]) == 0
     said = capsys.readouterr().out
+    assert not left
     assert "gamma=0.9 " in said
     assert "gamma=0.99 " in said
     history = Bundle.load(folder(tmp_path)).history

@@ -18,7 +18,9 @@ from sim2real.robots.loop import DelayParams
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.stages.sensitivity import MULTIPLES, models_of, moves_of, sensitivity, with_room
+from sim2real.train.architectures import MLP
 from sim2real.train.env import GraphEnvironment
+from sim2real.train.networks import Policy
 
 VALUES = {
     "gain": 20.0, "gravity": 100.0, "damping": 20.0, "friction": 0.1, "sensor_delay": 0.02, "actuator_delay": 0.025,
@@ -73,10 +75,9 @@ def judged():
     robot = with_room(Holding(), models)
     nodes, task = robot.training(found.values, {}, {}, True)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
-    one = jnp.ones(1)
-    policy = SimpleNamespace(
-        low=-2.0 * one, log_std=one, get_mean=lambda observation: VOLTS * one, to_action=lambda u: u
-    )
+    layer = (jnp.zeros((robot.observation_size, 1)), jnp.full(1, VOLTS / 2.0))
+    zero, one = jnp.zeros(robot.observation_size), jnp.ones(1)
+    policy = Policy((layer,), one, zero, zero + 1.0, -2.0 * one, 2.0 * one, MLP((1,)))
     return sensitivity(robot, env, policy, moves, models, seed=0)
 
 

@@ -169,3 +169,26 @@ class Counter(Constant):
         return Step(
             {**state, "row": row}, seen[None], jnp.float32(2), row >= self.length, ~yes, yes, {"rows": row * 1.0}
         )
+
+
+class Sign:
+    """A sign is shown at the first of six rows; to be said again in all the others."""
+
+    observation_size = 2
+    action_low = np.array([-2.0], np.float32)
+    action_high = np.array([2.0], np.float32)
+
+    def reset(self, key):
+        sign = jnp.sign(jax.random.uniform(key, minval=-1.0))
+        return {"sign": sign, "row": jnp.int32(0), "said": jnp.float32(0)}, jnp.stack([sign, 1.0])
+
+    def step(self, state, action, key):
+        error = (action[0] - state["sign"]) ** 2
+        late = state["row"] > 0
+        said = state["said"] + jnp.where(late & (action[0] * state["sign"] > 0.5), 0.2, 0.0)
+        new = {**state, "row": state["row"] + 1, "said": said}
+        no = jnp.bool_(False)
+        return Step(new, jnp.zeros(2), jnp.where(late, -error, 0.0), no, new["row"] >= 6, ~no, {"success": said})
+
+    def privileged(self, state):
+        return state["sign"][None]

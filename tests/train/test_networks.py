@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError
-from sim2real.train.networks import Policy, entropy, init_mlp, log_prob
+from sim2real.train.architectures import MLP, init_mlp
+from sim2real.train.networks import Policy, entropy, log_prob
 
 
 @pytest.fixture
 def policy():
     rng = np.random.default_rng(0)
     return Policy(
-        layers=init_mlp(rng, (3, 16, 16, 2), 1.0),
+        params=init_mlp(rng, (3, 16, 16, 2), 1.0),
         log_std=np.array([-1.0, 0.5], np.float32),
         mean=np.array([1.0, 0.0, -2.0], np.float32),
         std=np.array([0.5, 2.0, 10.0], np.float32),
         low=np.array([-2.0, 0.0], np.float32),
         high=np.array([2.0, 5.0], np.float32),
+        network=MLP((16, 16, 2)),
     )
 
 

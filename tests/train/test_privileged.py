@@ -25,7 +25,7 @@ def test_it_knows_what_the_policy_cannot_see():
         for privileged in (False, True)
     )
     assert seeing.history["value_loss"][-1, 0] < 0.6 * blind.history["value_loss"][-1, 0]
-    assert seeing.best.layers[0][0].shape == blind.best.layers[0][0].shape == (1, 16)
+    assert seeing.best.params[0][0].shape == blind.best.params[0][0].shape == (1, 16)
 
 
 class Scalar(Coin):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from environments import Counter
 
+from sim2real.train.architectures import MLP, init_mlp
 from sim2real.train.config import PPOConfig
-from sim2real.train.networks import Policy, init_mlp
+from sim2real.train.networks import Policy
 from sim2real.train.rollout import Copies, collect, evaluate
 
 
@@ -19,7 +20,7 @@ def config():
 @pytest.fixture(scope="module")
 def policy():
     one = np.ones(1, np.float32)
-    return Policy(init_mlp(np.random.default_rng(0), (1, 4, 1), 1.0), 0 * one, 0 * one, one, -one, one)
+    return Policy(init_mlp(np.random.default_rng(0), (1, 4, 1), 1.0), 0 * one, 0 * one, one, -one, one, MLP((4, 1)))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,66 @@
+"""What a policy's network is, besides its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sim2real.errors import Sim2RealError
+
+OWN = ("mlp", "gru")
+"""Networks that numpy runs."""
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """What a policy's network is.
+
+    Attributes:
+        name: ``"mlp"``, ``"gru"``, or ``"package.module:Class"`` of a user's own.
+        squash: Whether the action is bounded by tanh; else it is clipped.
+        privileged: Number of entries at the end of the observation that only simulation knows: a teacher's, which runs
+            on no robot.
+    """
+
+    name: str = "mlp"
+    squash: bool = False
+    privileged: int = 0
+
+    @property
+    def own(self) -> bool:
+        """Whether numpy runs it."""
+        return self.name in OWN
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: object) -> NetworkSpec:
+        """Return what ``to_dict`` was called of.
+
+        Raises:
+            Sim2RealError: A part is missing or of the wrong type.
+        """
+        if isinstance(data, Mapping):
+            name, squash, privileged = (data.get(part) for part in ("name", "squash", "privileged"))
+            known = isinstance(name, str) and isinstance(squash, bool) and type(privileged) is int
+            if known and isinstance(name, str) and isinstance(privileged, int) and privileged >= 0:
+                return cls(name, bool(squash), privileged)
+        raise Sim2RealError(
+            f"the policy's network is described by {data!r}: name, squash and privileged are needed",
+            hint="export the policy again: sim2real train",
+        )
+
+    def refuse_teacher(self) -> None:
+        """Raise where only simulation can run the policy.
+
+        Raises:
+            Sim2RealError: It is a teacher.
+        """
+        if self.privileged:
+            raise Sim2RealError(
+                f"this policy is a teacher: {self.privileged} entries of what it sees are known in simulation only",
+                hint="train a student from it, sim2real train PIPELINE --distil RUN, and deploy that one",
+            )
