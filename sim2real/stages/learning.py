@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import UseAppendAction
 
 from sim2real.train.config import PPOConfig
+from sim2real.train.hosts import HostsConfig
 from sim2real.train.sweep import Sweep
 
 
@@ -22,6 +23,8 @@ class LearningConfig:
     every seed, the best policy of all is kept."""
     tensorboard: bool = False
     """Write the curves for TensorBoard while training goes on, into the stage's folder 'tensorboard'."""
+    hosts: HostsConfig = field(default_factory=HostsConfig)
+    """Several processes, on this host or others, that make one training."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
 

@@ -33,6 +33,7 @@ from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitiv
 from sim2real.train.networks import Policy
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
+from sim2real.train.processes import in_words, join, leads, wait_for_all
 from sim2real.train.sweep import Sweep, named
 
 
@@ -69,14 +70,14 @@ def train(
     config = config or pipeline.train
     made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
-    with progress(ppo.evaluations, "train (compiling)") as bar:
+    with progress(ppo.evaluations, "train (compiling)", leads()) as bar, in_words():
         key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
         result = patiently(
             lambda: learn(made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep)
         )
     contract = contract_of(made.robot, made.env.task, made.values)
     weak = None
-    if config.sensitivity:
+    if config.sensitivity and leads():
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
     bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes, sensitivity=weak)
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
@@ -113,15 +114,21 @@ def _sensitivity(
     return sensitivity(wide, env, policy, moves, models, config.seed)
 
 
-def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Train, and write the policy bundle into a stage folder.
+def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder | None:
+    """Train, and write the policy bundle into a stage folder; of several processes the first one writes.
 
     Args:
         pipeline: The robot.
         config: The stage's configuration.
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
+
+    Returns:
+        The stage; None in a process that writes nothing.
     """
+    if config.hosts.several:
+        note(str(config.hosts))
+    join(config.hosts)  # before anything is computed
     moving_robot(pipeline)  # before anything is read
     interrupted = find_interrupted(pipeline.name, config, root)
     run_dir = run_dir if interrupted is None else interrupted.run_dir
@@ -137,8 +144,13 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     inputs = {} if path is None else {"parameters": path}
     if config.explain:
         return explain(pipeline, config, identification, inputs, root, run_dir)
+    resume = None if interrupted is None else interrupted.folder / CHECKPOINT
+    with in_words():
+        wait_for_all("all have read what they need")  # what the first one writes now is not taken for that
+    if not leads():
+        train(pipeline, config, identification, checkpoint=Path(CHECKPOINT), resume=resume)
+        return None
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
-        resume = None if interrupted is None else interrupted.folder / CHECKPOINT
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
             bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume, watch=watch)
         hashes = {name: sha256(file) for name, file in inputs.items()}

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 
 from sim2real.train.config import PPOConfig
+from sim2real.train.mesh import spread
 from sim2real.train.networks import Policy, apply_mlp, entropy, log_prob
 from sim2real.train.normaliser import Normaliser, normalise_parameters, update_normaliser
 from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
@@ -228,9 +229,9 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
     batch = prepare(state, policy, rows, config)
     optimiser = make_optimiser(config)
 
-    def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
+    def minibatch(carry: _Learnt, part: Batch) -> tuple[_Learnt, dict[str, jax.Array]]:
         params, optimiser_state = carry
-        part = jax.tree.map(lambda leaf: leaf[index].reshape(-1, *leaf.shape[2:]), batch)
+        part = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part)
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config)
         if config.schedule == "adaptive":
             rate = adapt_rate(get_rate(optimiser_state), parts["kl"], config.target_kl)
@@ -238,11 +239,15 @@ def update(env: TrainingEnvironment, config: PPOConfig, state: TrainState) -> tu
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
+    def epoch(carry: _Learnt, shuffle: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
+        # Shuffled once, not in each minibatch: devices exchange copies here alone, then gradients.
+        index = shuffle.reshape(config.minibatches, -1)
+        return jax.lax.scan(minibatch, carry, spread(jax.tree.map(lambda leaf: leaf[index], batch), config))
+
     shuffles = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
         jax.random.split(key_shuffle, config.epochs)
     )
-    index = shuffles.reshape(config.epochs * config.minibatches, -1)
-    (params, optimiser_state), parts = jax.lax.scan(minibatch, (state.params, state.optimiser), index)
+    (params, optimiser_state), parts = jax.lax.scan(epoch, (state.params, state.optimiser), shuffles)
     stats = jax.tree.map(jnp.mean, parts) | {
         "reward": jnp.mean(rows.reward) / config.reward_scale,
         "value": jnp.sum(batch.weight * batch.value) / jnp.maximum(batch.weight.sum(), 1.0) / config.reward_scale,
