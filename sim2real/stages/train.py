@@ -22,7 +22,7 @@ from sim2real.robots.loop_robot import LoopRobot
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.events import event_files
-from sim2real.stages.explaining import explain
+from sim2real.stages.explaining import disturbance_rows, explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
@@ -91,6 +91,7 @@ def train(
         "train": f"{result.train_s:.1f} s",
         "episodes that end at a pause": f"{made.episodes.cut} of {made.episodes.timelines}",
         "timelines drawn again": made.episodes.again,
+        **disturbance_rows(made.episodes),
     }
     return bundle, about if weak is None else {**about, "what breaks it": weak.said}
 
@@ -182,7 +183,8 @@ def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> 
         watch(p)
     bar.set_description_str("train")
     bar.update(1)
-    bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
+    width = f", {p.values['width'].max():.2f} of the differences" if "width" in p.values else ""
+    bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}{width}")
 
 
 def _terms(history: History) -> tuple[list[list[Any]], list[str]] | None:

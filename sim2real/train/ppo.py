@@ -24,7 +24,7 @@ from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.devices import Shardings, gather, place, shardings_of
 from sim2real.train.networks import Policy
 from sim2real.train.processes import agree, leads
-from sim2real.train.protocol import TrainingEnvironment, check_environment, metric_names
+from sim2real.train.protocol import TrainingEnvironment, check_environment, get_width, metric_names
 from sim2real.train.result import Progress as Progress
 from sim2real.train.result import TrainResult as TrainResult
 from sim2real.train.result import best_of, history_of
@@ -177,4 +177,6 @@ def _epoch(
     policy = make_policy(env, state.params, state.normaliser)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
+    width = get_width(env, config, state.update - 1)
+    values |= {} if width is None else {"width": width}
     return state, policy, values | evaluate(env, config, policy, keys(state)[2])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment, get_privileged
+from sim2real.train.protocol import TrainingEnvironment, get_privileged, get_reset
 
 
 class Copies(NamedTuple):
@@ -95,7 +95,7 @@ def collect(
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    fresh = Copies(*jax.vmap(env.reset)(jax.random.split(key_reset, count)))
+    fresh = Copies(*jax.vmap(get_reset(env, config, update))(jax.random.split(key_reset, count)))
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
     spread = jnp.exp(policy.log_std)
