@@ -16,7 +16,6 @@ from sim2real.stages import ending
 from sim2real.stages.interruption import SignalHandling
 
 if TYPE_CHECKING:
-    from sim2real.artifacts.run_folder import StageFolder
     from sim2real.stages.pipeline import Pipeline
 
 DEMO_PIPELINE = "pendulum"
@@ -352,19 +351,20 @@ def _run_all(pipeline: Pipeline, flags: Any) -> None:
             continue
         redo = True  # what comes after a stage that ran again is out of date
         console.note(f"{stage} ({number}/{len(STAGES)})")
-        run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir).run_dir
+        run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir)
 
 
-def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> StageFolder:
-    """Call a stage's entry point and print its summary and what it wrote."""
+def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> Path | None:
+    """Call a stage's entry point, print its summary and what it wrote, and return its run folder."""
     from sim2real.stages import console
 
-    done = importlib.import_module(f"sim2real.stages.{stage}").run(pipeline, config, root, run_dir)
+    if (done := importlib.import_module(f"sim2real.stages.{stage}").run(pipeline, config, root, run_dir)) is None:
+        return None  # another process writes
     if done.manifest["summary"]:
         print(console.pairs(done.manifest["summary"]))
     for path in [*done.outputs.values(), done.folder / "manifest.json"]:
         console.wrote(path)
-    return done
+    return done.run_dir
 
 
 def _pipeline_first(command: str, arguments: list[str]) -> tuple[Pipeline, list[str]]:

@@ -420,3 +420,16 @@ def test_a_reader_that_has_enough_is_no_error():
     process.stderr.close()
     assert process.wait(30) == 1
     assert message == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "pendulum", "--train.hosts.found"], "only training is divided among processes"),
+        (["train", "pendulum", "--hosts.found", "--explain"], "explain trains nothing"),
+    ],
+)
+def test_what_several_processes_cannot_do_is_refused(calls, capsys, arguments, said):
+    assert cli.main(arguments) == 2
+    assert said in capsys.readouterr().err
+    assert not calls

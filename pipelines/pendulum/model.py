@@ -154,6 +154,14 @@ class PendulumWorld(OdeWorld):
         gravity = p.mass * GRAVITY * p.length * jnp.sin(th)
         return Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * turn) / p.J)
 
+    def velocity(self, state: Measurement) -> Any:
+        """Return the angular velocity [rad/s]."""
+        return state.thdot
+
+    def with_velocity(self, state: Measurement, velocity: jax.Array) -> Measurement:
+        """Return the state with another angular velocity [rad/s]."""
+        return state.replace(thdot=velocity)
+
     def limit(self, params: PendulumParams, state: Measurement) -> Measurement:
         """Clip the speed."""
         return Measurement(th=state.th, thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))

@@ -44,13 +44,15 @@ class Episodes:
     """What the episodes of a training are drawn from.
 
     Attributes:
-        parameters: What differs between episodes, in the order of the table.
+        parameters: What differs between episodes, in the order of the table; pushes and starts too.
         widening: Factor on the deviations of the posterior for what the model leaves unexplained.
         noise: What the sensor's readings have on top of the motion.
         timelines: How many timelines the episodes share.
         cut: How many of them end before a pause that a program cannot hold.
         again: How many were drawn again, as such a pause came in their first half.
         longest_pause_s: Longest time between two policy steps [s].
+        push_hz: Pushes of each joint in a second [Hz]; 0: none.
+        curriculum: Share of all differences between episodes at the first and at the last update.
         draws: Parameter -> what was drawn ``(K,)``.
         recorded_s: Node -> what its steps took on the robot ``(N,)`` [s].
         drawn_s: Node -> what they take in the timelines ``(M,)`` [s].
@@ -65,6 +67,8 @@ class Episodes:
     cut: int = 0
     again: int = 0
     longest_pause_s: float = 0.0
+    push_hz: float = 0.0
+    curriculum: tuple[float, float] = (1.0, 1.0)
     draws: Mapping[str, np.ndarray] = field(default_factory=dict)
     recorded_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     drawn_s: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -48,6 +48,8 @@ class FitConfig:
     """Derivatives: forward mode or finite differences; 'auto' takes the latter where a node has no derivative."""
     difference: float = 3e-3
     """Step of finite differences; 1 is about a quarter of the bounds' width. Larger ones smooth kinks of friction."""
+    devices: int = 1
+    """Number of this host's devices that a generation's candidates are divided among; for the compiled engine."""
     seed: int = 0
     """Seed of the search."""
 
@@ -70,5 +72,10 @@ class FitConfig:
             raise UsageError(f"skip_s must lie in [0, 10] s, got {self.skip_s}")
         if min(self.batch, self.refine, self.refine_steps, self.long_s) < 0:
             raise UsageError("batch, refine, refine_steps and long_s must not be negative")
+        if self.devices < 1 or self.population % self.devices:
+            raise UsageError(
+                f"devices must be 1 at least and divide the population of {self.population}, got {self.devices}",
+                hint=f"make population a multiple of {self.devices}" if self.devices > 1 else None,
+            )
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"seed must lie in [0, 2**31), got {self.seed}")

@@ -69,6 +69,26 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
     return Choice("c", "asked for" if wanted == "c" else "the world is MuJoCo's, and there is no accelerator", model)
 
 
+def check_devices(count: int, engine: Choice) -> None:
+    """Refuse devices that are not there, or that the engine does not use.
+
+    Raises:
+        UsageError: With what there is.
+    """
+    if count == 1:
+        return
+    if engine.name == "c":
+        raise UsageError(
+            f"devices={count}, but C MuJoCo simulates on the processors of this host, on all of them ({engine.why})",
+            hint="leave out --devices, or take --engine compiled",
+        )
+    if count > (there := jax.local_device_count()):
+        raise UsageError(
+            f"devices={count}, but JAX finds {there} on this host: {jax.local_devices()[0].device_kind}",
+            hint="on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=8 makes 8 of it, for tests",
+        )
+
+
 def _world(nodes: Mapping[str, BaseNode], given: Mapping[str, Any]) -> Any:
     worlds = [n for n in nodes.values() if isinstance(n, BaseWorld)]
     if len(worlds) != 1 or not all(hasattr(worlds[0], n) for n in _NEEDED):

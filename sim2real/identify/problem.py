@@ -19,7 +19,7 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
 from sim2real.identify.config import FitConfig
 from sim2real.identify.derivative import finite_differences
-from sim2real.identify.engine import CRollouts, choose
+from sim2real.identify.engine import CRollouts, check_devices, choose
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.programs import program
@@ -65,6 +65,7 @@ class Problem:
         timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
         make_room(nodes, timeline)  # after a hiccup commands leave in a burst
         self.graph = CompiledGraph(nodes, model.sensor, timeline, cuts.given)
+        check_devices(config.devices, self.engine)
         self._outside = CRollouts(self.graph, self.engine.model) if self.engine.name == "c" else None
         self.segments = self.graph.episodes
         self.begins_s = np.array([s.begin_s for s in self.spans])

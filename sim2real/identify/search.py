@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.tree import strong
@@ -136,6 +137,7 @@ class _Run:
             else (lambda key: None)
         )
         self.batched = batched
+        self.devices = jax.local_devices()[: config.devices]
         self.advance: Any = None
 
     def __call__(
@@ -195,15 +197,29 @@ class _Run:
         fitness = self.losses(candidates, around, self.pick(key))
         return jnp.where(jnp.isfinite(fitness), fitness, _INFINITE)
 
+    def _divided(self, candidates: Any) -> Any:
+        """Return candidates of which each device simulates a part."""
+        return self._spread(candidates, PartitionSpec("candidates"))
+
+    def _on_all(self, values: Any) -> Any:
+        """Return values that all devices have: each makes the same next generation."""
+        return self._spread(values, PartitionSpec())
+
+    def _spread(self, values: Any, how: PartitionSpec) -> Any:
+        if len(self.devices) == 1:
+            return values
+        where = NamedSharding(Mesh(np.array(self.devices), ("candidates",)), how)
+        return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, where), values)
+
     def _advance(self, state: Any, params: Any, key: Any) -> tuple[Any, Any]:
         def generation(state: Any, key: Any) -> tuple[Any, Any]:
             ask, tell, pick = jax.random.split(key, 3)
             candidates, state = self.strategy.ask(ask, state, params)
-            fitness = self._fitness(candidates, self._middle(state), pick)
+            fitness = self._on_all(self._fitness(self._divided(candidates), self._middle(state), pick))
             state, _ = self.strategy.tell(tell, candidates, fitness, state, params)
             return state, jnp.min(fitness)
 
-        return jax.lax.scan(generation, state, jax.random.split(key, self.count))
+        return self._on_all(jax.lax.scan(generation, state, jax.random.split(key, self.count)))
 
 
 @contextmanager

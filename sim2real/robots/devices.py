@@ -55,7 +55,8 @@ class SimSensor(BaseNode):
         if not self.noise:
             return super().init_state(rng, graph_state)
         drawn = jnp.zeros(len(self.noise)) if rng is None else jax.random.normal(rng, (len(self.noise),))
-        return SensorBias(drawn * jnp.array([n.bias for n in self.noise]))
+        params = (graph_state or GraphState()).params.get(self.name)
+        return SensorBias(_scale(params) * drawn * jnp.array([n.bias for n in self.noise]))
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Return the world's message, with noise if there is any."""
@@ -68,7 +69,7 @@ class SimSensor(BaseNode):
         # A key of its own for each step; the sensor has no other use for its random numbers.
         key = jax.random.fold_in(step_state.rng, step_state.seq)
         added = jax.random.normal(key, (len(self.noise),)) * jnp.array([n.deviation for n in self.noise])
-        added = added + step_state.state.bias
+        added = _scale(step_state.params) * added + step_state.state.bias
         changed: dict[str, Any] = {}
         for noise, error in zip(self.noise, added, strict=True):
             field, index = noise.place
@@ -77,6 +78,12 @@ class SimSensor(BaseNode):
             own = noise.quantum * jnp.round(own / noise.quantum) if noise.quantum else own
             changed[field] = own if index is None else value.at[index].set(own)
         return message.replace(**changed)
+
+
+def _scale(params: Any) -> Any:
+    """Return the factor on the noise in a sensor's parameters."""
+    noise = getattr(params, "noise", None)
+    return 1.0 if noise is None else noise
 
 
 @struct.dataclass

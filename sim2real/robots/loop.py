@@ -32,9 +32,11 @@ class DelayParams(Base):
 
     Attributes:
         delay: Delay of its connection with the world [s]; None: as the connection was made.
+        noise: Factor on deviation and bias of a sensor's noise; None: 1.
     """
 
     delay: Any = None
+    noise: Any = None
 
 
 def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
@@ -90,6 +91,28 @@ class LoopRobot(Robot):
             key: JAX key.
             draw: Draws dynamics and delays: key -> values by name.
         """
+
+    def displaced(self, params: Mapping[str, Any], position: jax.Array, velocity: jax.Array) -> dict[str, Any]:
+        """Return an episode's parameters with another start; default: changes ``start`` of the world's parameters.
+
+        Args:
+            params: What ``random_params`` returned.
+            position: What is added to the joints' positions ``(joints,)`` [rad].
+            velocity: What is added to their velocities ``(joints,)`` [rad/s].
+
+        Raises:
+            UsageError: The world's parameters have no such start.
+        """
+        world = params[self.roles.world]
+        start = getattr(world, "start", None)
+        if start is None or jnp.shape(start) != (2 * len(position),):
+            raise UsageError(
+                f"the start of {type(self).__name__} cannot be moved: its world's parameters have no `start` of "
+                f"{len(position)} positions, then velocities",
+                hint="give the robot a method displaced(params, position, velocity), or leave out --vary.start-*",
+            )
+        moved = jnp.asarray(start) + jnp.concatenate([position, velocity])
+        return {**params, self.roles.world: world.replace(start=moved)}
 
     def judged(self, graph_state: GraphState) -> Any:
         """Return what ``reward`` and ``success`` are functions of: the world's state."""

@@ -240,6 +240,22 @@ class ServoRobot(LoopRobot):
         start = jnp.where(jax.random.bernoulli(k_where), rest, anywhere)
         return self.node_params(drawn, start, jnp.zeros_like(start), self.draw_aim(k_aim))
 
+    def displaced(self, params: Mapping[str, Any], position: jax.Array, velocity: jax.Array) -> dict[str, Any]:
+        """Return an episode's parameters with another start, within the joints' limits; goals start there too.
+
+        Args:
+            params: What ``random_params`` returned.
+            position: What is added to the joints' positions ``(joints,)`` [rad].
+            velocity: What is added to their velocities ``(joints,)`` [rad/s].
+        """
+        world, agent = params[self.roles.world], params[self.roles.supervisor]
+        start = jnp.clip(agent.start + position, *map(jnp.asarray, (self.servos.low, self.servos.high)))
+        return {
+            **params,
+            self.roles.world: world.replace(qpos=start, qvel=world.qvel + velocity),
+            self.roles.supervisor: agent.replace(start=start),
+        }
+
     def node_params(
         self, values: Mapping[str, Any], position: Any, velocity: Any, aim: Any, policy: Any = None
     ) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from sim2real.composer.world import ComposedWorld
@@ -52,6 +53,14 @@ class ServoWorld(ComposedWorld):
         # In a leapfrog scheme velocities belong to half a step earlier: extrapolated by the acceleration.
         speed = state.data.qvel + self.lead_s * state.data.qacc
         return JointReading(state.data.qpos[self._qpos], speed[self._qvel])
+
+    def velocity(self, state: Any) -> jax.Array:
+        """Return the joints' velocities ``(joints,)`` [rad/s]."""
+        return state.data.qvel[self._qvel]
+
+    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+        """Return the state with other velocities of the joints ``(joints,)`` [rad/s]."""
+        return state.replace(data=state.data.replace(qvel=state.data.qvel.at[self._qvel].set(velocity)))
 
     def entered(self, state: Any, action: Any) -> Any:
         """Return the state with which a control step begins; a resumed episode's setpoints start at the goals.

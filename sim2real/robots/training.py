@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
 from sim2real.policy.contract import ActionTerm
-from sim2real.robots.loop import draw_values
+from sim2real.robots.loop import DelayParams, draw_values
 from sim2real.robots.roles import Roles
 from sim2real.train.tasks import Rewards
 
@@ -23,6 +24,7 @@ class TrainableLoop(Protocol):
     """What a task asks of its robot; see ``LoopRobot``."""
 
     roles: Roles
+    channels: tuple[Any, ...]
 
     @property
     def action(self) -> tuple[ActionTerm, ...]:
@@ -36,6 +38,16 @@ class TrainableLoop(Protocol):
 
     def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
         """Return parameters of the nodes for a random episode."""
+        ...
+
+    def displaced(self, params: Mapping[str, Any], position: jax.Array, velocity: jax.Array) -> dict[str, Any]:
+        """Return an episode's parameters with another start, see ``LoopRobot``.
+
+        Args:
+            params: Parameters of the nodes.
+            position: What is added to the joints' positions ``(joints,)`` [rad].
+            velocity: What is added to their velocities ``(joints,)`` [rad/s].
+        """
         ...
 
     def judged(self, graph_state: GraphState) -> Any:
@@ -68,6 +80,9 @@ class LoopTask:
         values: Parameters by name.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
             in place of the values.
+
+    Attributes:
+        start: Largest change of a joint's position [rad] and of its velocity [rad/s] at the start of an episode.
     """
 
     def __init__(
@@ -81,11 +96,36 @@ class LoopTask:
         self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.observation_size = robot.observation_size
+        self.start = (0.0, 0.0)
         self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.action], np.float32).T
 
     def params(self, key: jax.Array) -> dict[str, Any]:
         """Draw the parameters of an episode."""
-        return self.robot.random_params(key, self._draw)
+        return self.params_at(key, None)
+
+    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+        """Draw the parameters of an episode that has a share of all differences; None: all of them."""
+        draw = partial(self._draw, width=width)
+        if any(self.start):
+            key, key_start = jax.random.split(key)
+            params = self.robot.displaced(self.robot.random_params(key, draw), *self.offsets(key_start, width))
+        else:
+            params = self.robot.random_params(key, draw)
+        sensor = self.robot.roles.sensor
+        if width is None or not isinstance(params[sensor], DelayParams):
+            return params
+        return {**params, sensor: params[sensor].replace(noise=width)}
+
+    def offsets(self, key: jax.Array, width: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Draw how far from the robot's own start an episode starts: positions and velocities, ``(joints,)`` each.
+
+        Args:
+            key: JAX key.
+            width: Share of the differences; None: all of them.
+        """
+        share = 1.0 if width is None else width
+        drawn = share * jax.random.uniform(key, (2, len(self.robot.channels)), minval=-1.0, maxval=1.0)
+        return self.start[0] * drawn[0], self.start[1] * drawn[1]
 
     def observe(self, step_state: StepState) -> jax.Array:
         """Return the policy's observation, made by the agent's node."""
@@ -113,5 +153,8 @@ class LoopTask:
         numbers = [x for x in map(jnp.asarray, jax.tree.leaves(known)) if jnp.issubdtype(x.dtype, jnp.inexact)]
         return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
 
-    def _draw(self, key: jax.Array) -> dict[str, Any]:
-        return draw_values(key, self.values, self.draws)
+    def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+        drawn = draw_values(key, self.values, self.draws)
+        if width is None:
+            return drawn
+        return {n: own + width * (drawn[n] - own) if n in self.draws else own for n, own in self.values.items()}

@@ -77,17 +77,18 @@ class Bar(Protocol):
 
 
 @contextmanager
-def progress(total: int | None, desc: str) -> Iterator[Bar]:
+def progress(total: int | None, desc: str, shown: bool = True) -> Iterator[Bar]:
     """Show a progress bar on stderr, or plain lines if that is not a terminal (a log file).
 
     Args:
         total: Number of steps; None if unknown.
         desc: What is being done.
+        shown: False shows nothing: another process does.
     """
-    if sys.stderr.isatty():
+    if sys.stderr.isatty() or not shown:
         from tqdm import tqdm  # not needed for --help
 
-        with tqdm(total=total, desc=desc, file=sys.stderr, leave=False) as bar:
+        with tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not shown) as bar:
             yield bar
         return
     lines = _Lines(total, desc)

@@ -52,6 +52,7 @@ def explain(
                 "episodes that end at a pause": episodes.cut,
                 "timelines drawn again": episodes.again,
                 "longest pause": f"{1e3 * episodes.longest_pause_s:.1f} ms",
+                **disturbance_rows(episodes),
             }
         )
     return stage.result
@@ -66,6 +67,15 @@ def parameter_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
         known = "" if p.low95 is None or p.high95 is None else f"[{p.low95:.4g}, {p.high95:.4g}]"
         rows.append([p.name, p.value, known, f"[{low:.4g}, {high:.4g}]", p.unit, "left open by the log" * p.open])
     return rows, ["parameter", "value", "95 % identified", "95 % drawn", "unit", ""]
+
+
+def disturbance_rows(episodes: Episodes) -> dict[str, str]:
+    """Return how often joints are pushed, and how differences grow, in words; empty where they do not."""
+    told = {"pushes": f"{episodes.push_hz:g} a second for each joint"} if episodes.push_hz else {}
+    if episodes.curriculum != (1.0, 1.0):
+        first, last = episodes.curriculum
+        told["curriculum"] = f"{first:g} of these differences at the first update, {last:g} at the last one"
+    return told
 
 
 def noise_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:

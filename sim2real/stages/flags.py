@@ -55,6 +55,14 @@ class RunFlags(DemoFlags):
     train: TrainConfig = field(default_factory=TrainConfig)
     deploy: DeployConfig = field(default_factory=DeployConfig)
 
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        if self.train.hosts.several:
+            raise UsageError(
+                "only training is divided among processes: each of them would record and deploy",
+                hint="record and identify in one, then `sim2real train PIPELINE --hosts...` in all",
+            )
+
 
 @dataclass(frozen=True)
 class TargetFlags:

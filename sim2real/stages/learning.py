@@ -9,6 +9,7 @@ from tyro.conf import UseAppendAction
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
+from sim2real.train.hosts import HostsConfig
 from sim2real.train.sweep import Sweep
 
 
@@ -28,6 +29,8 @@ class LearningConfig:
     """Write all of the training into a file after each evaluation, to go on from with --resume."""
     tensorboard: bool = False
     """Write the curves for TensorBoard while training goes on, into the stage's folder 'tensorboard'."""
+    hosts: HostsConfig = field(default_factory=HostsConfig)
+    """Several processes, on this host or others, that make one training."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learning algorithm."""
 

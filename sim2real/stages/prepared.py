@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from sim2real.artifacts.episodes import Episodes, Varied
@@ -19,14 +20,17 @@ from sim2real.policy.contract import PolicyContract
 from sim2real.robots.base import Robot
 from sim2real.robots.devices import SimSensor
 from sim2real.robots.loop import DELAYS
+from sim2real.robots.training import LoopTask
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.console import note
+from sim2real.stages.disturbed import with_disturbances
 from sim2real.stages.parameters import check_parameters
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.train_config import TrainConfig
 from sim2real.train.draws import draw_robots
 from sim2real.train.env import GraphEnvironment, TrainingTask
+from sim2real.train.pushes import Pushes
 from sim2real.train.timelines import Drawn, Recorded, draw_timelines
 
 _SHOWN = 5000
@@ -98,8 +102,34 @@ def prepare(
     noise = _disturb(nodes[robot.roles.sensor], found, config)
     drawn = draw_timelines(nodes, robot.roles.supervisor, config.episode_s, config.timelines, config.seed, recorded)
     graph = CompiledGraph(nodes, robot.roles.supervisor, drawn.timeline)
-    env = GraphEnvironment(graph, task, drawn.steps)
-    return Prepared(robot, values, env, _episodes(found, values, draws, noise, drawn, timing, config))
+    _move_start(task, config)
+    pushes = Pushes.of(config.vary, nodes[robot.roles.world], robot.rate_hz)
+    env = GraphEnvironment(graph, task, drawn.steps, pushes, config.vary.curriculum if config.vary.grows else None)
+    episodes = _episodes(found, values, draws, noise, drawn, timing, config)
+    episodes = with_disturbances(episodes, config.vary, task, pushes, config.seed)
+    if config.vary.grows and not (episodes.parameters or noise):
+        raise UsageError(
+            "vary.curriculum lets episodes differ more and more, and nothing differs between them",
+            hint="add --vary.uniform 0.3, --vary.push 1, --vary.start-position 0.2, or train on the identified model",
+        )
+    return Prepared(robot, values, env, episodes)
+
+
+def _move_start(task: TrainingTask, config: TrainConfig) -> None:
+    """Let episodes start where the configuration says.
+
+    Raises:
+        UsageError: The task, or its world, does not know how.
+    """
+    start = (config.vary.start_position, config.vary.start_velocity)
+    if not any(start):
+        return
+    if not isinstance(task, LoopTask):
+        raise UsageError(
+            f"the start of a {type(task).__name__} cannot be moved", hint="leave out --vary.start-*, or use a LoopRobot"
+        )
+    task.start = start
+    jax.eval_shape(task.params, jax.random.key(0))
 
 
 def timing_of(found: Identification) -> Timing:

@@ -17,8 +17,10 @@ from sim2real.stages.targets import find_run
 
 CHECKPOINT = "checkpoint.safetensors"
 NEWEST = "newest"
-_MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard", "checkpoint")
-"""Settings that do not change how training goes; which parameters they are is told by their digest."""
+_HOSTS = ("hosts.found", "hosts.coordinator", "hosts.processes", "hosts.process", "hosts.timeout_s")
+_MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard", "checkpoint", *_HOSTS)
+"""Settings that do not change how training goes; which parameters they are is told by their digest, and how many
+devices share it by the program."""
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:

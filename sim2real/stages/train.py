@@ -23,7 +23,7 @@ from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.distilling import as_taught, find_teacher, teacher_of
 from sim2real.stages.events import event_files
-from sim2real.stages.explaining import explain
+from sim2real.stages.explaining import disturbance_rows, explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
@@ -35,6 +35,7 @@ from sim2real.train.networks import Policy
 from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
+from sim2real.train.processes import in_words, join, leads, wait_for_all
 from sim2real.train.sweep import Sweep, named
 
 
@@ -75,7 +76,7 @@ def train(
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
     own = contract_of(made.robot, made.env.task, made.values)
     master = None if teacher is None else teacher_of(teacher, own)
-    with progress(ppo.evaluations, "train (compiling)") as bar:
+    with progress(ppo.evaluations, "train (compiling)", leads()) as bar, in_words():
         key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
         result = patiently(
             lambda: learn(
@@ -83,7 +84,7 @@ def train(
             )
         )
     weak = None
-    if config.sensitivity:
+    if config.sensitivity and leads():
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
     policy = result.best
     bundle = Bundle(
@@ -107,6 +108,7 @@ def train(
         "train": f"{result.train_s:.1f} s",
         "episodes that end at a pause": f"{made.episodes.cut} of {made.episodes.timelines}",
         "timelines drawn again": made.episodes.again,
+        **disturbance_rows(made.episodes),
     }
     return bundle, about if weak is None else {**about, "what breaks it": weak.said}
 
@@ -130,15 +132,21 @@ def _sensitivity(
     return sensitivity(wide, env, policy, moves, models, config.seed)
 
 
-def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder:
-    """Train, and write the policy bundle into a stage folder.
+def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | None) -> StageFolder | None:
+    """Train, and write the policy bundle into a stage folder; of several processes the first one writes.
 
     Args:
         pipeline: The robot.
         config: The stage's configuration.
         root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
+
+    Returns:
+        The stage; None in a process that writes nothing.
     """
+    if config.hosts.several:
+        note(str(config.hosts))
+    join(config.hosts)  # before anything is computed
     moving_robot(pipeline)  # before anything is read
     interrupted = find_interrupted(pipeline.name, config, root)
     run_dir = run_dir if interrupted is None else interrupted.run_dir
@@ -157,8 +165,13 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         teacher, inputs["teacher"] = find_teacher(pipeline.name, config.distil, root)
     if config.explain:
         return explain(pipeline, config, identification, inputs, root, run_dir)
+    resume = None if interrupted is None else interrupted.folder / CHECKPOINT
+    with in_words():
+        wait_for_all("all have read what they need")  # what the first one writes now is not taken for that
+    if not leads():
+        train(pipeline, config, identification, checkpoint=Path(CHECKPOINT), resume=resume)
+        return None
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
-        resume = None if interrupted is None else interrupted.folder / CHECKPOINT
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
             kept = checkpoint if config.checkpoint else None
             bundle, about = train(pipeline, config, identification, None, kept, resume, watch, teacher)
@@ -191,7 +204,8 @@ def _report(bar: Any, p: Progress, watch: Callable[[Progress], None] | None) -> 
         watch(p)
     bar.set_description_str("train")
     bar.update(1)
-    bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}")
+    width = f", {p.values['width'].max():.2f} of the differences" if "width" in p.values else ""
+    bar.set_postfix_str(f"return {p.values['return'].max():.0f}, success {p.values['success'].max():.2f}{width}")
 
 
 def _terms(history: History) -> tuple[list[list[Any]], list[str]] | None:

@@ -45,6 +45,8 @@ class TrainConfig(LearningConfig):
             raise UsageError(
                 f"training needs at least one timeline of 0.5 to 600 s, got {self.timelines} of {self.episode_s} s"
             )
+        if self.explain and self.hosts.several:
+            raise UsageError("explain trains nothing: it takes one process", hint="leave out --hosts")
         if not 0.0 <= self.randomise <= 10.0:
             raise UsageError(f"randomise must lie in [0, 10], got {self.randomise}")
 

@@ -79,6 +79,10 @@ class TrainingIdentity:
         plain = json.loads(json.dumps(settings))  # as a file has them: lists for tuples
         return TrainingIdentity(plain, np.asarray(jax.random.key_data(key)).tolist(), digest)
 
+    def said(self) -> dict[str, Any]:
+        """Return what it consists of, settings one by one."""
+        return {**self.config, "key": self.key, "program": self.program[:12]}
+
     def refuse_another(self, saved: Mapping[str, Any], path: Path) -> None:
         """Compare with what a file says of its training.
 

@@ -1,53 +1,83 @@
-"""Training over several devices of a host: seeds and copies are divided among them, in one program."""
+"""Training over several devices, of one host or of several: seeds and copies are divided, in one program."""
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec
 
-from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
+from sim2real.train.mesh import COPIES, SEEDS, mesh_of
 
 if TYPE_CHECKING:
     from sim2real.train.update import TrainState
 
-_SEEDS, _COPIES = "seeds", "copies"
+
+T = TypeVar("T")
 
 
-def placements(state: TrainState, config: PPOConfig) -> Any:
-    """Return where each array of a training's state goes: a sharding for each; None for one device.
+class Shardings(NamedTuple):
+    """Where the arrays of a training lie.
+
+    Attributes:
+        state: A sharding for each array of its state.
+        whole: The sharding of what all devices have.
+    """
+
+    state: Any
+    whole: NamedSharding
+
+
+def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
+    """Return where each array of a training's state goes; None for one device.
 
     Seeds are divided first, as they have nothing to tell each other; the devices of a seed divide its copies. The
     compiler sees to it that they exchange what an update needs. Random numbers do not depend on it.
 
     Args:
         state: The state, with a leading seed axis; the environments' part has the copies as its second axis.
-        config: Numbers of devices, seeds and copies.
+        config: Numbers of devices in each process, seeds and copies.
 
     Raises:
         UsageError: When there are not as many devices, or they cannot divide seeds and copies.
     """
-    if config.devices == 1:
+    if (mesh := mesh_of(config)) is None:
         return None
-    there = jax.local_devices()
-    if config.devices > len(there):
-        raise UsageError(
-            f"devices={config.devices}, but JAX finds {len(there)} on this host: {there[0].device_kind}",
-            hint="on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=8 makes 8 of it, for tests",
-        )
-    by_seed = math.gcd(config.num_seeds, config.devices)
-    by_copy = config.devices // by_seed
-    if config.num_envs % by_copy:
-        raise UsageError(
-            f"{config.devices} devices cannot divide {config.num_seeds} seeds of {config.num_envs} copies: "
-            f"{by_copy} devices a seed do not divide its copies",
-            hint=f"make num_envs a multiple of {by_copy}",
-        )
-    mesh = Mesh(np.array(there[: config.devices]).reshape(by_seed, by_copy), (_SEEDS, _COPIES))
-    whole = NamedSharding(mesh, PartitionSpec(_SEEDS))
-    split = NamedSharding(mesh, PartitionSpec(_SEEDS, _COPIES))
-    return jax.tree.map(lambda _: whole, state)._replace(copies=jax.tree.map(lambda _: split, state.copies))
+    by_seed = NamedSharding(mesh, PartitionSpec(SEEDS))
+    split = NamedSharding(mesh, PartitionSpec(SEEDS, COPIES))
+    shardings = jax.tree.map(lambda _: by_seed, state)._replace(copies=jax.tree.map(lambda _: split, state.copies))
+    return Shardings(shardings, NamedSharding(mesh, PartitionSpec()))
+
+
+def place(state: T, layout: Shardings | None) -> T:
+    """Return a state on its devices; each process, which has all of it, puts its own part.
+
+    Args:
+        state: The state, in this process's memory.
+        layout: Where its arrays go; None: where they are.
+    """
+    if layout is None:
+        return state
+
+    def put(leaf: Any, where: NamedSharding) -> jax.Array:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(leaf), where), impl=jax.random.key_impl(leaf))
+        array = np.asarray(leaf)
+        return jax.make_array_from_callback(array.shape, where, lambda index: array[index])
+
+    return jax.tree.map(put, state, layout.state)
+
+
+def gather(state: T, layout: Shardings | None) -> T:
+    """Return a state that this process can read, also where other processes have a part; all of them call this.
+
+    Args:
+        state: The state.
+        layout: Where its arrays are; None: here.
+    """
+    if layout is None or jax.process_count() == 1:
+        return state
+    return jax.jit(lambda state: state, out_shardings=layout.whole)(state)

@@ -12,7 +12,17 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
-from sim2real.train.tasks import REWARD, EndingTask, PrivilegedTask, Rewards, checked_end, terms_of, total_of
+from sim2real.train.pushes import Pushes
+from sim2real.train.tasks import (
+    REWARD,
+    EndingTask,
+    PrivilegedTask,
+    Rewards,
+    WideningTask,
+    checked_end,
+    terms_of,
+    total_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,6 +80,7 @@ class EnvState(NamedTuple):
         total: Sum of the rewards so far.
         terms: The same of each term of the reward that has a name.
         good: Number of rows in the second half of the episode in which the task was fulfilled.
+        width: Share of all differences between episodes that this one has; None: all.
     """
 
     graph: GraphState
@@ -77,6 +88,7 @@ class EnvState(NamedTuple):
     total: jax.Array
     terms: dict[str, jax.Array]
     good: jax.Array
+    width: jax.Array | None = None
 
 
 class GraphEnvironment:
@@ -90,13 +102,29 @@ class GraphEnvironment:
         graph: The compiled graph, with the task's supervisor.
         task: The pipeline's task.
         steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
+        pushes: What hits the robot; None: nothing.
+        curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
+            ``reset`` has the last.
 
     Raises:
-        UsageError: When the supervisor makes several steps in one row of the timelines.
+        UsageError: When the supervisor makes several steps in one row of the timelines, or the task knows no shares.
     """
 
-    def __init__(self, graph: CompiledGraph, task: TrainingTask, steps: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        graph: CompiledGraph,
+        task: TrainingTask,
+        steps: np.ndarray | None = None,
+        pushes: Pushes | None = None,
+        curriculum: tuple[float, float] | None = None,
+    ) -> None:
         self.graph, self.task = graph, task
+        self.pushes, self.curriculum = pushes, curriculum
+        if curriculum is not None and not isinstance(task, WideningTask):
+            raise UsageError(
+                f"episodes of a {type(task).__name__} cannot differ by a share: it has no `params_at`",
+                hint="give the task a method params_at(key, width), or leave out --vary.curriculum",
+            )
         self.observation_size = task.observation_size
         self.action_low, self.action_high = task.action_low, task.action_high
         # One row less than the tables have, as the observation after an episode's last row is looked up in them too.
@@ -106,7 +134,7 @@ class GraphEnvironment:
         counts = graph.timeline.vertices[graph.supervisor].count if steps is None else steps
         self._last = jnp.asarray(graph.last_row(np.asarray(counts)), jnp.int32)
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
-        self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
+        self._start, self.step = jax.jit(self._reset), jax.jit(self._step)
         # Worlds of composed tasks have a method `ends`. Looked up by name: importing their class would import MuJoCo.
         found: dict[str, Callable[[Any], tuple[jax.Array, jax.Array]] | None] = {
             name: getattr(node, "ends", None) for name, node in graph.nodes.items()
@@ -127,19 +155,31 @@ class GraphEnvironment:
             )
         return self.task.privileged(state.graph)
 
-    def _reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
-        """Start an episode on a random timeline."""
+    def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
+        """Start an episode on a random timeline; with a curriculum, one with as many differences as at its end."""
+        return self._start(key, None if self.curriculum is None else jnp.float32(self.curriculum[1]))
+
+    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[EnvState, jax.Array]:
+        """Start an episode that differs from others by a share, shape ``()``, of what it might."""
+        return self._start(key, width)
+
+    def _reset(self, key: jax.Array, width: jax.Array | None) -> tuple[EnvState, jax.Array]:
         k_eps, k_params, k_init = jax.random.split(key, 3)
         eps = jax.random.randint(k_eps, (), 0, self.graph.episodes)
-        gs = self.graph.init(k_init, params=self.task.params(k_params), eps=eps)
+        task = self.task
+        if width is not None and isinstance(task, WideningTask):
+            params = task.params_at(k_params, width)
+        else:
+            params = task.params(k_params)
+        gs = self.graph.init(k_init, params=params, eps=eps)
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         terms = terms_of(jax.eval_shape(self.task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
-        state = EnvState(gs, step_state, jnp.float32(0.0), {n: jnp.float32(0.0) for n in terms}, jnp.float32(0.0))
+        zero = jnp.float32(0.0)
+        state = EnvState(gs, step_state, zero, {n: zero for n in terms}, zero, width)
         return state, self.task.observe(step_state)
 
     def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
         """Make the supervisor's step with the policy's action, then run the graph up to its next step."""
-        del key
         valid: Any = state.step_state.seq >= 0
         step_state, output = self.task.act(state.step_state, action)
         gs = self.graph.advance(state.graph, step_state, output, inside=True)
@@ -154,8 +194,10 @@ class GraphEnvironment:
         fallen = [] if self._terminated is None else [checked_end(self._terminated(gs), self.task)]
         terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in ended], bool))
+        if self.pushes is not None:
+            gs = self.pushes.apply(gs, key, state.width)
         gs, step_state, _ = self.graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (last - last // 2)}
         metrics |= {f"{REWARD}{name}": term for name, term in terms.items()}
-        new = EnvState(gs, step_state, total, terms, good)
+        new = EnvState(gs, step_state, total, terms, good, state.width)
         return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)

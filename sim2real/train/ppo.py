@@ -23,9 +23,10 @@ from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpo
 from sim2real.train.checks import FINITE, check_values
 from sim2real.train.compilation import compile_lowered, small_random_numbers
 from sim2real.train.config import PPOConfig as PPOConfig
-from sim2real.train.devices import placements
+from sim2real.train.devices import Shardings, gather, place, shardings_of
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment, check_environment, metric_names
+from sim2real.train.processes import agree, leads
+from sim2real.train.protocol import TrainingEnvironment, check_environment, get_width, metric_names
 from sim2real.train.result import Progress as Progress
 from sim2real.train.result import TrainResult as TrainResult
 from sim2real.train.result import best_of, history_of
@@ -58,7 +59,8 @@ def train(
         key: Source of all randomness, from ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
         on_progress: Called after every evaluation, those before a resumption too; an exception that it raises ends the
             training.
-        checkpoint: File that holds all of the training after each evaluation; None: none is written.
+        checkpoint: File that holds all of the training after each evaluation; None: none is written. Of several
+            processes all have to name one, and the first writes it.
         resume: Such a file to go on from. The result is that of a training that was never interrupted, bit for bit on
             one machine.
         sweep: Settings to try side by side; None: those of ``config``.
@@ -81,16 +83,19 @@ def train(
     sweep = sweep or Sweep({})
     networks = make_networks(env, config, actor, critic, teacher)
     state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
-    where = placements(state, config)
-    state = state if where is None else jax.device_put(state, where)
+    layout = shardings_of(state, config)
+    state = place(state, layout)
     one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
+    where = layout and (layout.state, layout.whole, layout.whole)
     with small_random_numbers():
-        lowered = jax.jit(one, donate_argnums=0, out_shardings=where and (where, None, None)).lower(state, numbers)
+        lowered = jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
-    identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume else None
+    identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume or layout else None
+    if identity:
+        agree({**identity.said(), "saves": checkpoint is not None, "resumes": resume is not None})
     if resume and identity:
         now = load_checkpoint(resume, identity, now.state, lowered.out_info[1])
-        now = now if where is None else now._replace(state=jax.device_put(now.state, where))
+        now = now._replace(state=place(now.state, layout))
     first, before_s = len(now.log), now.log[-1].elapsed_s if now.log else 0.0
     epoch = partial(
         _advance, compile_lowered(lowered), numbers, config, sweep.names(config.num_seeds), before_s - start
@@ -102,10 +107,17 @@ def train(
     while not _is_over(config, now.log):
         now = epoch(now)
         if checkpoint and identity:
-            save_checkpoint(checkpoint, identity, now)
+            _save(checkpoint, identity, now, layout)
         report(now.log[-1])
     members = [point for point in sweep.grid for _ in range(config.num_seeds)]
     return _result(members, now, first, compiled - start, time.perf_counter() - compiled)
+
+
+def _save(path: Path, identity: TrainingIdentity, now: Checkpoint, layout: Shardings | None) -> None:
+    """Write a checkpoint; of several processes all hand over what they have, and the first one writes."""
+    whole = now._replace(state=gather(now.state, layout))
+    if leads():
+        save_checkpoint(path, identity, whole)
 
 
 def _advance(
@@ -206,5 +218,7 @@ def _epoch(
     stats = jax.tree.map(lambda leaf: leaf[:count], stats)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
+    width = get_width(env, config, state.update - 1)
+    values |= {} if width is None else {"width": width}
     policy = make_policy(env, config, networks, state.params, state.normaliser)
     return state, policy, values | figures_of(tested)

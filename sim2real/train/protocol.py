@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
@@ -110,6 +111,48 @@ def sees_more(env: TrainingEnvironment) -> PrivilegedEnvironment:
             hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged and --ppo.teacher",
         )
     return env
+
+
+@runtime_checkable
+class WideningEnvironment(Protocol):
+    """An environment whose episodes may differ more from each other as training goes on."""
+
+    curriculum: tuple[float, float] | None
+    """Share of their differences at the first and at the last update; None: always all."""
+
+    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[Any, jax.Array]:
+        """Return what ``reset`` does, for an episode with a share of the differences, shape ``()``."""
+        ...
+
+
+def get_width(env: TrainingEnvironment, config: PPOConfig, update: jax.Array) -> jax.Array | None:
+    """Return the share of their differences that an update's new episodes have, shape ``()``; None: always all.
+
+    Args:
+        env: The environment.
+        config: Number of updates.
+        update: Shape ``()``: number of updates before.
+    """
+    if not isinstance(env, WideningEnvironment) or env.curriculum is None:
+        return None
+    first, last = env.curriculum
+    return jnp.float32(first) + (last - first) * jnp.clip(update / max(config.updates - 1, 1), 0.0, 1.0)
+
+
+def get_reset(
+    env: TrainingEnvironment, config: PPOConfig, update: jax.Array
+) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
+    """Return what starts the episodes of an update.
+
+    Args:
+        env: The environment.
+        config: Number of updates.
+        update: Shape ``()``: number of updates before.
+    """
+    width = get_width(env, config, update)
+    if width is None or not isinstance(env, WideningEnvironment):
+        return env.reset
+    return lambda key: env.reset_at(key, width)
 
 
 def check_environment(env: TrainingEnvironment) -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import TrainingEnvironment, get_privileged, metric_names
+from sim2real.train.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names
 from sim2real.train.teacher import advice
 
 
@@ -134,14 +134,16 @@ def collect(
         update: Shape ``()``, int32: number of updates so far, in a test of rollouts.
         key: Source of resets, noise and the environment's own randomness.
         teacher: Whose advice is asked for in every row, while the policy acts.
-        testing: Shape ``()``, bool: play without exploration noise, and cut no episode; default: false.
+        testing: Shape ``()``, bool: play without exploration noise, cut no episode, and have all differences between
+            episodes, as at the end of a curriculum; default: false.
 
     Returns:
         The copies after the rollout, and the rows.
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    begun = jax.vmap(env.reset)(jax.random.split(key_reset, count))
+    widened = update if testing is None else jnp.where(testing, config.updates, update)
+    begun = jax.vmap(get_reset(env, config, widened))(jax.random.split(key_reset, count))
     fresh = Copies(*begun, spread(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
@@ -229,7 +231,8 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
         ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the
         fraction of those that ended by themselves. Each of shape ``()``.
     """
-    shapes = jax.eval_shape(jax.vmap(env.reset), jax.random.split(key, config.num_envs))
+    reset = get_reset(env, config, jnp.int32(0))
+    shapes = jax.eval_shape(jax.vmap(reset), jax.random.split(key, config.num_envs))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
     blank = blank._replace(carry=spread(policy.initial_carry(), config.num_envs))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -67,4 +67,13 @@ class PrivilegedTask(Protocol):
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
         """Return what is true in the graph's state, shape ``(P,)``, in any units."""
+        ...
+
+
+@runtime_checkable
+class WideningTask(Protocol):
+    """A task whose episodes may differ from each other by a share of what they might."""
+
+    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+        """Draw the parameters of the nodes for an episode with a share of the differences; None: all of them."""
         ...

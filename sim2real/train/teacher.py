@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.train.architectures import is_recurrent
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
-from sim2real.train.protocol import Step, TrainingEnvironment, sees_more
+from sim2real.train.protocol import Step, TrainingEnvironment, WideningEnvironment, sees_more
 
 
 class TeacherEnvironment:
@@ -30,10 +30,18 @@ class TeacherEnvironment:
         self.privileged_size = size_of(env)
         self.observation_size = env.observation_size + self.privileged_size
         self.action_low, self.action_high = env.action_low, env.action_high
+        self.curriculum = env.curriculum if isinstance(env, WideningEnvironment) else None
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state, observation = self._env.reset(key)
+        return state, self._seen(state, observation)
+
+    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[Any, jax.Array]:
+        """Start an episode that differs from others by a share, shape ``()``, of what it might."""
+        if not isinstance(self._env, WideningEnvironment):
+            return self.reset(key)
+        state, observation = self._env.reset_at(key, width)
         return state, self._seen(state, observation)
 
     def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:

@@ -13,6 +13,7 @@ import optax
 from sim2real.policy.network import NetworkSpec
 from sim2real.train.config import PPOConfig
 from sim2real.train.losses import Batch, gae, loss
+from sim2real.train.mesh import spread
 from sim2real.train.networks import Policy, log_prob
 from sim2real.train.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
 from sim2real.train.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
@@ -165,9 +166,8 @@ def update(
     copies = copies._replace(critic_carry=critic_carry)
     optimiser = make_optimiser(config)
 
-    def minibatch(carry: _Learnt, index: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
+    def minibatch(carry: _Learnt, part: Batch) -> tuple[_Learnt, dict[str, jax.Array]]:
         params, optimiser_state = carry
-        part = jax.tree.map(lambda leaf: leaf[index], batch)
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config, networks)
         if config.schedule == "adaptive":
             rate = adapt_rate(get_rate(optimiser_state), parts["kl"], config.target_kl)
@@ -175,11 +175,15 @@ def update(
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
+    def epoch(carry: _Learnt, shuffle: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
+        # Shuffled once, not in each minibatch: devices exchange copies here alone, then gradients.
+        index = shuffle.reshape(config.minibatches, -1)
+        return jax.lax.scan(minibatch, carry, spread(jax.tree.map(lambda leaf: leaf[index], batch), config))
+
     shuffles = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
         jax.random.split(keys(state)[1], config.epochs)
     )
-    index = shuffles.reshape(config.epochs * config.minibatches, -1)
-    (params, optimiser_state), parts = jax.lax.scan(minibatch, (state.params, state.optimiser), index)
+    (params, optimiser_state), parts = jax.lax.scan(epoch, (state.params, state.optimiser), shuffles)
     stats = jax.tree.map(jnp.mean, parts) | {
         "reward": jnp.mean(rows.reward) / config.reward_scale,
         "value": jnp.sum(batch.weight * batch.value) / jnp.maximum(batch.weight.sum(), 1.0) / config.reward_scale,

@@ -37,7 +37,8 @@ def picture(path: Path, episodes: Episodes) -> None:
 def _figure(episodes: Episodes) -> Any:
     nodes = [n for n in episodes.recorded_s if n in episodes.drawn_s]
     noise = [n for n in episodes.noise if n.column in episodes.off]
-    count = max(1, len(episodes.parameters) + len(nodes) + len(noise))
+    grows = episodes.curriculum != (1.0, 1.0)
+    count = max(1, len(episodes.parameters) + len(nodes) + len(noise) + grows)
     rows = math.ceil(count / _COLUMNS)
     figure = new_figure(0.3 + _ROW_IN * rows)
     axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
@@ -51,6 +52,8 @@ def _figure(episodes: Episodes) -> Any:
         _times(next(used), node, 1e3 * episodes.recorded_s[node], 1e3 * episodes.drawn_s[node])
     for one in noise:
         _noise(next(used), one, episodes.off[one.column])
+    if grows:
+        _curriculum(next(used), episodes.curriculum)
     for ax in used:
         ax.set_axis_off()
     return figure
@@ -64,7 +67,16 @@ def _parameter(ax: Any, parameter: Varied, drawn: np.ndarray) -> None:
         ax.axvspan(scale * parameter.low95, scale * parameter.high95, color=ORANGE, alpha=0.35, lw=0)
     ax.axvline(scale * parameter.value, color=INK, lw=1.0)
     ax.set_title(f"{parameter.name} [{unit or '1'}]", fontsize="small")
-    ax.set_xlabel("drawn; band: 95 % identified", fontsize="x-small")
+    ax.set_xlabel("drawn" if parameter.low95 is None else "drawn; band: 95 % identified", fontsize="x-small")
+
+
+def _curriculum(ax: Any, shares: tuple[float, float]) -> None:
+    """Draw which share of all differences episodes have, from the first to the last update."""
+    ax.plot([0.0, 1.0], shares, color=BLUE)
+    ax.set_ylim(-0.05, 1.05)
+    ax.set_yticks([0.0, 1.0])
+    ax.set_title("share of all differences", fontsize="small")
+    ax.set_xlabel("share of the training; the others: at its end", fontsize="x-small")
 
 
 def _times(ax: Any, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:

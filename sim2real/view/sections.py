@@ -108,6 +108,13 @@ def _drawn_blocks(artifact: StageFolder) -> list[Block]:
             f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that training cannot "
             f"hold; {drawn.again} were drawn again, as it came in their first half."
         )
+    if drawn.push_hz:
+        caption += f" Each joint is pushed {drawn.push_hz:g} times a second, at random times."
+    if drawn.curriculum != (1.0, 1.0):
+        first, last = drawn.curriculum
+        caption += (
+            f" The share of all differences grows from {first:g} to {last:g} over the training; drawn: the latter."
+        )
     return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
 
 

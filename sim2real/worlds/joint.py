@@ -73,6 +73,14 @@ class JointWorld(SteppedWorld):
         half = len(start) // 2
         return JointState(start[0], start[1]) if half == 1 else JointState(start[:half], start[half:])
 
+    def velocity(self, state: JointState) -> Any:
+        """Return the joints' velocities, ``()`` or ``(joints,)`` [rad/s]."""
+        return state.velocity
+
+    def with_velocity(self, state: JointState, velocity: jax.Array) -> JointState:
+        """Return the state with other velocities [rad/s]."""
+        return state.replace(velocity=velocity)
+
     @abstractmethod
     def forces(self, params: Any, position: Value, velocity: Value, command: Any) -> Forces:
         """Return the forces on the joints.

@@ -147,6 +147,14 @@ class MjxWorld(BaseWorld):
         data = once(data)[0] if self.substeps == 1 else jax.lax.scan(once, data, length=self.substeps)[0]
         return step_state.replace(state=data), MjxState(data.qpos, data.qvel)
 
+    def velocity(self, state: Any) -> jax.Array:
+        """Return the velocities ``(nv,)`` [rad/s or m/s]."""
+        return state.qvel
+
+    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+        """Return the data with other velocities ``(nv,)`` [rad/s or m/s]."""
+        return state.replace(qvel=velocity)
+
     def law_values(self, params: Any) -> dict[str, jax.Array]:
         """Return the numbers that ``law`` needs; they may differ from copy to copy."""
         del params

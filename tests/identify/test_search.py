@@ -1,6 +1,10 @@
 """The search: finds what there is to find with every strategy, and says when there is nothing."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +13,7 @@ import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.config import FitConfig
+from sim2real.identify.engine import Choice, check_devices
 from sim2real.identify.search import search, strategies
 
 BOTTOM = np.array([1.0, -2.0])
@@ -166,3 +171,42 @@ def test_a_batch_of_all_segments_is_none():
 
     search(losses, np.zeros(2), FitConfig(strategy="SNES", population=8, generations=2, batch=3), np.arange(3))
     assert set(picked) == {None}
+
+
+DIVIDED = """
+from dataclasses import replace
+import numpy as np
+from test_search import CONFIG, bowl
+from sim2real.identify.search import search
+
+config, programs, found = replace(CONFIG, generations=40, restarts=2), {}, []
+for devices in (1, 2):
+    programs = {}
+    found.append(search(bowl, np.zeros(2), replace(config, devices=devices), programs=programs))
+    texts = [p.advance.as_text() for kind, p in programs.items() if kind != "alone" and p.population == 16]
+    assert [("num_partitions=2" in t, "f32[8,2]" in t) for t in texts] == [(devices == 2,) * 2], texts[0][:300]
+np.testing.assert_allclose(found[1].history, found[0].history, rtol=1e-3)
+np.testing.assert_allclose(found[1].finalists, found[0].finalists, atol=1e-3)
+assert found[1].evaluations == found[0].evaluations
+"""
+
+
+@pytest.mark.slow
+def test_two_devices_find_what_one_finds_and_each_simulates_half():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, "-c", DIVIDED], capture_output=True, text=True, timeout=300, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_devices_that_cannot_divide_the_candidates_are_refused():
+    with pytest.raises(UsageError, match="divide the population of 16, got 3"):
+        replace(CONFIG, devices=3)
+    for engine, said in ((Choice("c", "asked for"), "C MuJoCo simulates on"), (Choice("compiled", ""), "JAX finds 1 ")):
+        with pytest.raises(UsageError, match=f"devices=64, but {said}"):
+            check_devices(64, engine)
+    check_devices(1, Choice("c", "asked for"))

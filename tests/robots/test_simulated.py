@@ -1,5 +1,6 @@
 """The nodes of a servo robot in simulation."""
 
+import copy
 import dataclasses
 
 import jax
@@ -116,6 +117,22 @@ def test_a_bias_stays_for_an_episode(noisy):
     first, later = (np.asarray(jax.vmap(read, (0, None))(keys, k).position[:, 0]) for k in (3, 90))
     assert (first - 1.0).std() == pytest.approx(0.3, rel=0.15)
     assert np.corrcoef(first, later)[0, 1] > 0.95
+
+
+def test_a_share_of_the_noise_is_that_share_of_its_errors(noisy):
+    sensor, _ = noisy
+    sensor = copy.copy(sensor)
+    sensor.noise = tuple(dataclasses.replace(n, quantum=0.0) for n in sensor.noise)
+    still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
+
+    def off(share):
+        params = DelayParams(noise=share)
+        own = sensor.init_state(jax.random.key(7), GraphState(params={"sensor": params}))
+        message = sensor.step(StepState(jax.random.key(1), own, params, still, 0, 3, 0.0))[1]
+        return np.array([message.position[0] - 1.0, message.velocity[1] - 4.0])
+
+    assert np.abs(off(None)).min() > 1e-3
+    np.testing.assert_allclose(off(0.5), 0.5 * off(None), atol=1e-6)
 
 
 def test_noise_needs_random_numbers_and_without_it_readings_are_exact(noisy, pair):

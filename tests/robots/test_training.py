@@ -37,11 +37,14 @@ def trained(pair):
             return made.state, {**kept, "joints": world.data.qpos, "of_task": world.reward}
 
         first, seen = env.reset(key)
-        return first.graph.params, (seen, env.privileged(first)), jax.lax.scan(step, first, length=env.length)[1]
+        last, rows = jax.lax.scan(step, first, length=env.length)
+        world, state = nodes["world"], last.graph.state["world"]
+        blow = world.velocity(state), world.velocity(world.with_velocity(state, SPEEDS)), state.data.qvel
+        return first.graph.params, (seen, env.privileged(first)), rows, blow
 
-    params, (first, true), rows = jax.jit(run)(jax.random.key(5))
+    params, (first, true), rows, blow = jax.jit(run)(jax.random.key(5))
     return SimpleNamespace(
-        nodes=nodes, task=task, params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows)
+        nodes=nodes, task=task, params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows), blow=blow
     )
 
 
@@ -50,6 +53,21 @@ def drawn(trained):
     """The parameters of many episodes."""
     keys = jax.random.split(jax.random.key(0), 400)
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(trained.task.params))(keys))
+
+
+def test_a_push_gives_the_joints_other_velocities(trained):
+    before, after, moving = trained.blow
+    np.testing.assert_array_equal(before, moving)
+    np.testing.assert_array_equal(after, SPEEDS)
+
+
+def test_a_start_is_moved_with_its_goals_and_within_the_joints_limits(pair, drawn):
+    one = jax.tree.map(lambda leaf: leaf[0], drawn)
+    moved = pair.displaced(one, jnp.array([0.1, 100.0]), SPEEDS)
+    expected = [one["world"].qpos[0] + 0.1, pair.servos.high[1]]
+    np.testing.assert_allclose(moved["world"].qpos, np.minimum(expected, pair.servos.high), rtol=1e-6)
+    np.testing.assert_array_equal(moved["agent"].start, moved["world"].qpos)
+    np.testing.assert_allclose(moved["world"].qvel, one["world"].qvel + SPEEDS)
 
 
 def test_half_of_the_episodes_start_from_rest_and_half_from_anywhere(pair, drawn):

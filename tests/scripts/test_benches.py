@@ -85,6 +85,11 @@ def test_train(run):
     assert report["machine"]["devices"]
 
 
+def test_scaling(run):
+    name = f"scaling/{jax.default_backend()}/pendulum/1_devices"
+    assert {f"{name}/env_steps_per_s", f"{name}/compile_s"} <= names(run("scaling"))
+
+
 def test_randomise(run):
     report = run("randomise", "--ways", "all")
     found = {row["name"]: row["value"] for row in report["rows"]}

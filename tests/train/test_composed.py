@@ -80,7 +80,7 @@ def test_a_composed_task_ends_the_episode_of_its_graph(ends):
         success=lambda gs: jnp.bool_(False),
     )
     env = GraphEnvironment(graph, task, np.array([9]))
-    before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0)
+    before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0, width=None)
     step = env._step(before, jnp.zeros(1), jax.random.key(0))
     assert (bool(step.terminated), bool(step.truncated)) == ends
 

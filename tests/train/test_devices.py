@@ -12,10 +12,10 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
-from sim2real.train.devices import placements
+from sim2real.train.mesh import mesh_of
 
 SCRIPT = """
-import dataclasses, json
+import dataclasses, json, re
 import jax
 import numpy as np
 from environments import Bandit
@@ -30,12 +30,24 @@ for devices in (1, 8):
     result = train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3))
     leaves = jax.tree.leaves(jax.device_get(result.policies))
     found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
+
+from sim2real.train.devices import place, shardings_of
+from sim2real.train.ppo import _epoch
+from sim2real.train.start import make_networks, make_start
+
+config = dataclasses.replace(config, num_seeds=1, num_envs=48, rollout_steps=5, hidden=(7,), devices=2)
+networks = make_networks(Bandit(), config)
+state = make_start(Bandit(), [config], jax.random.key(0), networks)
+program = jax.jit(jax.vmap(lambda state: _epoch(Bandit(), config, networks, state)))
+text = program.lower(place(state, shardings_of(state, config))).compile().as_text()
+found["rows"] = sorted(map(int, set(re.findall(r"= f32\\[(\\d+),7\\]\\S* dot\\(", text))))
 print(json.dumps(found))
 """
 
 
-@pytest.mark.slow
-def test_eight_devices_learn_what_one_learns():
+@pytest.fixture(scope="module")
+def found():
+    """What one device learns, and eight; and of how many rows each of two computes networks."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
     here = Path(__file__).parent
     path = os.pathsep.join([str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
@@ -44,18 +56,29 @@ def test_eight_devices_learn_what_one_learns():
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=300, env=environment, check=False
     )
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_eight_devices_learn_what_one_learns(found):
     assert len(found["1"]) > 10
     for one, eight in zip(found["1"], found["8"], strict=True):
         np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
+def test_each_device_computes_its_part_of_a_minibatch(found):
+    whole = 48 // 4 * 5
+    assert whole // 2 in found["rows"]
+    assert whole not in found["rows"]
+
+
 def test_devices_that_are_not_there_are_refused():
     with pytest.raises(UsageError, match="devices=64, but JAX finds 1 on this host"):
-        placements(SimpleNamespace(), PPOConfig(devices=64))
+        mesh_of(PPOConfig(devices=64))
 
 
 def test_copies_that_cannot_be_divided_are_refused(monkeypatch):
     monkeypatch.setattr("jax.local_devices", lambda: [SimpleNamespace(device_kind="cpu")] * 8)
     with pytest.raises(UsageError, match="8 devices cannot divide 2 seeds of 6 copies: 4 devices a seed"):
-        placements(SimpleNamespace(), PPOConfig(devices=8, num_seeds=2, num_envs=6, minibatches=2))
+        mesh_of(PPOConfig(devices=8, num_seeds=2, num_envs=6, minibatches=2))

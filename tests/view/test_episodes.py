@@ -1,6 +1,7 @@
 """The picture of what episodes are drawn from."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,6 +30,11 @@ def test_every_part_has_a_panel(episodes):
     ET.fromstring(text)
     for title in ("gain [1/s]", "round_trip_delay [ms]", "steps of agent [ms]", "q[0], off the model [rad]"):
         assert title in text
+
+
+def test_a_curriculum_has_a_panel_too(episodes):
+    assert "share of all differences" not in episodes_svg(episodes, "here")
+    assert "share of all differences" in episodes_svg(replace(episodes, curriculum=(0.0, 1.0)), "here")
 
 
 def test_the_picture_is_a_png_also_of_nothing(episodes, tmp_path):

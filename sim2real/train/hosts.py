@@ -1,0 +1,53 @@
+"""Which processes, of one host or of several, make one training together. Imports no JAX, so ``--help`` is instant."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from sim2real.errors import UsageError
+
+
+@dataclass(frozen=True)
+class HostsConfig:
+    """The processes of a training; each divides its part among its own devices."""
+
+    found: bool = False
+    """Join the processes that SLURM, Open MPI or Kubernetes started, as JAX finds them there."""
+    coordinator: str | None = None
+    """Address of process 0 that all others reach, HOST:PORT with a free port, where they are started by hand."""
+    processes: int | None = None
+    """Number of processes that are started by hand."""
+    process: int | None = None
+    """Which of them this is: 0, 1 ...; process 0 writes all files and shows how training goes."""
+    timeout_s: int = 300
+    """How long to wait for a process that has not come, or that no longer answers [s]."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before the others are asked."""
+        by_hand = (self.coordinator, self.processes, self.process)
+        if self.found and by_hand != (None, None, None):
+            raise UsageError("hosts.found takes what it finds: hosts.coordinator, processes and process exclude it")
+        if None in by_hand and by_hand != (None, None, None):
+            raise UsageError(
+                "processes that are started by hand need all of hosts.coordinator, hosts.processes and hosts.process",
+                hint="--hosts.coordinator HOST:PORT --hosts.processes 2 --hosts.process 0, and 1 on the other host",
+            )
+        if self.coordinator is not None and not re.fullmatch(r"\S+:\d{1,5}", self.coordinator):
+            raise UsageError(f"hosts.coordinator must be HOST:PORT, got {self.coordinator!r}")
+        if self.processes is not None and self.process is not None and not 0 <= self.process < self.processes:
+            raise UsageError(f"hosts.process must lie in [0, {self.processes}), got {self.process}")
+        if not 5 <= self.timeout_s <= 86400:
+            raise UsageError(f"hosts.timeout_s must lie in [5, 86400] s, got {self.timeout_s}")
+
+    @property
+    def several(self) -> bool:
+        """Whether there are, or may be, other processes."""
+        return self.found or self.processes is not None
+
+    def __str__(self) -> str:
+        """In words, for the output of each process: what JAX says when it ends one is hard to read."""
+        who = "one of the processes that the launcher started"
+        if self.process is not None:
+            who = f"process {self.process} of {self.processes}, which meet at {self.coordinator}"
+        return f"{who}; when one does not come, or answer, within {self.timeout_s} s, all end"

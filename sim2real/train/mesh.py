@@ -1,0 +1,64 @@
+"""The devices of a training: a row for each group of seeds, in which each has some of their copies."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
+
+SEEDS, COPIES = "seeds", "copies"
+"""Names of the mesh's axes."""
+T = TypeVar("T")
+
+
+def mesh_of(config: PPOConfig) -> Mesh | None:
+    """Return the devices, those of a seed in a row; None for one device.
+
+    Raises:
+        UsageError: When there are not as many devices, or they cannot divide seeds and copies.
+    """
+    there = jax.local_devices()
+    if config.devices > len(there):
+        raise UsageError(
+            f"devices={config.devices}, but JAX finds {len(there)} on this host: {there[0].device_kind}",
+            hint="on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=8 makes 8 of it, for tests",
+        )
+    if (total := config.devices * jax.process_count()) == 1:
+        return None
+    by_seed = math.gcd(config.num_seeds, total)
+    by_copy = total // by_seed
+    if config.num_envs % by_copy:
+        raise UsageError(
+            f"{total} devices cannot divide {config.num_seeds} seeds of {config.num_envs} copies: "
+            f"{by_copy} devices a seed do not divide its copies",
+            hint=f"make num_envs a multiple of {by_copy}",
+        )
+    own = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
+    chosen = [device for devices in own for device in devices[: config.devices]]
+    return Mesh(np.array(chosen).reshape(by_seed, by_copy), (SEEDS, COPIES))
+
+
+def spread(arrays: T, config: PPOConfig) -> T:
+    """Return minibatches of which each device of a seed has a part.
+
+    A minibatch takes copies from all devices. Left alone, the compiler has each device compute all of it.
+
+    Args:
+        arrays: Leaves of shape ``(B, M, ...)``: B minibatches of M copies.
+        config: Numbers of devices and seeds.
+    """
+    mesh = mesh_of(config)
+
+    def constrain(leaf: jax.Array) -> jax.Array:
+        if mesh is None or leaf.shape[1] % mesh.shape[COPIES]:
+            return leaf
+        where = PartitionSpec(None, COPIES, *[PartitionSpec.UNCONSTRAINED] * (leaf.ndim - 2))
+        return jax.lax.with_sharding_constraint(leaf, NamedSharding(mesh, where))
+
+    return jax.tree.map(constrain, arrays)

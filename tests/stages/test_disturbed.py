@@ -1,0 +1,62 @@
+"""Pushes, starts and a curriculum as the command shows them, and what of them is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim2real.errors import UsageError
+from sim2real.stages.explaining import disturbance_rows, parameter_rows
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.prepared import prepare
+from sim2real.train.variation import VariationConfig
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """Prepare a tiny training of the pendulum's nominal model."""
+    pipeline = load_pipeline("pendulum")
+
+    def prepared(**vary):
+        config = replace(pipeline.train, model="nominal", timelines=1, episode_s=0.5, vary=VariationConfig(**vary))
+        return prepare(pipeline, config)
+
+    return prepared
+
+
+@pytest.fixture(scope="module")
+def made(prepared):
+    vary = {"uniform": 0.2, "push": 3.0, "push_hz": 1.5, "start_position": 0.3, "curriculum": (0.1, 0.5)}
+    return prepared(**vary)
+
+
+def test_what_is_shown_is_what_is_drawn_at_the_end_of_the_training(made):
+    rows = {row[0]: row for row in parameter_rows(made.episodes)[0]}
+    assert set(rows) == {"gain", "gravity", "damping", "friction", "start position", "push"}
+    draws = made.episodes.draws
+    for name, value, size in (("gain", made.values["gain"], 0.2), ("start position", 0.0, 0.3), ("push", 0.0, 3.0)):
+        largest = 0.5 * size * (value or 1.0)
+        assert np.abs(draws[name] - value).max() == pytest.approx(largest, rel=0.02)
+    assert rows["push"][4] == "rad/s"
+    told = disturbance_rows(made.episodes)
+    assert told["pushes"] == "1.5 a second for each joint"
+    assert told["curriculum"] == "0.1 of these differences at the first update, 0.5 at the last one"
+
+
+def test_the_environment_has_what_is_shown(made):
+    assert made.env.curriculum == (0.1, 0.5)
+    assert made.env.pushes.size == 3.0
+    assert made.env.task.start == (0.3, 0.0)
+
+
+def test_without_any_of_it_nothing_is_shown_or_done(prepared):
+    plain = prepared()
+    assert disturbance_rows(plain.episodes) == {}
+    assert plain.env.pushes is None
+    assert plain.env.curriculum is None
+    assert plain.episodes.parameters == ()
+
+
+def test_a_curriculum_of_nothing_is_refused(prepared):
+    with pytest.raises(UsageError, match="nothing differs between them"):
+        prepared(curriculum=(0.0, 1.0))

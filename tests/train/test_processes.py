@@ -1,0 +1,177 @@
+"""Two processes that make one training: what one makes, within float error; all of them end in words."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from environments import Bandit
+
+from sim2real.errors import UsageError
+from sim2real.train.config import PPOConfig
+from sim2real.train.hosts import HostsConfig
+from sim2real.train.ppo import train
+from sim2real.train.processes import join, leads
+
+CONFIG = PPOConfig(
+    num_envs=16, minibatches=2, rollout_steps=4, total_steps=256, hidden=(8,), evaluations=2, eval_steps=2,
+    epochs=1,
+)  # fmt: skip
+SCRIPT = """
+import json, os, sys
+from dataclasses import replace
+from pathlib import Path
+from sim2real.train.hosts import HostsConfig
+from sim2real.train.processes import in_words, join, leads
+
+number, folder = int(sys.argv[1]), Path(sys.argv[3])
+join(HostsConfig(coordinator=sys.argv[2], processes=2, process=number, timeout_s=20))
+import jax
+import numpy as np
+from environments import Bandit
+from test_processes import CONFIG
+from sim2real.errors import Sim2RealError
+from sim2real.train.ppo import train
+
+key, own = jax.random.key(3), folder / f"{number}.safetensors"
+
+def stop(progress):
+    if progress.evaluation == 1:
+        raise InterruptedError
+
+def ended(config, report=None):
+    try:
+        with in_words():
+            train(Bandit(), config, key, report)
+    except Sim2RealError as error:
+        return str(error)
+
+try:
+    train(Bandit(), CONFIG, key, stop, checkpoint=own)
+except InterruptedError:
+    pass
+result = train(Bandit(), CONFIG, key, resume=folder / "0.safetensors")
+told = {
+    "leads": leads(),
+    "wrote": own.is_file(),
+    "found": [np.ravel(leaf).tolist() for leaf in [*jax.tree.leaves(jax.device_get(result.policies)),
+                                                   *result.history.values()]],
+    "differ": ended(replace(CONFIG, clip=0.1 + 0.1 * number)),
+}
+def leave(progress):
+    if number == 1:
+        (folder / "1.json").write_text(json.dumps(told))
+        os._exit(3)
+
+told["lost"] = ended(replace(CONFIG, evaluations=64, total_steps=8192), leave)
+(folder / "0.json").write_text(json.dumps(told))
+os._exit(0)  # the other one is gone: there is nobody to say goodbye to
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What each of two processes on this host saw."""
+    folder = tmp_path_factory.mktemp("processes")
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, str(i), address, str(folder)],
+            stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path},
+        )
+        for i in (0, 1)
+    ]  # fmt: skip
+    try:
+        ends = [(p.communicate(timeout=240)[1], p.returncode) for p in both]
+    finally:
+        for process in both:
+            process.kill()
+    assert [code for _, code in ends] == [0, 3], ends
+    return [json.loads((folder / f"{i}.json").read_text()) for i in (0, 1)]
+
+
+@pytest.mark.slow
+def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupted(told):
+    one = train(Bandit(), CONFIG, jax.random.key(3))
+    expected = [*jax.tree.leaves(jax.device_get(one.policies)), *one.history.values()]
+    for process in told:
+        assert len(process["found"]) == len(expected)
+        for found, own in zip(process["found"], expected, strict=True):
+            np.testing.assert_allclose(found, np.ravel(own), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_first_process_alone_leads_and_writes(told):
+    assert [(t["leads"], t["wrote"]) for t in told] == [(True, True), (False, False)]
+
+
+@pytest.mark.slow
+def test_processes_that_were_started_differently_say_in_what(told):
+    for process in told:
+        assert "the processes were not started alike: clip = 0.1 in process 0 and 0.2 in process 1" in process["differ"]
+
+
+@pytest.mark.slow
+def test_who_loses_another_process_says_so(told):
+    assert told[0]["lost"].startswith("process 0 of 2 lost another one of this training: ")
+    assert "--resume newest" in told[0]["lost"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["slurm", "open_mpi"])
+def test_processes_of_a_launcher_find_each_other(launcher):
+    text = "from sim2real.train.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
+    text += "print(jax.process_index(), jax.process_count(), leads())"
+    with socket.socket() as free:  # both launchers' processes derive their port from the job's number
+        free.bind(("127.0.0.1", 0))
+        job = free.getsockname()[1] % 2**12 + 2**12
+
+    def told(i):
+        if launcher == "slurm":
+            own = {"JOB_ID": job, "STEP_NODELIST": "localhost", "NTASKS": 2, "PROCID": i, "LOCALID": i}
+            return {f"SLURM_{name}": str(value) for name, value in own.items()}
+        own = {"SIZE": 2, "RANK": i, "LOCAL_RANK": i}
+        world = {f"OMPI_COMM_WORLD_{name}": str(value) for name, value in own.items()}
+        return {"OMPI_MCA_orte_hnp_uri": f"{job * 2**12}.0;tcp://127.0.0.1:34911", **world}
+
+    both = [
+        subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True, env={**os.environ, **told(i)})
+        for i in (0, 1)
+    ]
+    said = [process.communicate(timeout=120)[0].split() for process in both]
+    assert said == [["0", "2", "True"], ["1", "2", "False"]]
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"found": True, "processes": 2}, "exclude it"),
+        ({"coordinator": "here:1", "processes": 2}, "need all of"),
+        ({"coordinator": "here", "processes": 2, "process": 0}, "must be HOST:PORT, got 'here'"),
+        ({"coordinator": "here:1", "processes": 2, "process": 2}, r"must lie in \[0, 2\), got 2"),
+        ({"timeout_s": 0}, r"must lie in \[5, 86400\] s"),
+    ],
+)
+def test_processes_that_cannot_be_are_refused(settings, said):
+    with pytest.raises(UsageError, match=said):
+        HostsConfig(**settings)
+
+
+def test_one_process_joins_nobody_and_leads():
+    join(HostsConfig())
+    assert leads()
+
+
+def test_without_a_launcher_nothing_is_found():
+    jax.devices()
+    with pytest.raises(UsageError, match="the processes cannot be joined"):
+        join(HostsConfig(found=True))
