@@ -11,8 +11,9 @@ import numpy as np
 from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, malformed, read_json, write_json
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.policy.bundle import load_bundle, read_weights, save_bundle
+from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
+from sim2real.policy.runner import PolicyRunner
 
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
@@ -92,6 +93,8 @@ class Bundle:
         episodes: What its episodes were drawn from; None where only the policy was copied.
         sensitivity: How the policy does where a parameter is wrong; None where that was not simulated.
         path: Its folder; None before it was saved.
+        references: What JAX does on observations of the log and of training, with which the runner is compared when the
+            bundle is saved.
     """
 
     contract: PolicyContract
@@ -100,6 +103,18 @@ class Bundle:
     episodes: Episodes | None = None
     path: Path | None = None
     sensitivity: Sensitivity | None = None
+    references: Mapping[str, PolicyReference] = field(default_factory=dict)
+
+    def runner(self, backend: str = "numpy") -> PolicyRunner:
+        """Return what runs the policy, in numpy or, with ``"onnx"``, in onnxruntime.
+
+        Raises:
+            UsageError: The backend is unknown or not installed.
+            Sim2RealError: A file is missing or damaged.
+        """
+        if self.path is not None:
+            return load_bundle(self.path, backend)
+        return make_runner(self.weights, self.contract, backend)
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into the folder of a train stage.
@@ -107,7 +122,7 @@ class Bundle:
         Returns:
             Output -> name of the file or folder in it.
         """
-        save_bundle(folder / BUNDLE, self.weights, self.contract)
+        save_bundle(folder / BUNDLE, self.weights, self.contract, references=self.references)
         written = {"bundle": BUNDLE}
         if self.history is not None:
             self.history.save(folder / HISTORY)

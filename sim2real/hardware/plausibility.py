@@ -21,6 +21,8 @@ class Plausibility:
     **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
     uncertainty of times and readings, the robot is stopped.
 
+    **Envelope.** A position outside of ``envelope_rad`` stops the robot.
+
     **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
     holding, with friction, and at a stop. "Push" is the torque that the command asks for:
 
@@ -60,8 +62,10 @@ class Plausibility:
             effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
 
         Raises:
-            SafetyStop: A position jumped, or a joint stands still although it was pushed in both directions.
+            SafetyStop: A position jumped or lies outside of the envelope, or a joint stands still although it was
+                pushed in both directions.
         """
+        self._require_inside(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s, effort)
             return
@@ -81,6 +85,19 @@ class Plausibility:
         # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
         # differs from that at the start of the standstill, pushed hard up, pushed hard down.
         self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+
+    def _require_inside(self, position_rad: np.ndarray) -> None:
+        if self._config.envelope_rad is None:
+            return
+        low, high = (np.broadcast_to(np.asarray(e, np.float64), position_rad.shape) for e in self._config.envelope_rad)
+        beyond = np.maximum(low - position_rad, position_rad - high)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > 0.0:
+            raise SafetyStop(
+                f"{self._config.joint(worst)} is at {position_rad[worst]:.4g} rad, outside of its envelope, "
+                f"{low[worst]:.4g} to {high[worst]:.4g} rad",
+                hint="bring it back by hand; envelope_rad sets what is allowed",
+            )
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
         if self._config.max_speed_rad_s is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -9,6 +10,7 @@ import platform
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,8 +34,25 @@ LEAST_STD = 1e-6
 """Smallest standard deviation accepted in a normaliser; those of trained policies are at least 1e-3."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PolicyReference:
+    """What the policy that was trained does, to compare with.
+
+    Attributes:
+        observations: Shape ``(N, O)``.
+        actions: Shape ``(N, A)``: what JAX makes of them.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+
+
 def save_bundle(
-    folder: str | Path, weights: Mapping[str, np.ndarray], contract: PolicyContract, samples: np.ndarray | None = None
+    folder: str | Path,
+    weights: Mapping[str, np.ndarray],
+    contract: PolicyContract,
+    samples: np.ndarray | None = None,
+    references: Mapping[str, PolicyReference] = MappingProxyType({}),
 ) -> Path:
     """Write a bundle; ``policy.json`` is written last, so that a folder that has it is complete.
 
@@ -42,18 +61,23 @@ def save_bundle(
         weights: As ``Policy.to_weights`` returns them.
         contract: Observations, actions and rate of the policy.
         samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared if
-            onnxruntime is installed. None: drawn from the normaliser.
+            onnxruntime is installed. None: those of the references, or else drawn from the normaliser.
+        references: Where observations are from, such as ``log`` -> what JAX does there; the runner is compared with it,
+            and how well they agree stands in ``policy.json``.
 
     Returns:
         The folder.
 
     Raises:
-        Sim2RealError: Weights and contract do not fit each other, or numpy and ONNX give different actions.
+        Sim2RealError: Weights and contract do not fit each other, or the runner, ONNX and JAX give different actions.
     """
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract)
     graph = build_onnx(weights, contract)
+    parity = {name: _parity(weights, contract, reference, name) for name, reference in references.items()}
     if importlib.util.find_spec("onnxruntime") is not None:
+        if samples is None and references:
+            samples = np.concatenate([reference.observations for reference in references.values()])
         _check_parity(weights, graph, contract, samples)
     files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
     about = {
@@ -64,6 +88,7 @@ def save_bundle(
             "std": weights["std"].tolist(),
             "clip": OBSERVATION_CLIP,
         },
+        "parity": parity,
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         "versions": {"python": platform.python_version()}
         | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
@@ -91,16 +116,37 @@ def load_bundle(folder: str | Path, backend: str = "numpy") -> PolicyRunner:
         UsageError: The backend is unknown or not installed.
         Sim2RealError: A file is missing, damaged or of a format that this version does not know.
     """
-    if backend not in BACKENDS:
-        raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
+    _check_backend(backend)
     folder = Path(folder)
     about = _read_about(folder)
     contract = PolicyContract.from_dict(about)
-    weights = read_weights(folder)
+    runner = make_runner(read_weights(folder), contract)
+    return runner if backend == "numpy" else PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, about)))
+
+
+def make_runner(weights: Mapping[str, np.ndarray], contract: PolicyContract, backend: str = "numpy") -> PolicyRunner:
+    """Return a policy that was not saved, ready to run.
+
+    Args:
+        weights: As ``Policy.to_weights`` returns them.
+        contract: Observations, actions and rate of the policy.
+        backend: As in ``load_bundle``.
+
+    Raises:
+        UsageError: The backend is unknown or not installed.
+        Sim2RealError: Weights and contract do not fit each other.
+    """
+    _check_backend(backend)
+    weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract)
     if backend == "numpy":
         return PolicyRunner(contract, NumpyBackend(weights))
-    return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, about)))
+    return PolicyRunner(contract, OnnxBackend(build_onnx(weights, contract)))
+
+
+def _check_backend(backend: str) -> None:
+    if backend not in BACKENDS:
+        raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
 
 
 def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
@@ -193,6 +239,23 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract) -> N
         promised = np.array([getattr(term, side) for term in contract.action], np.float32)
         if not np.array_equal(promised, weights[side]):
             raise Sim2RealError(f"the policy's {side} bounds are {weights[side]}, the contract's are {promised}")
+
+
+def _parity(
+    weights: Mapping[str, np.ndarray], contract: PolicyContract, reference: PolicyReference, name: str
+) -> dict[str, float]:
+    """Return how far the runner is off JAX, as a fraction of the actions' range, and on how many observations."""
+    runner = PolicyRunner(contract, NumpyBackend(weights))
+    runner.reset()
+    actions = np.array([runner(observation) for observation in reference.observations])
+    off = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
+    if not off.max(initial=0.0) <= PARITY:  # a NaN is no parity
+        raise Sim2RealError(
+            f"the runner disagrees with JAX by {off.max():.2e} of the action range on observations of the {name}, "
+            f"{PARITY:.0e} is allowed",
+            hint="what was trained is not what would run: a normaliser with tiny deviations loses float32's precision",
+        )
+    return {"samples": len(actions), "largest": float(off.max(initial=0.0))}
 
 
 def _check_parity(

@@ -110,6 +110,13 @@ class PolicyRunner:
         self._low = np.array([term.low for term in contract.action], np.float32)
         self._high = np.array([term.high for term in contract.action], np.float32)
 
+    def reset(self) -> None:
+        """Begin an episode: forget the one before. A policy without memory, as these are, has nothing to forget."""
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action for the next observation of the episode; as ``act``."""
+        return self.act(observation)
+
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return the action, float32 of shape ``(A,)`` within the contract's bounds.
 

@@ -14,9 +14,11 @@ import numpy as np
 from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import OpenStage, StageFolder, open_stage
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
+from sim2real.policy.bundle import make_runner
 from sim2real.robots.base import Robot
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.stages.config import TrainConfig
@@ -25,6 +27,7 @@ from sim2real.stages.events import event_files
 from sim2real.stages.explaining import explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
+from sim2real.stages.parity import MOST, logged, observations_of, reference_of
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.prepared import contract_of, find_parameters, prepare, require_accepted, timing_of
 from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
@@ -44,6 +47,7 @@ def train(
     checkpoint: Path | None = None,
     resume: Path | None = None,
     watch: Callable[[Progress], None] | None = None,
+    log: Recording | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
@@ -56,6 +60,7 @@ def train(
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
         resume: Such a file, of the same training, to go on from.
         watch: Called after each evaluation.
+        log: A recording: on what a policy would have seen there, what will run is compared with what was trained.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -74,11 +79,16 @@ def train(
         result = patiently(
             lambda: learn(made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep)
         )
-    contract = contract_of(made.robot, made.env.task, made.values)
+    contract = contract_of(made.robot, made.env.task, made.values, made.episodes)
     weak = None
     if config.sensitivity:
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
-    bundle = Bundle(contract, result.best.to_weights(), _history(result), made.episodes, sensitivity=weak)
+    seen = {"training": result.observations[:MOST]}
+    if log is not None and isinstance(made.robot, LoopRobot):
+        seen["log"] = observations_of(made.robot, log, make_runner(result.best.to_weights(), contract))
+    references = {name: reference_of(result.best, observations) for name, observations in seen.items()}
+    weights, own = result.best.to_weights(), _history(result)
+    bundle = Bundle(contract, weights, own, made.episodes, sensitivity=weak, references=references)
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
@@ -140,7 +150,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         resume = None if interrupted is None else interrupted.folder / CHECKPOINT
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
-            bundle, about = train(pipeline, config, identification, checkpoint=checkpoint, resume=resume, watch=watch)
+            log = logged(identification, stage.run_dir)
+            bundle, about = train(pipeline, config, identification, None, checkpoint, resume, watch, log)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256

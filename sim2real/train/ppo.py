@@ -135,6 +135,7 @@ def _result(
         history=history,
         env_steps=np.array([progress.env_steps for progress in log]),
         elapsed_s=np.array([progress.elapsed_s for progress in log]),
+        observations=np.asarray(now.state.copies.observation[best_of(history)[1]]),
         env_steps_per_s=len(members) * trained / train_s,
         compile_s=compile_s,
         train_s=train_s,
