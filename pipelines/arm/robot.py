@@ -15,6 +15,7 @@ from sim2real.graph.base import Array
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.robots.hardware import Embedded
 from sim2real.robots.messages import JointReading
+from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, SHEET, Arm
@@ -32,6 +33,7 @@ class ArmRobot(ServoRobot):
         sheet=SHEET,
         speed=2.0,
     )
+    probe = Probe(step=0.12, lag_s=0.0115)
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"))
     features = (
         ("position", ("rad",) * 3, 5.0),

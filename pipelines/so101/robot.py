@@ -25,6 +25,7 @@ from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.messages import JointReading
+from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, SHEET, Arm
@@ -57,6 +58,7 @@ class SO101Robot(ServoRobot):
         middle=(0.0, -0.95, 0.9, -1.3, 0.0, 0.0),
         device="feetech",
     )
+    probe = Probe(step=0.12, lag_s=-0.004)
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
         ("position", ("rad",) * 6, 5.0),

@@ -28,6 +28,8 @@ class GateLimits:
     """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
     stuck_effort: float = 0.2
     """A joint driven both ways with more than this fraction of its torque must move, or the robot is stopped [1]."""
+    freeze_rad_s: float = 3.0
+    """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
     """Joint angles outside of which the robot is stopped, lowest and highest; default: not checked [rad]."""
     max_sample_age_s: float = 0.25
@@ -39,7 +41,14 @@ class GateLimits:
 
     def __post_init__(self) -> None:
         """Check that all limits are in their ranges."""
-        positive = ("command_timeout_s", "max_speed_rad_s", "stuck_effort", "max_sample_age_s", "stop_s")
+        positive = (
+            "command_timeout_s",
+            "max_speed_rad_s",
+            "stuck_effort",
+            "max_sample_age_s",
+            "stop_s",
+            "freeze_rad_s",
+        )
         for name in ("limit", "slew_per_s", *positive):
             if not getattr(self, name) > 0.0:
                 raise UsageError(f"gate.{name} must be above 0, got {getattr(self, name)}")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.errors import Sim2RealError
+from sim2real.errors import SafetyStop, Sim2RealError
 from sim2real.hardware.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
 """Time between two samples; how long a step is watched."""
+_TRIES, _BUSY_S = 3, 0.012
+"""Steps with a longer pause than this between two samples are made again; so many times as many at most."""
 _RISE_RAD = 0.05
 """The part of the answer up to here is fitted: later, weight and friction make it no polynomial."""
 _GRID_S = 0.0005
@@ -48,8 +51,8 @@ class Probe:
 
     Attributes:
         step: Size of a step [the command's unit].
-        lag_s: How much later than it is an answer seems to begin [s]: what starts softly is seen late. As the robot in
-            the computer has it, whose delay is known.
+        lag_s: How much later than it does an answer seem to begin [s]: what starts softly is seen late. As found on the
+            robot in the computer, whose delay is known.
         joint: The joint that is moved.
         steps: How many steps.
     """
@@ -69,11 +72,11 @@ def measure_delay(rig: Rig, probe: Probe) -> StepAnswers:
 
     Raises:
         Sim2RealError: The joint does not answer.
-        SafetyStop: What the gate stopped.
+        SafetyStop: This machine is too busy to measure, or what the gate stopped.
     """
     rig.start()
     try:
-        answers = [_answer(rig, probe.joint, *ends) for ends in _steps(rig, probe)]
+        answers = _answers(rig, probe)
     except BaseException:
         rig.stop_quietly()  # the reason must not be lost to what else fails
         raise
@@ -108,23 +111,39 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     return StepAnswers(np.array([min(grid, key=lambda d: _misfit(a, d, curve)) for a in answers]))
 
 
+def _answers(rig: Rig, probe: Probe) -> list[np.ndarray]:
+    """Return the answers to some steps; those during which this machine was busy are made again."""
+    answers: list[np.ndarray] = []
+    for before, goal in itertools.islice(itertools.cycle(_steps(rig, probe)), _TRIES * probe.steps):
+        found = _answer(rig, probe.joint, before, goal)
+        answers += [] if found is None else [found]
+        if len(answers) == probe.steps:
+            return answers
+    raise SafetyStop(
+        f"the delay cannot be measured: this machine was busy during all but {len(answers)} of "
+        f"{_TRIES * probe.steps} small steps",
+        hint="close what else runs on it; without this check: --no-measure-delay",
+    )
+
+
 def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the command before each step, and that of the step: from rest and back, or to both sides of zero."""
     rest, away = rig.gate.fallback, rig.gate.fallback
     away[probe.joint] += probe.step
     if rig.gate.config.stale == "zero":
-        return [(rest, away if i % 2 == 0 else -away) for i in range(probe.steps)]
+        return [(rest, away), (rest, -away)]
     if np.any(away > rig.gate.config.range[1]):
         away[probe.joint] -= 2 * probe.step
-    return [(rest, away) if i % 2 == 0 else (away, rest) for i in range(probe.steps)]
+    return [(rest, away), (away, rest)]
 
 
-def _answer(rig: Rig, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Return the answer to a step: times since the command [s], and motion in its direction [rad]."""
+def _answer(rig: Rig, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+    """Return the answer to a step: times since the command [s], and motion in its direction [rad]; None: too few."""
     _settle(rig, before)
     begin, rows = rig.measure().position_rad[joint], []
     left_s = time.monotonic()
     rig.command(goal, 0.0, left_s)
+    sent_s = time.monotonic() - left_s
     while (now := time.monotonic()) < left_s + _WATCHED_S:
         reading = rig.measure()
         rows.append((1e-9 * reading.transaction.t_sent_ns - left_s, reading.position_rad[joint] - begin))
@@ -133,7 +152,8 @@ def _answer(rig: Rig, joint: int, before: np.ndarray, goal: np.ndarray) -> np.nd
         time.sleep(max(0.0, now + _PERIOD_S - time.monotonic()))
     if rig.gate.config.stale == "zero":
         rig.command(before, 0.0, time.monotonic())
-    return np.array(rows) * [1.0, np.sign(goal[joint] - before[joint])]
+    longest_s = max(sent_s, *np.diff([0.0, *(t_s for t_s, _ in rows)]))
+    return np.array(rows) * [1.0, np.sign(goal[joint] - before[joint])] if longest_s < _BUSY_S else None
 
 
 def _settle(rig: Rig, command: np.ndarray) -> None:
