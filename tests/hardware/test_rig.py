@@ -1,5 +1,7 @@
 """The rig on a real emulator: what stops the motors, and that nothing else does."""
 
+import os
+import signal
 import threading
 import time
 
@@ -262,3 +264,18 @@ def test_a_joint_that_leaves_its_envelope_stops_the_robot(open_rig):
     ):
         run(rig, 2.5, 2.0)
     rig.stop_quietly()
+
+
+def test_an_unplugged_bus_is_lost_at_once_and_its_servo_stops_itself(open_rig):
+    rig, robot = open_rig(EmulatorConfig(unplugged_after_s=0.0, on_signal=True), silence_s=0.1)
+    rig.start()
+    run(rig, 2.5, 0.3)
+    began_ns = time.monotonic_ns()
+    os.kill(robot.pid, signal.SIGUSR1)
+    with pytest.raises(HardwareLost, match="failed during"):
+        run(rig, 2.5, 2.0)
+    assert (time.monotonic_ns() - began_ns) * 1e-9 < 1.0
+    time.sleep(0.3)
+    t_ns, modes, goals = effects(robot)
+    assert (modes[-1] == OperatingMode.OFF) | (goals[-1] == 0.0)
+    assert (t_ns[-1] - began_ns) * 1e-9 < 0.3
