@@ -12,7 +12,7 @@ from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor
 
 from sim2real import cli, errors
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import read_truth
+from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import read_log
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline import load_pipeline
@@ -80,6 +80,31 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
     assert np.abs(goals[: last - 10]).max() > 0.3, "it swung at up to 2 of 5 V"
     assert abs(goals[last]) < 0.05, "the voltage had faded when the torque went off"
     assert read_log(log).complete
+
+
+@pytest.mark.slow
+def test_a_robot_that_would_fall_is_held_until_it_is_let_go(tmp_path, start_cli):
+    robot = load_pipeline("arm").load()
+    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(3)}
+    weights |= {"layers.0.kernel": np.zeros((size, 3)), "layers.0.bias": np.full(3, 0.2)}
+    bundle = save_bundle(tmp_path / "bundle", weights, PolicyContract(robot.observation, robot.action, robot.rate_hz))
+    flags = ["--bundle", bundle, "--episodes", 1, "--duration-s", 1, "--runs", tmp_path, *PATIENT]
+    process = start_cli("deploy", "arm", "--hold", *flags)
+    assert any("holding: support the robot" in line for line in process.stderr)
+    time.sleep(0.5)
+    told_ns = time.monotonic_ns()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 130
+    (path,) = tmp_path.glob("arm/*/deploy/truth.bin")
+    effects = read_truth(path).of(Kind.EFFECT, 1)
+    before, modes = effects["t_ns"] < told_ns, effects["values"][:, 0]
+    held = effects["values"][before & (effects["t_ns"] > told_ns - 400_000_000)]
+    assert len(held) > 5
+    assert np.all(held[:, 0] == OperatingMode.POSITION)
+    assert np.ptp(held[:, 1]) < 1e-6, "the goal stays"
+    assert modes[-1] == OperatingMode.OFF
 
 
 def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
