@@ -160,7 +160,7 @@ def swing(rig, duration_s):
 @pytest.mark.parametrize("kind", SERVOS)
 def test_an_encoder_that_stands_still_stops_the_robot(open_rig, kind):
     plant, drive, gate, ids = SERVOS[kind]
-    gate = GateConfig(**gate, max_speed_rad_s=60.0)
+    gate = GateConfig(**gate, max_speed_rad_s=60.0, freeze_rad_s=1e3)  # it may move just then
     rig = open_rig(plant, drive, gate, EmulatorConfig(frozen_after_s=0.8), ids)
     with pytest.raises(SafetyStop, match=r"joint \d has read .* rad for .* s, though it was pushed both ways"):
         swing(rig, 5.0)
