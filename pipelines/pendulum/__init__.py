@@ -3,8 +3,8 @@
 from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig
 from sim2real.stages.pipeline import Pipeline
 
-GATE = GateLimits(freeze_rad_s=1.0)
-"""It swings freely: nothing but a frozen encoder stops it dead."""
+GATE = GateLimits(freeze_rad_s=0.7)
+"""It swings freely: nothing but a frozen encoder stops it dead; friction alone brakes it by 0.2 rad/s a sample."""
 
 PIPELINE = Pipeline(
     name="pendulum",

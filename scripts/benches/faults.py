@@ -40,8 +40,14 @@ SAFE_S = 0.2
 KILLED, STOPPED, NAN = "killed", "stopped", "nan"
 QUICK = {"runs": 1, "faults": ["wild"]}
 _START_S, _END_S, _MOVING_V = 60.0, 30.0, 0.1
+_TRIES = 4
+"""How often a deployment is begun that ends before its fault."""
 _SWINGS_S = (0.5, 1.5)
 """The fault comes so long after the motor has begun to turn."""
+
+
+class NotBegun(Sim2RealError):  # noqa: N818
+    """The deployment ended before the fault."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +178,7 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     """Deploy, let the fault happen, and see what comes of it.
 
     Raises:
-        Sim2RealError: The deployment did not begin to move.
+        NotBegun: The deployment did not begin to move.
     """
     draw = random.Random(f"{fault.name}/{seed}")
     robot = load_pipeline("pendulum").load()
@@ -181,7 +187,7 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     with emulated(config, robot.embedded.plant, truth) as (port, emulator):
         child = deployed(port, bundle, folder / "runs", said, watchdog_s)
         try:
-            wait_until_moving(truth, said)
+            wait_until_moving(truth, said, child)
             time.sleep(draw.uniform(*_SWINGS_S))
             number = {KILLED: signal.SIGKILL, STOPPED: signal.SIGSTOP, NAN: signal.SIGUSR1}.get(fault.name)
             began_ns = time.monotonic_ns()
@@ -201,6 +207,30 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     return Outcome(fault.name, seed, safe_s, code, words.strip()[-300:], _readable(log), right)
 
 
+def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) -> Outcome:
+    """Return what comes of a run whose robot moved before the fault: a busy machine may have to begin again.
+
+    Args:
+        fault: What goes wrong.
+        seed: Says when.
+        bundle: The policy.
+        root: Folder of the runs.
+        watchdog_s: The gate's longest silence [s].
+
+    Raises:
+        NotBegun: It never moved.
+    """
+    for again in range(_TRIES - 1):
+        with contextlib.suppress(NotBegun):
+            return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
+    return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+
+
+def _new(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
 def safe_after(truth: Truth, since_ns: int) -> float:
     """Return how long after a moment [ns] the motor stopped for good [s]: torque off, or its own firmware's zero."""
     effects = truth.of(Kind.EFFECT)
@@ -211,20 +241,25 @@ def safe_after(truth: Truth, since_ns: int) -> float:
     return max(0.0, 1e-9 * float(effects["t_ns"][turning[-1] + 1] - since_ns))
 
 
-def wait_until_moving(truth: Path, said: Path) -> None:
+def wait_until_moving(truth: Path, said: Path, child: BaseProcess) -> None:
     """Wait until the emulator's motor has been driven.
 
+    Args:
+        truth: The emulator's account.
+        said: What the deployment says.
+        child: The deployment.
+
     Raises:
-        Sim2RealError: It was not, for a minute.
+        NotBegun: It ended before, or took a minute.
     """
     end = time.monotonic() + _START_S
-    while time.monotonic() < end:
+    while time.monotonic() < end and child.is_alive():
         time.sleep(0.1)
         if truth.is_file() and truth.stat().st_size > 0:
             effects = read_truth(truth).of(Kind.EFFECT)
             if len(effects) and np.any(np.abs(effects["values"][:, 1]) > 0.0):
                 return
-    raise Sim2RealError(f"the deployment did not begin to move: {said.read_text(errors='replace')}")
+    raise NotBegun(f"the deployment did not begin to move: {said.read_text(errors='replace')}")
 
 
 def ended(process: BaseProcess) -> int:
@@ -266,9 +301,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         for kind in options.faults:
             found = []
             for seed in range(options.first_seed, options.first_seed + options.runs):
-                folder = Path(name) / f"{kind}_{seed}"
-                folder.mkdir()
-                found.append(run_once(FAULTS[kind], seed, bundle, folder, options.servo_watchdog_s))
+                found.append(begun(FAULTS[kind], seed, bundle, Path(name), options.servo_watchdog_s))
                 print(f"{kind} {seed}: {found[-1].safe_s:.3f} s, exit {found[-1].code}", file=sys.stderr)
             outcomes += found
             safe = np.array([o.safe_s for o in found])

@@ -77,7 +77,7 @@ class Plausibility:
         self._t_s, self._unsure_s = t_s, unsure_s
         moved = position_rad != self._position
         if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
-            self._speed[moved] = np.abs(position_rad - self._position)[moved] / (elapsed_s + _STAMP_S)
+            self._speed[moved] = np.abs(position_rad - self._position)[moved] / elapsed_s
         self._position = position_rad.copy()
         self._since_s[moved], self._start[moved] = t_s, effort[moved]
         self._require_no_freeze(t_s, effort)
@@ -124,7 +124,7 @@ class Plausibility:
         fast, still = self._speed > self._config.freeze_rad_s, t_s - self._since_s >= self._config.freeze_s
         for i in np.flatnonzero(fast & still & (effort != 0.0)):
             raise SafetyStop(
-                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s or more just before",
+                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s just before",
                 hint="is its encoder stuck, or did it hit something? freeze_rad_s sets the limit",
             )
 

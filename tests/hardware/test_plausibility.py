@@ -63,7 +63,7 @@ FREE = GateConfig(max_speed_rad_s=20.0, joints=("pan", "tilt"), freeze_rad_s=2.0
 
 def test_a_joint_that_stops_dead_though_it_is_pushed_is_stopped():
     path = moving_then_still(6.0)
-    message = r"joint 'tilt' has read 0\.6 rad for 0\.06 s, but moved at 4 rad/s or more just before"
+    message = r"joint 'tilt' has read 0\.6 rad for 0\.06 s, but moved at 6 rad/s just before"
     with pytest.raises(SafetyStop, match=message):
         judge(np.full(path.shape, 0.1), path, FREE)
 

@@ -68,7 +68,7 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
     bundle = faults.swinging_bundle(tmp_path / "bundle")
     with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
         child = faults.deployed(port, bundle, tmp_path, said, 0.4)
-        faults.wait_until_moving(truth, said)
+        faults.wait_until_moving(truth, said, child)
         time.sleep(0.5)
         os.kill(child.pid, signal.SIGINT)
         assert faults.ended(child) == 130, said.read_text()
@@ -117,7 +117,7 @@ def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
 @pytest.mark.parametrize("name", faults.FAULTS)
 def test_a_fault_leaves_the_motor_safe_and_its_reason_said(tmp_path, name):
     """One run of each; ``scripts/bench.py faults`` has fifty. Patient, for the machine may be busy."""
-    found = faults.run_once(faults.FAULTS[name], 0, faults.swinging_bundle(tmp_path / "bundle"), tmp_path, 0.15)
+    found = faults.begun(faults.FAULTS[name], 0, faults.swinging_bundle(tmp_path / "bundle"), tmp_path, 0.15)
     assert found.right, found
     assert found.readable
     assert found.safe_s < 2 * faults.SAFE_S
