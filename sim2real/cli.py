@@ -47,7 +47,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   latency   where the milliseconds go between motion and motion: host, bus and device
   import    turn files of other recorders into logs, and say what is what in them
   new       write the files of a pipeline for a robot of which there is a model
-  export    write what was identified for MuJoCo, mjlab, Isaac Lab, or as JSON
+  export    write what was identified for MuJoCo, mjlab, Isaac Lab, or as JSON; or a policy for a bare machine
   log       recover what is readable of a damaged log into a new one
 
 examples
@@ -257,39 +257,35 @@ def _files(command: str, arguments: list[str]) -> None:
         sys.exit(ERROR)
 
 
-def _only(command: str, arguments: list[str]) -> None:
-    """``sim2real log recover FILE`` and ``sim2real export identified RUN|PIPELINE|FILE --to FORMAT``."""
-    from sim2real.stages import config, flags
-
-    what, kind, stage, usage, *examples = {
-        "log": ("recover", "Recover", "recovering", "FILE", "session.mcap", "session.mcap --out saved.mcap"),
-        "export": (
-            *("identified", "Export", "exporting", "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json"),
+_ACTIONS = {
+    "log": {"recover": ("Recover", "recovering", "FILE", "session.mcap", "session.mcap --out saved.mcap")},
+    "export": {
+        "identified": (
+            *("Export", "exporting", "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json"),
             *(f"{DEMO_PIPELINE} --to json", "runs/arm/TIME --to mjcf --out arm.xml"),
         ),
-    }[command]
-    prog, rest = _action(command, what, arguments, usage)
+        "policy": ("Ship", "shipping", "RUN|PIPELINE|BUNDLE --to DIR", f"{DEMO_PIPELINE} --to policy"),
+    },
+}
+"""Command -> what it can do -> configuration, stage, what comes behind it, and examples of that."""
+
+
+def _act(command: str, arguments: list[str]) -> None:
+    """``sim2real log recover FILE``, ``sim2real export identified`` and ``sim2real export policy``."""
+    from sim2real.stages import config, flags
+
+    actions, (action, *rest) = _ACTIONS[command], arguments or [""]
+    if action in ("-h", "--help"):
+        action, rest = next(iter(actions)), ["--help"]
+    if action not in actions:
+        said = f"there is no `{command} {action}`" if action else f"{command} needs to be told what to do"
+        uses = " or ".join(f"sim2real {command} {name} {about[2]}" for name, about in actions.items())
+        raise UsageError(f"{said}. Available: {', '.join(actions)}", hint=uses)
+    kind, stage, _, *examples = actions[action]
+    prog = f"sim2real {command} {action}"
     own, epilog = getattr(config, f"{kind}Config")(), _epilog(*(f"{prog} {example}" for example in examples))
     asked = flags.parse(own, rest, prog, _summary(own), epilog)
     importlib.import_module(f"sim2real.stages.{stage}").run(asked)  # imports JAX
-
-
-def _action(command: str, only: str, arguments: list[str], usage: str) -> tuple[str, list[str]]:
-    """Return the command with the one thing that it can do, and the arguments behind that.
-
-    Args:
-        command: The command.
-        only: What it can do.
-        arguments: What the user typed behind the command.
-        usage: What comes behind, for the hint.
-    """
-    action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if action in ("-h", "--help"):
-        action, rest = only, ["--help"]
-    if action != only:
-        said = f"there is no `{command} {action}`" if action else f"{command} needs to be told what to do"
-        raise UsageError(f"{said}. Available: {only}", hint=f"sim2real {command} {only} {usage}")
-    return f"sim2real {command} {only}", rest
 
 
 def _check(command: str, arguments: list[str]) -> None:
@@ -328,7 +324,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "latency": _stage,
     "check": _check,
     **dict.fromkeys(("import", "validate", "new"), _files),
-    **dict.fromkeys(("log", "export"), _only),
+    **dict.fromkeys(("log", "export"), _act),
 }
 
 

@@ -10,9 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.graph.arrays import namespace
+from sim2real.graph.base import Array
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.robots.hardware import Embedded
 from sim2real.robots.messages import JointReading
+from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, SHEET, Arm
@@ -30,6 +33,7 @@ class ArmRobot(ServoRobot):
         sheet=SHEET,
         speed=2.0,
     )
+    probe = Probe(step=0.12, lag_s=0.0115)
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"))
     features = (
         ("position", ("rad",) * 3, 5.0),
@@ -67,13 +71,13 @@ class ArmRobot(ServoRobot):
         """Return a target ``(3,)`` [m]."""
         return tip_of(jnp, jax.random.uniform(key, (3,), minval=jnp.array(LOW), maxval=jnp.array(HIGH)))
 
-    def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
+    def observe(self, reading: JointReading, goal: Any, aim: Any) -> Array:
         """Return what the policy sees: joints, and the way to the target, seen from the arm."""
-        q = reading.position
-        gap = aim - tip_of(jnp, q)
-        c, s = jnp.cos(q[0]), jnp.sin(q[0])
-        way = jnp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
-        return jnp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way])
+        q, xp = reading.position, namespace(reading.position, goal)
+        gap = aim - tip_of(xp, q)
+        c, s = xp.cos(q[0]), xp.sin(q[0])
+        way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+        return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way])
 
     def success(self, state: Any) -> jax.Array:
         """Return whether the tip is at the target."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.arrays import namespace
+from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.agent import DirectAgent
 from sim2real.worlds.ode import OdeWorld
@@ -158,7 +159,7 @@ class PendulumWorld(OdeWorld):
         """Return the angular velocity [rad/s]."""
         return state.thdot
 
-    def with_velocity(self, state: Measurement, velocity: jax.Array) -> Measurement:
+    def with_velocity(self, state: Measurement, velocity: Array) -> Measurement:
         """Return the state with another angular velocity [rad/s]."""
         return state.replace(thdot=velocity)
 
@@ -174,6 +175,7 @@ class Agent(DirectAgent):
         super().__init__(name, rate, features, (3, 1), HISTORY, Command, **options)
 
 
-def features(m: Measurement) -> jax.Array:
-    """Return what the policy sees of a measurement, ``(3,)``."""
-    return jnp.stack([jnp.cos(m.th), jnp.sin(m.th), m.thdot / 10.0]).astype(jnp.float32)
+def features(m: Measurement) -> Array:
+    """Return what the policy sees of a measurement, ``(3,)``; in numpy on the robot, where there is no JAX."""
+    xp = namespace(m.th)
+    return xp.stack([xp.cos(m.th), xp.sin(m.th), m.thdot / 10.0]).astype(np.float32)

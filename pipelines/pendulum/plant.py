@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mujoco import MjData, MjModel, mj_forward, mj_step  # pyright: ignore[reportAttributeAccessIssue]
-
 SUPPLY_V = 5.0
 """Voltage of the motor at full PWM [V]."""
 
@@ -49,6 +47,9 @@ class PendulumPlant:
     def __init__(
         self, friction: float = 1.6, inertia: float = 1.15, motor: float = 0.9, step_s: float = 0.0005
     ) -> None:
+        # Not above: the robot's own module takes the supply's voltage from here, and need not wait for MuJoCo.
+        from mujoco import MjData, MjModel, mj_forward, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+
         self._J, self._K = inertia * _J, motor * _K
         self._b, self._c = friction * _B, friction * _C
         text = _MODEL.format(
@@ -65,13 +66,14 @@ class PendulumPlant:
         self.data.qpos[0] = math.pi
         self._voltage: float | None = None  # None: the driver is off and the winding open
         mj_forward(self.model, self.data)
+        self._step = mj_step
 
     def advance(self, t_s: float) -> None:
         """Integrate up to ``t_s`` [s]."""
         data, step_s = self.data, self.model.opt.timestep
         for _ in range(round((t_s - data.time) / step_s)):
             data.ctrl[0] = 0.0 if self._voltage is None else self._torque_nm(self._voltage)
-            mj_step(self.model, data)
+            self._step(self.model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
         """Set the voltage: ``goal`` is its share of the supply; with torque off the winding is open."""

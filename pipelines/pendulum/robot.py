@@ -27,6 +27,7 @@ from sim2real.robots.agent import AgentParams
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
+from sim2real.robots.probe import Probe
 from sim2real.robots.training import Draw
 
 from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, dynamics, from_groups
@@ -63,6 +64,7 @@ class PendulumRobot(LoopRobot):
     )
     action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
     mounting = (HINGE,)
+    probe = Probe(step=1.5, lag_s=0.004)
     tick_s = 1 / WORLD_HZ
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
@@ -137,14 +139,7 @@ class PendulumRobot(LoopRobot):
 
     def gate(self, limits: GateLimits) -> GateConfig:
         """Return a gate that falls back to 0 V."""
-        return GateConfig(
-            limits.limit,
-            limits.slew_per_s,
-            limits.command_timeout_s,
-            limits.max_speed_rad_s,
-            joints=(HINGE.name,),
-            stuck_effort=limits.stuck_effort,
-        )
+        return limits.gate(limits.limit, joints=(HINGE.name,))
 
     def read(self, reading: Reading) -> Measurement:
         """Return the sensor's message of a reading."""

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.arrays import namespace
+from sim2real.graph.base import Array
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device
 from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
@@ -23,6 +25,7 @@ from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.messages import JointReading
+from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, SHEET, Arm
@@ -55,6 +58,7 @@ class SO101Robot(ServoRobot):
         middle=(0.0, -0.95, 0.9, -1.3, 0.0, 0.0),
         device="feetech",
     )
+    probe = Probe(step=0.12, lag_s=-0.004)
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
         ("position", ("rad",) * 6, 5.0),
@@ -115,13 +119,13 @@ class SO101Robot(ServoRobot):
         angles = jax.random.uniform(key, (6,), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
         return jnp.append(tip_of(jnp, angles), angles[5])
 
-    def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
+    def observe(self, reading: JointReading, goal: Any, aim: Any) -> Array:
         """Return what the policy sees: joints, and the way to the target, seen from the arm."""
-        q = reading.position
-        gap = aim[:3] - tip_of(jnp, q)
-        c, s = jnp.cos(q[0]), -jnp.sin(q[0])  # pan turns clockwise
-        way = jnp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
-        return jnp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
+        q, xp = reading.position, namespace(reading.position, goal)
+        gap = aim[:3] - tip_of(xp, q)
+        c, s = xp.cos(q[0]), -xp.sin(q[0])  # pan turns clockwise
+        way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+        return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
 
     def success(self, state: Any) -> jax.Array:
         """Return whether the tip is at the target, and the jaw as it is told."""

@@ -43,6 +43,11 @@ BENCHES = {
     "demo": Bench(
         "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")
     ),
+    "faults": Bench(
+        "faults",
+        "what goes wrong while a policy runs: how soon the motor is safe, the log, and what is said",
+        ("sim2real/hardware", "sim2real/runtime", "sim2real/robots", "sim2real/stages", "sim2real/policy"),
+    ),
     "graph": Bench(
         "graph", "the compiled graph against a robot written by hand", (*_GRAPH, "scripts/benches/graph_mjx.py")
     ),
@@ -89,6 +94,17 @@ BENCHES = {
             "sim2real/train",
             "sim2real/stages/prepared.py",
             "scripts/benches/hidden_robots.py",
+        ),
+    ),
+    "runner": Bench(
+        "runner",
+        "a step of a policy in numpy, and the loop of twelve joints at 500 Hz",
+        (
+            "sim2real/policy",
+            "sim2real/runtime",
+            "sim2real/hardware",
+            "sim2real/robots",
+            "scripts/benches/twelve_joints.py",
         ),
     ),
     "scaling": Bench(

@@ -29,7 +29,7 @@ QUICK = {
             "--train.ppo.num-envs=16",
         ),
         *("--train.ppo.minibatches=2", "--train.ppo.evaluations=1"),
-        *("--deploy.episodes=1", "--deploy.duration-s=1"),
+        *("--deploy.episodes=1", "--deploy.duration-s=1", "--deploy.no-measure-delay"),
     ],
 }
 

@@ -11,9 +11,10 @@ import numpy as np
 from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, malformed, read_json, write_json
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.policy.bundle import read_contract, read_weights, save_bundle
+from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
+from sim2real.policy.runner import PolicyRunner
 
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
@@ -95,6 +96,8 @@ class Bundle:
         path: Its folder; None before it was saved.
         spec: What the policy's network is.
         graph: The policy as an ONNX model, of a network that is not one of ours; not read again by ``load``.
+        references: What JAX does on observations of the log and of training, with which the runner is compared when the
+            bundle is saved.
     """
 
     contract: PolicyContract
@@ -105,6 +108,18 @@ class Bundle:
     sensitivity: Sensitivity | None = None
     spec: NetworkSpec = field(default_factory=NetworkSpec)
     graph: bytes | None = None
+    references: Mapping[str, PolicyReference] = field(default_factory=dict)
+
+    def runner(self, backend: str | None = None) -> PolicyRunner:
+        """Return what runs the policy, in numpy or, with ``"onnx"``, in onnxruntime.
+
+        Raises:
+            UsageError: The backend is unknown, not installed or does not run this network.
+            Sim2RealError: A file is missing or damaged.
+        """
+        if self.path is not None:
+            return load_bundle(self.path, backend)
+        return make_runner(self.weights, self.contract, backend, self.spec, self.graph)
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into the folder of a train stage.
@@ -112,7 +127,9 @@ class Bundle:
         Returns:
             Output -> name of the file or folder in it.
         """
-        save_bundle(folder / BUNDLE, self.weights, self.contract, None, self.spec, self.graph)
+        save_bundle(
+            folder / BUNDLE, self.weights, self.contract, spec=self.spec, graph=self.graph, references=self.references
+        )
         written = {"bundle": BUNDLE}
         if self.history is not None:
             self.history.save(folder / HISTORY)

@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
+from sim2real.graph.arrays import is_jax as is_jax
+from sim2real.graph.arrays import namespace as namespace
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Array
-
-
-def is_jax(value: object) -> bool:
-    """Return whether a value is a JAX array or tracer, without importing JAX."""
-    jax = sys.modules.get("jax")
-    return jax is not None and isinstance(value, jax.Array)
-
-
-def namespace(*values: object) -> Any:
-    """Return ``jax.numpy`` when one of the values, or of their items, is JAX's; else ``numpy``."""
-    for value in values:
-        items = value if isinstance(value, list | tuple) else (value,)
-        if any(is_jax(v) for v in items):
-            import jax.numpy as jnp
-
-            return jnp
-    return np
 
 
 def multiply_quaternions(a: Array, b: Array) -> Array:

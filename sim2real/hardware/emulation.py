@@ -9,7 +9,7 @@ from sim2real.errors import UsageError
 
 @dataclass(frozen=True)
 class Emulation:
-    """Settings of the emulated bus and servos; times of faults count from the emulator's start.
+    """Settings of the emulated bus and servos; times of faults count from the emulator's start, or a signal.
 
     Args:
         baud_rate: Bits per second; a byte takes 10 bits.
@@ -30,6 +30,9 @@ class Emulation:
         late_s: That delay [s].
         wild: Probability that a read returns a position that no motor can reach, with a correct checksum.
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
+        unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
+        ill_after_s: Time from which answers are late or wild [s].
+        on_signal: Whether those times, but for the overload's, count from when the process gets SIGUSR1.
     """
 
     baud_rate: int = 1_000_000
@@ -49,6 +52,9 @@ class Emulation:
     late_s: float = 0.009
     wild: float = 0.0
     frozen_after_s: float | None = None
+    unplugged_after_s: float | None = None
+    ill_after_s: float = 0.0
+    on_signal: bool = False
 
     def __post_init__(self) -> None:
         """Check that all values are in their ranges."""

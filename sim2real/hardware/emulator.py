@@ -51,8 +51,17 @@ class _Pty:
         os.set_blocking(self.fd, False)
         self.port = os.ttyname(self._host_fd)
 
+    def unplug(self) -> None:
+        """Take the port away: the host's reads and writes fail from now on."""
+        if self.fd >= 0:
+            os.close(self._host_fd)
+            os.close(self.fd)
+            self.fd = -1
+
     def send(self, answer: bytes) -> bool:
-        """Send bytes to the host; return False if the buffer is full, because the host does not read."""
+        """Send bytes to the host; return False if nobody reads: the buffer is full, or the port is gone."""
+        if self.fd < 0:
+            return False
         try:
             return os.write(self.fd, answer) == len(answer)
         except BlockingIOError:
@@ -67,16 +76,22 @@ class _Pty:
 
 
 class _StopFlag:
-    """A flag that SIGTERM and SIGINT set."""
+    """A flag that SIGTERM and SIGINT set, and when SIGUSR1 came, after which faults begin."""
 
     def __init__(self) -> None:
         self.is_set = False
+        self.faulty_ns: int | None = None
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
+        signal.signal(signal.SIGUSR1, self._begin_faults)
 
     def _set(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         self.is_set = True
+
+    def _begin_faults(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self.faulty_ns = time.monotonic_ns()
 
 
 def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_fd: int | None) -> None:
@@ -90,6 +105,12 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
             wake_ns = min(wake_ns, due_ns)
         ready = select.select(inputs, [], [], max(0, wake_ns - now_ns) * 1e-9)[0]
         now_ns = time.monotonic_ns()
+        if stop.faulty_ns is not None:
+            bus.begin_faults(stop.faulty_ns)
+            stop.faulty_ns = None
+        if pty.fd >= 0 and bus.unplugged(now_ns):
+            inputs.remove(pty.fd)
+            pty.unplug()
         if pty.fd in ready:
             bus.feed(pty.receive(), now_ns)
         if parent_fd in ready and not os.read(parent_fd, 1024):

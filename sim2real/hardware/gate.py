@@ -29,6 +29,13 @@ class GateConfig:
             move, or the robot is stopped; one value or one per joint; above 1: not checked. See
             `sim2real.hardware.plausibility`.
         stuck_s: How long it must be driven in each direction without a break [s].
+        freeze_rad_s: A joint that is pushed, moved this fast between two readings, and then reads the same to the count
+            for ``freeze_s``, stops the robot: its encoder has frozen, or it hit something [rad/s].
+        freeze_s: See there [s].
+        envelope_rad: Measured positions beyond which the robot is stopped, (low, high), each one value or one per joint
+            [rad]; None: not checked.
+        max_sample_age_s: Age of the newest measurement above which nothing is commanded any more [s].
+        stop_s: Longest time in which a soft stop brings the robot to rest [s].
     """
 
     limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
@@ -40,6 +47,11 @@ class GateConfig:
     joints: tuple[str, ...] = ()
     stuck_effort: float | Sequence[float] = 0.2
     stuck_s: float = 0.2
+    freeze_rad_s: float = 3.0
+    freeze_s: float = 0.05
+    envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
+    max_sample_age_s: float = 0.25
+    stop_s: float = 0.5
 
     def __post_init__(self) -> None:
         """Check that all limits are in their ranges and fit each other."""
@@ -50,7 +62,10 @@ class GateConfig:
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
         if self.stale == "zero" and not np.all((low <= 0.0) & (high >= 0.0)):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
-        for name in ("slew_per_s", "command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s"):
+        if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
+            raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
+        positive = ("command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s", "max_sample_age_s", "stop_s")
+        for name in ("slew_per_s", "freeze_rad_s", "freeze_s", *positive):
             value = getattr(self, name)
             if value is not None and not np.all(np.asarray(value) > 0.0):
                 raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")

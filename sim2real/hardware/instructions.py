@@ -110,7 +110,7 @@ class InstructedBus(PlannedBus, Generic[S, E]):
         address = self.form.word(request.packet.parameters, position)
         length = self.form.word(request.packet.parameters, position + self.form.address_bytes)
         sample = self.measure(servo, request.t_ns)
-        if self.happens(self._config.wild):
+        if self.ill(self._config.wild, request.t_ns):
             servo.put(servo.table.position, self.random.randrange(*self.wild_counts))
         error, data = servo.read(address, length)
         if servo.answers_reads:

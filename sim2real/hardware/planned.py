@@ -146,6 +146,7 @@ class PlannedBus(ABC):
         self._last_bytes_ns = start_ns
         self._delivered_ns = start_ns
         self._frozen: dict[int, tuple[float, float, float]] = {}
+        self._fault_ns = None if config.on_signal else start_ns
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
         if config.overload_after_s is not None:
@@ -194,9 +195,21 @@ class PlannedBus(ABC):
                 action(*arguments)
         self._clock.advance(t_ns)
 
+    def begin_faults(self, t_ns: int) -> None:
+        """Count the times of faults from now on, ``t_ns``."""
+        self._fault_ns = t_ns
+
+    def unplugged(self, t_ns: int) -> bool:
+        """Return whether the port is gone at a time [ns]."""
+        return self._passed(self._config.unplugged_after_s, t_ns)
+
     def happens(self, probability: float) -> bool:
         """Return whether a fault happens; draws no random number if its probability is 0."""
         return probability > 0.0 and self.random.random() < probability
+
+    def ill(self, probability: float, t_ns: int) -> bool:
+        """Return whether an answer to what came at a time [ns] is late, or wild, with this probability."""
+        return self._passed(self._config.ill_after_s, t_ns) and self.happens(probability)
 
     def configure(self, servo: Firmware) -> None:
         """Tell the plant a servo's controller settings if they have changed."""
@@ -222,7 +235,7 @@ class PlannedBus(ABC):
         sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
         values = self._clock.sample(servo.servo_id, sampled_ns)
         shown = values
-        if config.frozen_after_s is not None and t_ns - self._start_ns >= config.frozen_after_s * 1e9:
+        if self._passed(config.frozen_after_s, t_ns):
             shown = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
         servo.refresh(*shown, tick_ms=(t_ns - self._start_ns) // 1_000_000)
         return sampled_ns, values
@@ -241,7 +254,7 @@ class PlannedBus(ABC):
         """
         begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
-        late_ns = round(self._config.late_s * 1e9) if self.happens(self._config.late) else 0
+        late_ns = round(self._config.late_s * 1e9) if self.ill(self._config.late, request.t_ns) else 0
         self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
         self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo_id, answer, request, sample)
 
@@ -250,8 +263,11 @@ class PlannedBus(ABC):
         heapq.heappush(self._events, (t_ns, self._sequence, action, arguments))
 
     def _silent(self, t_ns: int) -> bool:
-        after_s = self._config.silent_after_s
-        return after_s is not None and t_ns - self._start_ns >= after_s * 1e9
+        return self._passed(self._config.silent_after_s, t_ns)
+
+    def _passed(self, after_s: float | None, t_ns: int) -> bool:
+        """Return whether the time of a fault has come."""
+        return after_s is not None and self._fault_ns is not None and t_ns - self._fault_ns >= after_s * 1e9
 
     def _delay_ns(self, latency_s: float, jitter_s: float) -> int:
         return round(1e9 * (latency_s + self.random.uniform(-jitter_s, jitter_s)))

@@ -21,6 +21,11 @@ class Plausibility:
     **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
     uncertainty of times and readings, the robot is stopped.
 
+    **Freeze.** A joint that moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the same to
+    the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead.
+
+    **Envelope.** A position outside of ``envelope_rad`` stops the robot.
+
     **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
     holding, with friction, and at a stop. "Push" is the torque that the command asks for:
 
@@ -48,7 +53,7 @@ class Plausibility:
         self.suspects: list[str] = []
         self._t_s: float | None = None
         self._unsure_s = 0.0
-        self._position = self._since_s = self._start = self._held_s = self._longest_s = np.zeros(0)
+        self._position = self._since_s = self._start = self._speed = self._held_s = self._longest_s = np.zeros(0)
 
     def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
         """Check a measurement.
@@ -60,8 +65,10 @@ class Plausibility:
             effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
 
         Raises:
-            SafetyStop: A position jumped, or a joint stands still although it was pushed in both directions.
+            SafetyStop: A position jumped or lies outside of the envelope, or a joint stands still although it was
+                pushed in both directions.
         """
+        self._require_inside(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s, effort)
             return
@@ -69,18 +76,35 @@ class Plausibility:
         self._require_reachable(position_rad, elapsed_s + unsure_s + self._unsure_s)
         self._t_s, self._unsure_s = t_s, unsure_s
         moved = position_rad != self._position
+        if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
+            self._speed[moved] = np.abs(position_rad - self._position)[moved] / elapsed_s
         self._position = position_rad.copy()
         self._since_s[moved], self._start[moved] = t_s, effort[moved]
+        self._require_no_freeze(t_s, effort)
         self._held_s[:, moved] = self._longest_s[:, moved] = 0.0
         self._require_motion(effort, elapsed_s)
 
     def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
         n = len(position_rad)
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
+        self._speed = np.zeros(n)
         self._since_s, self._start = np.full(n, t_s), effort.copy()
         # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
         # differs from that at the start of the standstill, pushed hard up, pushed hard down.
         self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+
+    def _require_inside(self, position_rad: np.ndarray) -> None:
+        if self._config.envelope_rad is None:
+            return
+        low, high = (np.broadcast_to(np.asarray(e, np.float64), position_rad.shape) for e in self._config.envelope_rad)
+        beyond = np.maximum(low - position_rad, position_rad - high)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > 0.0:
+            raise SafetyStop(
+                f"{self._config.joint(worst)} is at {position_rad[worst]:.4g} rad, outside of its envelope, "
+                f"{low[worst]:.4g} to {high[worst]:.4g} rad",
+                hint="bring it back by hand; envelope_rad sets what is allowed",
+            )
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
         if self._config.max_speed_rad_s is None:
@@ -94,6 +118,14 @@ class Plausibility:
                 f"{self._config.joint(worst)} reads {position_rad[worst]:.6g} rad, {leap[worst]:.6g} rad from the last "
                 f"reading: at its fastest, {limit[worst]:.4g} rad/s, it can have moved by {most[worst]:.3g} rad",
                 hint="look at the encoder and the cable; max_speed_rad_s sets what is possible",
+            )
+
+    def _require_no_freeze(self, t_s: float, effort: np.ndarray) -> None:
+        fast, still = self._speed > self._config.freeze_rad_s, t_s - self._since_s >= self._config.freeze_s
+        for i in np.flatnonzero(fast & still & (effort != 0.0)):
+            raise SafetyStop(
+                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s just before",
+                hint="is its encoder stuck, or did it hit something? freeze_rad_s sets the limit",
             )
 
     def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:

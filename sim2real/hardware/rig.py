@@ -11,13 +11,17 @@ from typing import Final, Self
 
 import numpy as np
 
-from sim2real.errors import HardwareLost, Sim2RealError, UsageError
+from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.gate import GateConfig, SafetyGate
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.plausibility import Plausibility
 
 _CHECK_PERIOD_S: Final = 0.5
+_STILL_RAD_S: Final = 0.05
+"""A joint this slow is at rest."""
+_FADE: Final = 0.4
+"""Share of a soft stop in which commands fade; the rest is for what they leave to come to rest."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,8 @@ class Rig:
         self._sent: np.ndarray | None = None
         self._speed_rad_s: np.ndarray | None = None
         self._checked_s = 0.0
+        self._sampled_s: float | None = None
+        self._eased_s: float | None = None
         self._commanded_s: float | None = None
         self._lock = threading.Lock()
         self._done = threading.Event()
@@ -119,7 +125,7 @@ class Rig:
         """Switch the torque on, at rest, and start watching the age of commands."""
         self._done.set()
         self._done = threading.Event()  # a watcher that has not noticed yet that it is over must not go on
-        self._commanded_s = self._speed_rad_s = self._failure = None
+        self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
         self.measuring, self.commanding = BusUse(), BusUse()
         self._require_reach()
         self.device.enable()
@@ -163,7 +169,7 @@ class Rig:
             # Of the motors, whose direction does not matter to what is plausible.
             effort = self.device.effort(self._mounting.to_motors(sent), measured.position_rad)
         self._plausibility.check(reading.position_rad, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
-        self._speed_rad_s = reading.velocity_rad_s
+        self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, 1e-9 * asked.t_sent_ns
         return reading
 
     def command(self, command: np.ndarray, age_s: float, now_s: float) -> np.ndarray:
@@ -180,13 +186,50 @@ class Rig:
         """
         self._check()
         with self._lock:
-            allowed = self.gate.apply(command, age_s, now_s, self._speed_rad_s)
+            allowed = self.gate.apply(self._softened(command), age_s, now_s, self._speed_rad_s)
             self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
             self._sent = allowed
             self._commanded_s = time.monotonic()
         return allowed
 
-    def wait_until_still(self, timeout_s: float, speed_rad_s: float = 0.05, for_s: float = 0.5) -> Reading:
+    def require_fresh(self) -> None:
+        """Refuse to go on without a recent measurement.
+
+        Raises:
+            SafetyStop: The newest is older than ``max_sample_age_s``.
+        """
+        now_s, most_s = time.monotonic(), self.gate.config.max_sample_age_s
+        age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, all is at rest
+        if age_s > most_s:
+            raise SafetyStop(
+                f"node {self.gate.config.node!r} stopped: the newest measurement is {age_s:.3g} s old, "
+                f"{most_s:g} s are allowed",
+                hint="what holds up the sensor? max_sample_age_s sets the limit",
+            )
+
+    def ease(self) -> None:
+        """Begin a soft stop: from now on commands fade to zero within ``stop_s``, and goals stay where they are."""
+        self._eased_s = time.monotonic()
+
+    @property
+    def eased(self) -> bool:
+        """Whether a soft stop is over: all is still, or ``stop_s`` has passed."""
+        if self._eased_s is None:
+            return False
+        passed_s = time.monotonic() - self._eased_s
+        faded = self.gate.config.stale == "hold" or self._sent is None or not np.any(self._sent)
+        still = self._speed_rad_s is not None and bool(np.all(np.abs(self._speed_rad_s) < _STILL_RAD_S))
+        return passed_s > self.gate.config.stop_s or (faded and still)
+
+    def _softened(self, command: np.ndarray) -> np.ndarray:
+        if self._eased_s is None or self._sent is None:
+            return command
+        if self.gate.config.stale == "hold":
+            return self._sent
+        left = 1.0 - (time.monotonic() - self._eased_s) / (_FADE * self.gate.config.stop_s)
+        return np.asarray(command) * max(0.0, left)
+
+    def wait_until_still(self, timeout_s: float, speed_rad_s: float = _STILL_RAD_S, for_s: float = 0.5) -> Reading:
         """Wait, with torque off, until nothing moves any more.
 
         Args:

@@ -1,5 +1,7 @@
 """The policy bundle and its runner: numpy and onnxruntime only, no JAX."""
 
+from sim2real.policy.blended import BlendedRunner as BlendedRunner
+from sim2real.policy.bundle import PolicyReference as PolicyReference
 from sim2real.policy.bundle import load_bundle as load_bundle
 from sim2real.policy.bundle import read_weights as read_weights
 from sim2real.policy.bundle import save_bundle as save_bundle

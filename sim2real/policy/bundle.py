@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -9,6 +10,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -44,6 +46,19 @@ LEAST_STD = 1e-6
 """Smallest standard deviation accepted in a normaliser; those of trained policies are at least 1e-3."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PolicyReference:
+    """What the policy that was trained does, to compare with.
+
+    Attributes:
+        observations: Shape ``(N, O)``.
+        actions: Shape ``(N, A)``: what JAX makes of them.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+
+
 def save_bundle(
     folder: str | Path,
     weights: Mapping[str, np.ndarray],
@@ -51,6 +66,7 @@ def save_bundle(
     samples: np.ndarray | None = None,
     spec: NetworkSpec | None = None,
     graph: bytes | None = None,
+    references: Mapping[str, PolicyReference] = MappingProxyType({}),
 ) -> Path:
     """Write a bundle; ``policy.json`` is written last, so that a folder that has it is complete.
 
@@ -59,23 +75,31 @@ def save_bundle(
         weights: As ``Policy.to_weights`` returns them.
         contract: Observations, actions and rate of the policy.
         samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared, as those
-            of one episode, if onnxruntime is installed. None: drawn from the normaliser.
+            of one episode, if onnxruntime is installed. None: those of the references, or else drawn from the
+            normaliser.
         spec: What the network is; default: a perceptron whose output is clipped.
         graph: The policy as an ONNX model, of a network that is not one of ours.
+        references: Where observations are from, such as ``log`` -> what JAX does there; the runner is compared with it,
+            and how well they agree stands in ``policy.json``.
 
     Returns:
         The folder.
 
     Raises:
-        Sim2RealError: Weights and contract do not fit each other, or numpy and ONNX give different actions.
+        Sim2RealError: Weights and contract do not fit each other, or the runner, ONNX and JAX give different actions.
     """
     spec = spec or NetworkSpec()
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract, spec)
-    if (graph is None) != spec.own:
-        raise UsageError(f"network {spec.name!r} needs {'no ONNX model' if spec.own else 'an ONNX model'} of its own")
-    graph = build_onnx(weights, contract, spec) if graph is None else with_contract(graph, contract)
-    if spec.own and importlib.util.find_spec("onnxruntime") is not None:
+    graph = _graph_of(weights, contract, spec, graph)
+    there = importlib.util.find_spec("onnxruntime") is not None
+    parity = {}
+    if spec.own or there:
+        runner = PolicyRunner(contract, NumpyBackend(weights, spec) if spec.own else OnnxBackend(graph))
+        parity = {name: _parity(weights, runner, reference, name) for name, reference in references.items()}
+    if spec.own and there:
+        if samples is None and references:
+            samples = np.concatenate([reference.observations for reference in references.values()])
         _check_parity(weights, graph, contract, spec, samples)
     files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
     plain = spec == NetworkSpec()
@@ -88,6 +112,7 @@ def save_bundle(
             "std": weights["std"].tolist(),
             "clip": OBSERVATION_CLIP,
         },
+        "parity": parity,
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         "versions": {"python": platform.python_version()}
         | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
@@ -117,17 +142,59 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
         Sim2RealError: A file is missing, damaged or of a format that this version does not know, or the policy is a
             teacher.
     """
-    if backend not in (None, *BACKENDS):
-        raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
+    _check_backend(backend)
     contract, spec = read_contract(folder)
+    weights, folder = read_weights(folder), Path(folder)
+    if backend == "onnx" or (backend is None and not spec.own):
+        spec.refuse_teacher()
+        return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, _read_about(folder))))
+    return make_runner(weights, contract, "numpy", spec)
+
+
+def make_runner(
+    weights: Mapping[str, np.ndarray],
+    contract: PolicyContract,
+    backend: str | None = None,
+    spec: NetworkSpec | None = None,
+    graph: bytes | None = None,
+) -> PolicyRunner:
+    """Return a policy that was not saved, ready to run.
+
+    Args:
+        weights: As ``Policy.to_weights`` returns them.
+        contract: Observations, actions and rate of the policy.
+        backend: As in ``load_bundle``.
+        spec: As in ``save_bundle``.
+        graph: As in ``save_bundle``.
+
+    Raises:
+        UsageError: The backend is unknown, not installed or does not run this network.
+        Sim2RealError: Weights and contract do not fit each other, or the policy is a teacher.
+    """
+    _check_backend(backend)
+    spec = spec or NetworkSpec()
     spec.refuse_teacher()
-    weights = read_weights(folder)
-    if (backend or "numpy") == "numpy" and spec.own:
+    weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
+    _check_fit(weights, contract, spec)
+    if spec.own and backend != "onnx":
         return PolicyRunner(contract, NumpyBackend(weights, spec))
     if backend == "numpy":
         raise UsageError(f"numpy does not run network {spec.name!r}", hint="backend='onnx' runs any")
-    folder = Path(folder)
-    return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, _read_about(folder))))
+    return PolicyRunner(contract, OnnxBackend(_graph_of(weights, contract, spec, graph)))
+
+
+def _graph_of(
+    weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec, graph: bytes | None
+) -> bytes:
+    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a network not ours."""
+    if (graph is None) != spec.own:
+        raise UsageError(f"network {spec.name!r} needs {'no ONNX model' if spec.own else 'an ONNX model'} of its own")
+    return build_onnx(weights, contract, spec) if graph is None else with_contract(graph, contract)
+
+
+def _check_backend(backend: str | None) -> None:
+    if backend not in (None, *BACKENDS):
+        raise UsageError(f"there is no policy backend {backend!r}; available: {', '.join(BACKENDS)}")
 
 
 def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
@@ -247,6 +314,22 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         promised = np.array([getattr(term, side) for term in contract.action], np.float32)
         if not np.array_equal(promised, weights[side]):
             raise Sim2RealError(f"the policy's {side} bounds are {weights[side]}, the contract's are {promised}")
+
+
+def _parity(
+    weights: Mapping[str, np.ndarray], runner: PolicyRunner, reference: PolicyReference, name: str
+) -> dict[str, float]:
+    """Return how far the runner is off JAX, as a fraction of the actions' range, and on how many observations."""
+    runner.reset()
+    actions = np.array([runner(observation) for observation in reference.observations])
+    off = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
+    if not off.max(initial=0.0) <= PARITY:  # a NaN is no parity
+        raise Sim2RealError(
+            f"the runner disagrees with JAX by {off.max():.2e} of the action range on observations of the {name}, "
+            f"{PARITY:.0e} is allowed",
+            hint="what was trained is not what would run: a normaliser with tiny deviations loses float32's precision",
+        )
+    return {"samples": len(actions), "largest": float(off.max(initial=0.0))}
 
 
 def _check_parity(

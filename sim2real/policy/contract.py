@@ -96,6 +96,9 @@ class PolicyContract:
         action: The entries of the action vector in their order.
         rate_hz: Policy steps per second.
         delays_s: Name -> expected delay that the policy was trained with [s], e.g. ``{"sensor -> agent": 0.012}``.
+        trained_s: Name -> shortest and longest that episodes of the training had [s]: ``round_trip_delay``, what lies
+            between a command's departure and the motion in a measurement, and node -> duration of its steps. Empty:
+            the training had no delays, or does not say.
         limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
         hashes: Name -> sha256 of the files that it was made from, e.g. the log and the identified parameters.
     """
@@ -104,6 +107,7 @@ class PolicyContract:
     action: tuple[ActionTerm, ...]
     rate_hz: float
     delays_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    trained_s: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -121,6 +125,9 @@ class PolicyContract:
         for name, delay in self.delays_s.items():
             if not (math.isfinite(delay) and delay >= 0):
                 raise UsageError(f"delay {name!r} must be finite and at least 0 s, got {delay}")
+        for name, (least, most) in self.trained_s.items():
+            if not 0 <= least <= most < math.inf:
+                raise UsageError(f"times of {name!r} must be finite and in order, got {least} to {most} s")
 
     @property
     def observation_size(self) -> int:
@@ -145,6 +152,7 @@ class PolicyContract:
             | {"size": term.size}
             for term in self.observation
         ]
+        data["trained_s"] = {name: list(times) for name, times in self.trained_s.items()}
         data["delays_s"], data["limits"], data["hashes"] = dict(self.delays_s), dict(self.limits), dict(self.hashes)
         return data
 
@@ -170,7 +178,10 @@ class PolicyContract:
                 ),
                 rate_hz=float(data["rate_hz"]),
                 delays_s={name: float(delay) for name, delay in data["delays_s"].items()},
-                limits=dict(data["limits"]),
+                trained_s={
+                    name: (float(least), float(most)) for name, (least, most) in data.get("trained_s", {}).items()
+                },
+                limits={name: float(limit) for name, limit in data["limits"].items()},
                 hashes=dict(data["hashes"]),
             )
         except Sim2RealError:

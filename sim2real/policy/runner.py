@@ -174,6 +174,10 @@ class PolicyRunner:
         """Start an episode: a policy that remembers forgets the one before."""
         self._backend.reset()
 
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action for the next observation of the episode; as ``act``."""
+        return self.act(observation)
+
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return the action, float32 of shape ``(A,)`` within the contract's bounds.
 

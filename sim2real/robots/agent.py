@@ -1,20 +1,25 @@
-"""The policy's node: reads measurements, keeps a short history, and sends goals of joints, or actions as they are."""
+"""The policy's node: reads measurements, keeps a short history, and sends goals of joints, or actions as they are.
+
+``observe`` and ``act`` compute with what they get: JAX in a compiled graph, numpy on the wall clock, where a call of
+JAX for each small array would take longer than the policy.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.arrays import namespace
+from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.robots.messages import Decision, JointReading
 from sim2real.robots.roles import ROLES
 
-Features = Callable[[JointReading, Any, Any], jax.Array]
+Features = Callable[[JointReading, Any, Any], Array]
 """Returns the part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``."""
 
 
@@ -55,7 +60,7 @@ def first_carry(policy: Any) -> Any:
     return policy.initial_carry() if hasattr(policy, "initial_carry") else ()
 
 
-def decide(policy: Any, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+def decide(policy: Any, carry: Any, observation: Array) -> tuple[Any, Array]:
     """Return what a policy carries on, and its action.
 
     Args:
@@ -96,7 +101,7 @@ class GoalAgent(BaseNode):
         **options: Any,
     ) -> None:
         super().__init__(name, rate, **options)
-        self._low, self._high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+        self._low, self._high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         self._features, self._history, self._aims, self._sensor = features, history, aims, sensor
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
@@ -116,19 +121,20 @@ class GoalAgent(BaseNode):
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return Decision(jnp.asarray(params.start, jnp.float32), jnp.asarray(params.aim, jnp.float32))
 
-    def observe(self, step_state: StepState) -> jax.Array:
+    def observe(self, step_state: StepState) -> Array:
         """Return the policy's observation: the features, then the history, newest first."""
         reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
         now = self._features(reading, state.goal, step_state.params.aim)
-        return jnp.concatenate([now, state.past.ravel()]).astype(jnp.float32)
+        return namespace(now, state.past).concatenate([now, state.past.ravel()]).astype(np.float32)
 
     def act(self, step_state: StepState, action: Any) -> tuple[StepState, Decision]:
         """Return the new step state and the message for an action ``(joints,)``: speeds of the goals [rad/s]."""
         reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
-        goal = jnp.clip(state.goal + jnp.asarray(action, jnp.float32) / self.rate, self._low, self._high)
-        row = jnp.concatenate([reading.position, reading.velocity, goal]).astype(jnp.float32)
-        new = state.replace(goal=goal, past=jnp.concatenate([row[None], state.past])[: self._history])
-        decision = Decision(goal, jnp.asarray(step_state.params.aim, jnp.float32))
+        xp = namespace(action, state.goal, reading.position)
+        goal = xp.clip(state.goal + xp.asarray(action, np.float32) / self.rate, self._low, self._high)
+        row = xp.concatenate([reading.position, reading.velocity, goal]).astype(np.float32)
+        new = state.replace(goal=goal, past=xp.concatenate([row[None], state.past])[: self._history])
+        decision = Decision(goal, xp.asarray(step_state.params.aim, np.float32))
         return step_state.replace(state=new), decision
 
     def step(self, step_state: StepState) -> tuple[StepState, Decision]:
@@ -175,7 +181,7 @@ class DirectAgent(BaseNode):
         self,
         name: str,
         rate: float,
-        features: Callable[[Any], jax.Array],
+        features: Callable[[Any], Array],
         sizes: tuple[int, int],
         history: int,
         message: Callable[[Any], Any],
@@ -201,17 +207,19 @@ class DirectAgent(BaseNode):
         del rng, graph_state
         return self._message(jnp.zeros(self._sizes[1]))
 
-    def observe(self, step_state: StepState) -> jax.Array:
+    def observe(self, step_state: StepState) -> Array:
         """Return the policy's observation: the features, then the history, newest first."""
-        past = step_state.state
-        return jnp.concatenate([self._now(step_state), past.observations.ravel(), past.actions.ravel()])
+        past, now = step_state.state, self._now(step_state)
+        xp = namespace(now, past.observations)
+        return xp.concatenate([now, past.observations.ravel(), past.actions.ravel()])
 
     def act(self, step_state: StepState, action: Any) -> tuple[StepState, Any]:
         """Return the new step state and the message for an action ``(actions,)``."""
-        past = step_state.state
+        past, now = step_state.state, self._now(step_state)
+        xp = namespace(action, now, past.observations)
         new = past.replace(
-            observations=jnp.concatenate([self._now(step_state)[None], past.observations[:-1]]),
-            actions=jnp.concatenate([jnp.asarray(action, jnp.float32)[None], past.actions[:-1]]),
+            observations=xp.concatenate([now[None], past.observations[:-1]]),
+            actions=xp.concatenate([xp.asarray(action, np.float32)[None], past.actions[:-1]]),
         )
         return step_state.replace(state=new), self._message(action)
 
@@ -223,5 +231,5 @@ class DirectAgent(BaseNode):
         carry, action = decide(policy, past.carry, self.observe(step_state))
         return self.act(step_state.replace(state=past.replace(carry=carry)), action)
 
-    def _now(self, step_state: StepState) -> jax.Array:
+    def _now(self, step_state: StepState) -> Array:
         return self._features(step_state.inputs[self._sensor][-1].data)

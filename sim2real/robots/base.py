@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import numpy as np
@@ -22,6 +23,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.identify.model import IdentifiableModel
 from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.probe import Probe
 from sim2real.robots.roles import ROLES, Roles
 from sim2real.train.env import TrainingTask
 
@@ -119,6 +121,8 @@ class Robot(RecordedRobot):
         joints: Joint -> quantity -> field of the sensor's message, for the log; see ``McapRecorder``.
         observation: Terms of the policy's observation, in order.
         action: The policy's actions, in order, with the bounds that the robot bears.
+        limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
+        probe: The steps by which deploy measures the delay; None: it is not measured.
     """
 
     rate_hz: float
@@ -126,6 +130,8 @@ class Robot(RecordedRobot):
     joints: Mapping[str, Mapping[str, str]]
     observation: tuple[ObservationTerm, ...]
     action: tuple[ActionTerm, ...]
+    limits: Mapping[str, float] = MappingProxyType({})
+    probe: Probe | None = None
 
     _DATA: ClassVar[Mapping[str, Datum]] = {
         **RecordedRobot._DATA,
@@ -180,7 +186,8 @@ class Robot(RecordedRobot):
 
         Args:
             session: The open robot.
-            policy: The policy: a pytree with ``get_action(observation)``.
+            policy: What runs the policy: ``reset()`` begins an episode, a call with an observation ``(O,)`` returns the
+                action ``(A,)``, both numpy arrays; see ``PolicyNode``.
             trial: Number of the trial. If the task differs between trials, e.g. in its target, the same number stands
                 for the same task, on hardware and in simulation.
         """

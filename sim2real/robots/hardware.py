@@ -187,7 +187,12 @@ class ServoActuator(BaseNode):
         return True
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
-        """Send the newest command."""
+        """Send the newest command.
+
+        Raises:
+            SafetyStop: The newest measurement is too old, or what the gate stopped.
+        """
+        self._rig.require_fresh()
         message = step_state.inputs[self._agent]
         now_s = self.now()
         age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0

@@ -26,6 +26,7 @@ from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, drawn_in_a_loop, in_a_loop, simulated_loop
+from sim2real.robots.policy_node import PolicyNode, Runner, in_numpy
 from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
 from sim2real.train.tasks import Rewards
@@ -204,17 +205,18 @@ class LoopRobot(Robot):
         return self._on_hardware(session, Excitation(name, self.rate_hz, rows, self.message, delay=delay_s))
 
     def deployment_nodes(
-        self, session: ServoSession, policy: Any, trial: int = 0
+        self, session: ServoSession, policy: Runner, trial: int = 0
     ) -> tuple[dict[str, BaseNode], dict[str, Any]]:
         """Return the graph on hardware that runs a policy, and the agent's parameters.
 
         Args:
             session: The open robot.
-            policy: The policy.
+            policy: What runs the policy.
             trial: Number of the trial.
         """
-        params = {self.roles.supervisor: self.agent_params(session, policy, trial)}
-        return self._on_hardware(session, self.make_agent(delay=self.expected_delay_s[1])), params
+        params = {self.roles.supervisor: in_numpy(self.agent_params(session, None, trial))}
+        agent = PolicyNode(self.make_agent(delay=self.expected_delay_s[1]), policy)
+        return self._on_hardware(session, agent), params
 
     def identifiable(self, max_delay_s: float) -> IdentifiableLoop:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""

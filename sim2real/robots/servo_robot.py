@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.graph.arrays import namespace
+from sim2real.graph.base import Array
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device, Reading
@@ -128,15 +130,18 @@ class ServoRobot(LoopRobot):
         """Return positions and velocities of all that moves in the model, and the servos' setpoints."""
         return state.data.qpos, state.data.qvel, state.variables[REFERENCE]
 
-    def observe(self, reading: JointReading, goal: Any, aim: Any) -> jax.Array:
+    def observe(self, reading: JointReading, goal: Any, aim: Any) -> Array:
         """Return what the policy sees of the present, in the order of ``features``.
+
+        In training it gets JAX arrays, on the robot numpy's, for which ``namespace(goal)`` is ``numpy``: where it calls
+        ``jax.numpy`` all the same, it is only slower there.
 
         Args:
             reading: The newest measurement.
             goal: The goals, shape ``(joints,)`` [rad].
             aim: What the episode is about, shape ``(k,)``.
         """
-        return jnp.concatenate([reading.position, reading.velocity, goal, aim])
+        return namespace(goal).concatenate([reading.position, reading.velocity, goal, aim])
 
     # -- what the stages ask
 
@@ -167,6 +172,13 @@ class ServoRobot(LoopRobot):
         """The policy's actions, as fast as goals may go, either way [rad/s]."""
         speed = self.servos.speed
         return tuple(ActionTerm(f"speed of {j}'s goal", "rad/s", -speed, speed) for j in self.servos.names)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The ends of each joint's goals [rad]."""
+        s = self.servos
+        ends = {"lowest": s.low, "highest": s.high}
+        return {f"{end} goal of {name}": v for end, vs in ends.items() for name, v in zip(s.names, vs, strict=True)}
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -315,16 +327,7 @@ class ServoRobot(LoopRobot):
         """Return a gate that holds the last goals when commands are stale."""
         s = self.servos
         low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
-        return GateConfig(
-            (tuple(low), tuple(high)),
-            limits.slew_per_s,
-            limits.command_timeout_s,
-            limits.max_speed_rad_s,
-            stale="hold",
-            node=self.roles.actuator,
-            joints=s.names,
-            stuck_effort=limits.stuck_effort,
-        )
+        return limits.gate((tuple(low), tuple(high)), stale="hold", node=self.roles.actuator, joints=s.names)
 
     def read(self, reading: Reading) -> JointReading:
         """Return the sensor's message of a reading."""

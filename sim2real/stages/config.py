@@ -151,6 +151,18 @@ class DeployConfig:
     """Longest wait for the robot to come to rest before a deployment [s]."""
     seed: int = 0
     """Seed of the embedded robot."""
+    backend: Literal["numpy", "onnx"] = "numpy"
+    """What runs the policy: numpy, or onnxruntime, where that is installed."""
+    blend_s: float = 0.0
+    """Time in which the policy's action grows from none to all of it, for a first try on a robot [s]."""
+    measure_delay: bool = True
+    """Measure the delay with a few small steps, where the robot says how, before the policy moves it."""
+    delay_tolerance_s: float = 0.008
+    """How far the measured delay may lie outside of those that the policy was trained with [s]."""
+    force: bool = False
+    """Deploy, with a warning, though the delay is not what the policy was trained with."""
+    hold: bool = False
+    """Hold the robot where an episode or Ctrl-C ends it, until Enter is pressed: for one that falls without torque."""
     dry_run: bool = False
     """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
     strict_timing: bool = False
@@ -161,6 +173,11 @@ class DeployConfig:
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
         check_seed(self.seed)
+        if not (0.0 <= self.blend_s <= 60.0 and 0.0 < self.delay_tolerance_s <= 1.0):
+            raise UsageError(
+                "blend_s must lie in [0, 60] s and delay_tolerance_s in (0, 1] s, "
+                f"got {self.blend_s} and {self.delay_tolerance_s}"
+            )
         if self.episodes < 1:
             raise UsageError(f"episodes must be at least 1, got {self.episodes}")
         if not 1.0 <= self.duration_s <= 3600.0:
@@ -332,6 +349,18 @@ class ExportConfig:
     """What to write: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """The file to write; default: one in the working directory that is called after the pipeline."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+
+@dataclass(frozen=True)
+class ShipConfig:
+    """Write a policy bundle elsewhere, with an example that runs it on a machine that has numpy alone."""
+
+    source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|BUNDLE")] = None
+    """A bundle's folder, a run folder, or a pipeline, whose newest training is taken."""
+    to: Annotated[Path | None, arg(metavar="DIR")] = None
+    """The folder to write; default: one in the working directory."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 

@@ -12,17 +12,17 @@ from sim2real.artifacts.deployment import Deployment, Scores, log_of
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, finished, newest, open_stage
-from sim2real.errors import Sim2RealError
+from sim2real.errors import UsageError
+from sim2real.policy.blended import BlendedRunner
 from sim2real.robots.base import Robot, Session
+from sim2real.stages.admission import check_delay, require_fit, require_untouched
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
-from sim2real.stages.gap import compare
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
-from sim2real.train.networks import Policy
 
 
 def deploy(
@@ -50,21 +50,28 @@ def deploy(
     pipeline = pipeline_of(robot)
     config = config or pipeline.deploy
     robot = moving_robot(pipeline)
-    policy = _load_policy(robot, bundle)
+    require_fit(robot, bundle)
+    policy = BlendedRunner(bundle.runner(config.backend), config.blend_s)
     if identification is not None:
         check_parameters(identification, pipeline)
     logs = [log_of(folder, i) for i in range(config.episodes)]
     with opened(robot, config, folder / TRUTH) as session:
+        if config.hold and session.rig.gate.config.stale != "hold":
+            raise UsageError("this robot's motors hold no position", hint="leave out --hold")
+        delay = _measured_delay(robot, session, bundle, config)
         sessions = [_episode(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
     recordings = [Recording.load(log, folder / TRUTH) for log in logs]
     if config.dry_run:  # nothing was moved: there is nothing to judge or to compare
         nothing = tuple(Scores({}) for _ in recordings)
         none: tuple[dict[str, np.ndarray], ...] = tuple({} for _ in recordings)
         return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
-    if identification is None:
-        return compare(robot, recordings, policy, None, config.duration_s), sessions
-    simulated = moving_robot(pipeline, identification.world)
-    return compare(simulated, recordings, policy, identification.values, config.duration_s), sessions
+    sessions = [{**summary, **delay} for summary in sessions]
+    from sim2real.stages.gap import compare  # what simulates is imported, and compiled, when the robot is at rest
+    from sim2real.train.networks import Policy
+
+    world, values = (None, None) if identification is None else (identification.world, identification.values)
+    trained = Policy.from_weights(bundle.weights, bundle.spec)
+    return compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s), sessions
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -79,7 +86,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     robot = moving_robot(pipeline)
     path, run_dir = _find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
-    _load_policy(robot, bundle)  # one of another robot is refused before a folder is made
+    require_fit(robot, bundle)  # one of another robot is refused before a folder is made
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
         for i in range(config.episodes):
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
@@ -110,12 +117,22 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
+def _measured_delay(robot: Robot, session: Session, bundle: Bundle, config: DeployConfig) -> dict[str, Any]:
+    """Return what was found of the delay, for the summary; the robot is brought to rest before."""
+    if config.dry_run or not config.measure_delay or robot.probe is None:
+        return {}
+    note("waiting for the robot to come to rest, then a few small steps to measure its delay")
+    robot.prepare(session, config.settle_s)
+    return check_delay(robot, session.rig, bundle.contract, config)
+
+
 def _summary(found: Deployment, sessions: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the few lines that the console shows at the end."""
     scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(found.episodes)}
     success = {name: round(value, 3) for name, value in scores.items() if value is not None}
     return {
         **success,
+        **{name: said for name, said in sessions[-1].items() if name == "measured delay"},
         "lost replies": sessions[-1]["lost_replies"],
         "late replies": sessions[-1]["late_replies"],
         "odd measurements": sum(len(summary["suspects"]) for summary in sessions),
@@ -124,7 +141,13 @@ def _summary(found: Deployment, sessions: list[dict[str, Any]]) -> dict[str, Any
 
 
 def _episode(
-    pipeline: Pipeline, robot: Robot, session: Session, policy: Policy, trial: int, log: Path, config: DeployConfig
+    pipeline: Pipeline,
+    robot: Robot,
+    session: Session,
+    policy: BlendedRunner,
+    trial: int,
+    log: Path,
+    config: DeployConfig,
 ) -> dict[str, Any]:
     """Run one episode; return its session's summary."""
     then = f"{config.duration_s:g} s on {config.port}"
@@ -134,7 +157,7 @@ def _episode(
         note(f"waiting for the robot to come to rest, then {then}")
         robot.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy, trial)
-    return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy")
+    return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)
 
 
 def _find_bundle(
@@ -143,34 +166,8 @@ def _find_bundle(
     if config.bundle is not None:
         return Path(config.bundle), run_dir
     trained = newest(root, pipeline.name, "train", run_dir)
+    require_untouched(trained)
     return trained.output("bundle"), run_dir or trained.run_dir
-
-
-def _load_policy(robot: Robot, bundle: Bundle) -> Policy:
-    """Return the policy, once it is known that it fits the robot."""
-    bundle.spec.refuse_teacher()
-    contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
-    expected, found = ([(t.name, tuple(t.units), t.history) for t in c.observation] for c in (robot, contract))
-    if found != expected or contract.rate_hz != robot.rate_hz:
-        raise Sim2RealError(
-            f"the policy {where} sees {found} at {contract.rate_hz:g} Hz, "
-            f"this robot shows {expected} at {robot.rate_hz:g} Hz",
-            hint="train a policy for this pipeline",
-        )
-    takes, sends = ([(a.name, a.unit) for a in c.action] for c in (robot, contract))
-    if sends != takes:
-        raise Sim2RealError(
-            f"the policy {where} sends {sends}, this robot takes {takes}",
-            hint="train a policy for this pipeline",
-        )
-    for action, most in zip(contract.action, robot.action, strict=True):
-        if action.low < np.float32(most.low) or action.high > np.float32(most.high):  # training rounds them so
-            raise Sim2RealError(
-                f"the policy {where} sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}, "
-                f"this robot bears {most.low:g} to {most.high:g}",
-                hint="train a policy for this pipeline",
-            )
-    return Policy.from_weights(bundle.weights, bundle.spec)
 
 
 def _identified(pipeline: Pipeline, run_dir: Path) -> Identification | None:

@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -14,12 +15,26 @@ Result = TypeVar("Result")
 _LOOK_S = 0.25
 
 
+_soft = threading.Event()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let the next signal raise an exception, though one has come already."""
+    _soft.set()
+    try:
+        yield
+    finally:
+        _soft.clear()
+
+
 class SignalHandling:
     """Turns SIGINT, SIGTERM and SIGHUP into exceptions, so that every ``finally`` runs: torque off, logs closed.
 
     Only the first signal raises an exception: a second Ctrl-C must not interrupt the clean-up that takes the torque
-    off. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the garbage
-    collector), the signal is sent again.
+    off. What may take its time after the first, such as a soft stop, is done in ``interruptible``, where the next one
+    raises once more. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the
+    garbage collector), the signal is sent again.
 
     Attributes:
         received: Number of the signal that raised an exception; 0 before.
@@ -49,9 +64,10 @@ class SignalHandling:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
-        if self._raised is not None:
+        if self._raised is not None and not _soft.is_set():
             os.write(2, b"still cleaning up\n")  # print() is not safe inside a signal handler
             return
+        _soft.clear()
         self.received = number
         self._raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
         raise self._raised

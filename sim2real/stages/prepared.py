@@ -283,13 +283,16 @@ def find_parameters(
     return found.output("parameters"), run_dir or found.run_dir
 
 
-def contract_of(robot: Robot, task: TrainingTask, values: Mapping[str, float]) -> PolicyContract:
-    """Return what a policy of a robot sees and does.
+def contract_of(
+    robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
+) -> PolicyContract:
+    """Return what a policy of a robot sees and does, and the delays that it is trained with.
 
     Args:
         robot: The robot.
         task: Its task, with the actions' bounds.
         values: Parameters by name, whose delays the policy is trained with.
+        episodes: What the training's episodes are drawn from.
     """
     return PolicyContract(
         observation=robot.observation,
@@ -299,5 +302,18 @@ def contract_of(robot: Robot, task: TrainingTask, values: Mapping[str, float]) -
         ),
         rate_hz=robot.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
+        trained_s={} if episodes is None else _trained(values, episodes),
+        limits=dict(robot.limits),
         hashes={},
     )
+
+
+def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple[float, float]]:
+    """Return the shortest and longest round trip of the episodes, and of each node's steps all but 1 % either way."""
+    trained: dict[str, tuple[float, float]] = {}
+    if set(DELAYS) <= set(values):
+        trips = np.append(episodes.draws.get(ROUND_TRIP, []), sum(values[n] for n in DELAYS))
+        trained[ROUND_TRIP] = (float(trips.min()), float(trips.max()))
+    for node, took_s in episodes.drawn_s.items():
+        trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
+    return trained

@@ -22,7 +22,9 @@ from sim2real.robots.base import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.console import progress
+from sim2real.stages.interruption import interruptible
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.resting import come_to_rest
 from sim2real.stages.rig import answer_rows, bus_use, rig_summary, sent_rows
 
 LATE_SHARE = 0.01
@@ -74,6 +76,7 @@ def run_episode(
     duration_s: float,
     config: Any,
     label: str,
+    hold: bool = False,
 ) -> dict[str, Any]:
     """Run the graph for a while and log it; whatever happens, the motors end without torque and the log readable.
 
@@ -87,6 +90,7 @@ def run_episode(
         duration_s: How long to run [s].
         config: The stage's configuration, for the log's metadata.
         label: What the progress bar says.
+        hold: Whether the motors hold the robot where it ends, until somebody says that it can do without them.
 
     Returns:
         The summary that also stands in the log's ``session_end``: timing by node, losses, the gate's counts.
@@ -101,7 +105,14 @@ def run_episode(
     watch = Watch(recorder)
     graph.recorder = watch
     try:
-        _drive(graph, state, duration_s, label)
+        try:
+            _drive(graph, state, duration_s, label)
+        except (KeyboardInterrupt, SystemExit):
+            with interruptible():  # a second signal stops at once
+                come_to_rest(graph, session.rig, hold)
+            raise
+        if hold:
+            come_to_rest(graph, session.rig, hold)
         graph.stop()
     except BaseException as error:
         session.rig.stop_quietly()

@@ -14,9 +14,11 @@ import numpy as np
 from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import OpenStage, StageFolder, open_stage
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
+from sim2real.policy.bundle import make_runner
 from sim2real.robots.base import Robot
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.stages.config import TrainConfig
@@ -26,6 +28,7 @@ from sim2real.stages.events import event_files
 from sim2real.stages.explaining import disturbance_rows, explain
 from sim2real.stages.interruption import patiently
 from sim2real.stages.parameters import open_identification
+from sim2real.stages.parity import MOST, logged, observations_of, reference_of
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.prepared import contract_of, find_parameters, prepare, require_accepted, timing_of
 from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
@@ -48,6 +51,7 @@ def train(
     resume: Path | None = None,
     watch: Callable[[Progress], None] | None = None,
     teacher: Bundle | None = None,
+    log: Recording | None = None,
 ) -> tuple[Bundle, dict[str, Any]]:
     """Train a policy.
 
@@ -61,6 +65,7 @@ def train(
         resume: Such a file, of the same training, to go on from.
         watch: Called after each evaluation.
         teacher: Whom the policy imitates; None: it learns from rewards.
+        log: A recording: on what a policy would have seen there, what will run is compared with what was trained.
 
     Returns:
         The policy with what it expects and promises, and numbers about the training.
@@ -74,7 +79,7 @@ def train(
     config = config or pipeline.train
     made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
-    own = contract_of(made.robot, made.env.task, made.values)
+    own = contract_of(made.robot, made.env.task, made.values, made.episodes)
     master = None if teacher is None else teacher_of(teacher, own)
     with progress(ppo.evaluations, "train (compiling)", leads()) as bar, in_words():
         key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
@@ -86,17 +91,13 @@ def train(
     weak = None
     if config.sensitivity and leads():
         weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
-    policy = result.best
-    bundle = Bundle(
-        as_taught(own, policy),
-        policy.to_weights(),
-        _history(result),
-        made.episodes,
-        None,
-        weak,
-        policy.spec,
-        export_graph(policy),
-    )
+    policy, weights = result.best, result.best.to_weights()
+    contract, graph = as_taught(own, policy), export_graph(policy)
+    seen = {} if policy.spec.privileged else {"training": result.observations[:MOST]}
+    if seen and log is not None and isinstance(made.robot, LoopRobot):
+        seen["log"] = observations_of(made.robot, log, make_runner(weights, contract, None, policy.spec, graph))
+    references = {name: reference_of(policy, observations) for name, observations in seen.items()}
+    bundle = Bundle(contract, weights, _history(result), made.episodes, None, weak, policy.spec, graph, references)
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
     about = {
         "model": config.model,
@@ -173,8 +174,8 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         return None
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
-            kept = checkpoint if config.checkpoint else None
-            bundle, about = train(pipeline, config, identification, None, kept, resume, watch, teacher)
+            kept, log = checkpoint if config.checkpoint else None, logged(identification, stage.run_dir)
+            bundle, about = train(pipeline, config, identification, None, kept, resume, watch, teacher, log)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256

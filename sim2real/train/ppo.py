@@ -110,7 +110,8 @@ def train(
             _save(checkpoint, identity, now, layout)
         report(now.log[-1])
     members = [point for point in sweep.grid for _ in range(config.num_seeds)]
-    return _result(members, now, first, compiled - start, time.perf_counter() - compiled)
+    train_s, seen = time.perf_counter() - compiled, np.asarray(gather(now.state.copies.observation, layout))
+    return _result(members, now, first, seen, compiled - start, train_s)
 
 
 def _save(path: Path, identity: TrainingIdentity, now: Checkpoint, layout: Shardings | None) -> None:
@@ -150,9 +151,23 @@ def _advance(
 
 
 def _result(
-    members: list[dict[str, float]], now: Checkpoint, first: int, compile_s: float, train_s: float
+    members: list[dict[str, float]],
+    now: Checkpoint,
+    first: int,
+    seen: np.ndarray,
+    compile_s: float,
+    train_s: float,
 ) -> TrainResult:
-    """Return the result; ``first`` evaluations were made before this process."""
+    """Return the result.
+
+    Args:
+        members: The settings of each place on the leading axis.
+        now: The training at its end.
+        first: Number of evaluations that were made before this process.
+        seen: Shape ``(M, N, O)``: observations of all copies of all members.
+        compile_s: Time to trace and compile [s].
+        train_s: Time since then [s].
+    """
     log, history = now.log, history_of(now.log)
     trained = log[-1].env_steps - (log[first - 1].env_steps if first else 0)
     return TrainResult(
@@ -163,6 +178,7 @@ def _result(
         history=history,
         env_steps=np.array([progress.env_steps for progress in log]),
         elapsed_s=np.array([progress.elapsed_s for progress in log]),
+        observations=seen[best_of(history)[1]],
         env_steps_per_s=len(members) * trained / train_s,
         compile_s=compile_s,
         train_s=train_s,

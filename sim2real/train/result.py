@@ -42,6 +42,8 @@ class TrainResult:
             asked for where the target was reached.
         env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
         elapsed_s: Shape ``(evaluations,)``: time that training took so far [s].
+        observations: Shape ``(N, O)``: what the policies that ended training saw last, of the best one's place on the
+            seed axis.
         env_steps_per_s: Rows of all seeds per second of ``train_s``, those of evaluations not counted.
         compile_s: Time to trace and compile [s].
         train_s: Time to train and evaluate [s]; of a resumed training, since then.
@@ -54,6 +56,7 @@ class TrainResult:
     history: dict[str, np.ndarray]
     env_steps: np.ndarray
     elapsed_s: np.ndarray
+    observations: np.ndarray
     env_steps_per_s: float
     compile_s: float
     train_s: float

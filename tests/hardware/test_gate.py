@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.config import GateLimits
 from sim2real.hardware.gate import GateConfig, SafetyGate
 
 
@@ -167,3 +168,16 @@ def test_a_gate_that_holds_never_jumps_nor_moves_away_from_its_limits(start, cal
         assert np.all(outside(allowed) <= outside(last))
         last = allowed
     assert gate.counts.passed == len(calls)
+
+
+def test_a_gates_new_limits_are_checked():
+    with pytest.raises(UsageError, match="holds no position"):
+        GateConfig(envelope_rad=(1.0, -1.0))
+    with pytest.raises(UsageError, match="max_sample_age_s"):
+        GateConfig(max_sample_age_s=0.0)
+    with pytest.raises(UsageError, match="stop_s"):
+        GateLimits(stop_s=0.0)
+    limits = GateLimits(envelope_rad=(-1.0, 2.0), stop_s=0.3, max_sample_age_s=0.4, stuck_effort=0.5)
+    gate = limits.gate(1.0, joints=("a",))
+    assert (gate.envelope_rad, gate.stop_s, gate.max_sample_age_s) == ((-1.0, 2.0), 0.3, 0.4)
+    assert (gate.slew_per_s, gate.stuck_effort, gate.joints) == (400.0, 0.5, ("a",))

@@ -52,6 +52,36 @@ def test_a_joint_that_stands_still_is_normal(efforts):
     assert judge(efforts).suspects == []
 
 
+def moving_then_still(speed_rad_s, still=6):
+    """Return positions (N, 2): the second joint moves, and then reads the same."""
+    tilt = np.concatenate([speed_rad_s * PERIOD_S * np.arange(6), np.full(still, speed_rad_s * PERIOD_S * 5)])
+    return np.stack([np.zeros_like(tilt), tilt], axis=1)
+
+
+FREE = GateConfig(max_speed_rad_s=20.0, joints=("pan", "tilt"), freeze_rad_s=2.0)
+
+
+def test_a_joint_that_stops_dead_though_it_is_pushed_is_stopped():
+    path = moving_then_still(6.0)
+    message = r"joint 'tilt' has read 0\.6 rad for 0\.06 s, but moved at 6 rad/s just before"
+    with pytest.raises(SafetyStop, match=message):
+        judge(np.full(path.shape, 0.1), path, FREE)
+
+
+@pytest.mark.parametrize(
+    ("path", "effort"),
+    [
+        (moving_then_still(1.0), 0.1),  # a slow joint may stick
+        (moving_then_still(6.0), 0.0),  # nothing pushes it: somebody moved it by hand
+        (moving_then_still(6.0, still=2), 0.1),  # an old sample or two
+        (np.stack([np.zeros(40), 0.5 * np.sin(12.0 * PERIOD_S * np.arange(40))], axis=1), 0.1),  # it swings
+    ],
+    ids=["slow", "by hand", "old samples", "swing"],
+)
+def test_what_comes_to_rest_by_itself_is_normal(path, effort):
+    assert judge(np.full(path.shape, effort), path, FREE).suspects == []
+
+
 def test_a_joint_that_is_pushed_both_ways_and_stands_still_is_stopped():
     message = r"joint 'tilt' has read -0.25 rad for 0\.\d+ s, though it was pushed both ways with more than 20%"
     with pytest.raises(SafetyStop, match=message):
@@ -130,7 +160,7 @@ def swing(rig, duration_s):
 @pytest.mark.parametrize("kind", SERVOS)
 def test_an_encoder_that_stands_still_stops_the_robot(open_rig, kind):
     plant, drive, gate, ids = SERVOS[kind]
-    gate = GateConfig(**gate, max_speed_rad_s=60.0)
+    gate = GateConfig(**gate, max_speed_rad_s=60.0, freeze_rad_s=1e3)  # it may move just then
     rig = open_rig(plant, drive, gate, EmulatorConfig(frozen_after_s=0.8), ids)
     with pytest.raises(SafetyStop, match=r"joint \d has read .* rad for .* s, though it was pushed both ways"):
         swing(rig, 5.0)

@@ -344,3 +344,16 @@ def test_supplies_that_are_none(supply_v):
 def test_a_slow_profile_is_not_rounded_to_none(open_arm, speed_rad_s, count):
     rig, _ = open_arm(PositionDrive(800, speed_rad_s))
     assert rig.device.read(1, reg.PROFILE_VELOCITY) == count
+
+
+def test_a_soft_stop_leaves_the_goals_where_they_are_until_all_is_still(open_arm):
+    rig, _ = open_arm(stop_s=2.0, slew_per_s=3.0)
+    rig.start()
+    moving, _ = run(rig, START_RAD + 1.0, 0.3)  # on the way there
+    rig.ease()
+    assert not rig.eased, "it still moves"
+    held, reading = run(rig, START_RAD + 1.0, 0.6)
+    assert np.array_equal(held, np.broadcast_to(moving[-1], held.shape))
+    assert rig.eased
+    np.testing.assert_allclose(reading.position_rad, moving[-1], atol=0.02)
+    assert rig.device.read(1, reg.TORQUE_ENABLE) == 1, "torque is somebody else's decision"

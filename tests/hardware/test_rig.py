@@ -1,5 +1,7 @@
 """The rig on a real emulator: what stops the motors, and that nothing else does."""
 
+import os
+import signal
 import threading
 import time
 
@@ -217,3 +219,63 @@ def test_a_bus_that_cannot_be_set_up_is_closed(start_robot):
     with pytest.raises(HardwareLost, match="servo 7 does not answer"):
         Rig(DynamixelServos(BusConfig(robot.port), [7], VoltageDrive(SUPPLY_V)), GateConfig())
     Rig(DynamixelServos(BusConfig(robot.port), [1], VoltageDrive(SUPPLY_V)), GateConfig()).close()
+
+
+def test_a_soft_stop_fades_the_voltage_before_the_torque_goes_off(open_rig):
+    rig, robot = open_rig(stop_s=0.5)
+    rig.start()
+    run(rig, 3.0, 0.3)
+    rig.ease()
+    begin = time.monotonic()
+    sent = []
+    while not rig.eased:
+        sent.append(volts(rig, 3.0)[0])
+        rig.measure()
+        time.sleep(0.02)
+    assert time.monotonic() - begin < 0.6
+    assert sent == sorted(sent, reverse=True)
+    assert len({*sent}) >= 5, "it fades, it does not drop"
+    assert sent[-1] == 0.0
+    rig.stop()
+    rig.start()  # the next episode is a full one again
+    assert volts(rig, 3.0) == 3.0
+    assert not rig.eased
+    rig.stop()
+    assert effects(robot)[1][-1] == OperatingMode.OFF
+
+
+def test_nothing_is_commanded_on_old_measurements(open_rig):
+    rig, _ = open_rig(max_sample_age_s=0.15)
+    rig.start()
+    rig.require_fresh()  # nothing was measured yet, nothing has moved
+    rig.measure()
+    rig.require_fresh()
+    time.sleep(0.2)
+    with pytest.raises(SafetyStop, match=r"(?s)newest measurement is 0\.\d+ s old, 0\.15 s are allowed.*hint: "):
+        rig.require_fresh()
+    rig.stop()
+
+
+def test_a_joint_that_leaves_its_envelope_stops_the_robot(open_rig):
+    rig, _ = open_rig(envelope_rad=(-0.5, 0.5), joints=("hinge",))
+    rig.start()
+    with pytest.raises(
+        SafetyStop, match=r"(?s)joint 'hinge' is at 0\.5\d* rad, outside of its envelope, -0\.5 to 0\.5"
+    ):
+        run(rig, 2.5, 2.0)
+    rig.stop_quietly()
+
+
+def test_an_unplugged_bus_is_lost_at_once_and_its_servo_stops_itself(open_rig):
+    rig, robot = open_rig(EmulatorConfig(unplugged_after_s=0.0, on_signal=True), silence_s=0.1)
+    rig.start()
+    run(rig, 2.5, 0.3)
+    began_ns = time.monotonic_ns()
+    os.kill(robot.pid, signal.SIGUSR1)
+    with pytest.raises(HardwareLost, match="failed during"):
+        run(rig, 2.5, 2.0)
+    assert (time.monotonic_ns() - began_ns) * 1e-9 < 1.0
+    time.sleep(0.3)
+    t_ns, modes, goals = effects(robot)
+    assert (modes[-1] == OperatingMode.OFF) | (goals[-1] == 0.0)
+    assert (t_ns[-1] - began_ns) * 1e-9 < 0.3

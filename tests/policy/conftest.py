@@ -18,6 +18,7 @@ def contract():
         action=(ActionTerm("voltage", "V", -2.0, 2.0), ActionTerm("brake", "1", 0.0, 0.1)),
         rate_hz=50.0,
         delays_s={"sensor -> agent": 0.012},
+        trained_s={"round_trip_delay": (0.04, 0.05)},
         limits={"thdot_rad_s": 40.0},
         hashes={"log": "ab" * 32, "parameters": "cd" * 32},
     )

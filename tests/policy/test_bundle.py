@@ -11,7 +11,7 @@ import pytest
 import safetensors.numpy
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
-from sim2real.policy import PolicyRunner, load_bundle, read_weights, save_bundle
+from sim2real.policy import BlendedRunner, PolicyReference, PolicyRunner, load_bundle, read_weights, save_bundle
 
 
 @pytest.fixture
@@ -36,6 +36,38 @@ def test_actions_equal_the_jax_policy(runner, weights, observations):
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, reference, atol=2e-6)
     assert len(np.unique(found[:, 0])) > 100, "most actions are at their bounds: this tests too little"
+
+
+def test_the_bundle_says_how_well_its_runner_agrees_with_jax(tmp_path, weights, contract, observations):
+    import jax
+
+    from sim2real.train.networks import Policy
+
+    actions = np.asarray(jax.vmap(Policy.from_weights(weights).get_action)(observations))
+    references = {"log": PolicyReference(observations[:200], actions[:200])}
+    folder = save_bundle(tmp_path / "same", weights, contract, references=references)
+    parity = json.loads((folder / "policy.json").read_text())["parity"]["log"]
+    assert parity["samples"] == 200
+    assert 0.0 < parity["largest"] < 1e-5
+    off = PolicyReference(observations, actions + np.float32([0.001, 0.0]))  # of a range of 4 V
+    with pytest.raises(Sim2RealError, match=r"(?s)disagrees with JAX by 2.5.e-04 .* of the training.*hint: "):
+        save_bundle(tmp_path / "other", weights, contract, references={"training": off})
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_policy_is_let_in_slowly_in_every_episode(bundle, observations):
+    policy = load_bundle(bundle)
+    blended = BlendedRunner(policy, blend_s=0.08)  # four steps at 50 Hz
+    expected = policy.act(observations[0])
+    for _ in range(2):
+        blended.reset()
+        shares = [blended(observations[0]) / expected for _ in range(6)]
+        np.testing.assert_allclose(shares, np.outer([0.0, 0.25, 0.5, 0.75, 1.0, 1.0], [1.0, 1.0]), rtol=1e-6)
+
+
+def test_without_blending_the_first_action_is_the_policys(bundle, observations):
+    policy = load_bundle(bundle)
+    assert np.array_equal(BlendedRunner(policy, 0.0)(observations[0]), policy.act(observations[0]))
 
 
 def test_actions_stay_within_the_contract(runner):

@@ -139,6 +139,19 @@ def test_links(run):
     assert {"links/gamma/mean_ms", "links/bursts/lost", "links/intervals/mean"} <= found
 
 
+def test_runner(run):
+    found = {row["name"]: row["value"] for row in run("runner")["rows"]}
+    assert 0.0 < found["runner/numpy/32-64-64-8/p50_us"] < found["runner/numpy/32-64-64-8/p99_us"]
+    assert len(found["runner/12_joints_50_hz/actuator/lateness_ms"]) == 3
+    assert found["runner/12_joints_50_hz/lost_replies"] == 0
+
+
+def test_faults(run):
+    report = run("faults", "--servo-watchdog-s", 0.4)
+    found = {row["name"]: row["value"] for row in report["rows"]}
+    assert (found["faults/wild/log_readable"], found["faults/wild/code_and_reason"]) == (1, 1)
+
+
 def test_log(run):
     report = run("log")
     rows = {row["name"]: row["value"] for row in report["rows"]}

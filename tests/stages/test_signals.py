@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from sim2real.stages.interruption import SignalHandling, patiently
+from sim2real.stages.interruption import SignalHandling, interruptible, patiently
 
 pytestmark = pytest.mark.realtime
 
@@ -126,3 +126,25 @@ def test_what_a_computation_returns_and_raises_comes_back():
     assert patiently(lambda: 3) == 3
     with pytest.raises(ZeroDivisionError):
         patiently(lambda: 1 // 0)
+
+
+def stopped_twice():
+    """Be told to stop, and again while coming to rest."""
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+    except KeyboardInterrupt:
+        with interruptible():
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+
+
+def test_a_second_signal_ends_a_soft_stop_at_once_and_a_third_changes_nothing(capfd):
+    began = time.monotonic()
+    with SignalHandling():
+        with pytest.raises(SystemExit):
+            stopped_twice()
+        assert time.monotonic() - began < 2.0
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.05)
+    assert "still cleaning up" in capfd.readouterr().err

@@ -21,9 +21,11 @@ class Served:
 
     Attributes:
         is_set: Whether a signal told it to stop: never, it stops at the end of a pipe.
+        faulty_ns: When a signal told it to be faulty: never, either.
     """
 
     is_set = False
+    faulty_ns = None
 
     def __init__(self, path, plant, config):
         self._path = path

@@ -1,0 +1,315 @@
+"""Faults while a policy runs: how soon the motor is safe, whether the log can be read, and what the command says.
+
+A deployment of a policy that swings the pendulum runs in a process of its own, on an emulated servo in another; at a
+random moment of the motion one thing goes wrong. The emulator says when the motor stopped: its torque is off, or, where
+nothing that the host says arrives any more, the servo's own watchdog has stopped it: the servo is an XM430, which does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benches.figures import row
+from sim2real import cli
+from sim2real.errors import HARDWARE_LOST, SAFETY_STOP, Sim2RealError
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.truth import Kind, Truth, read_truth
+from sim2real.log.reader import TruncatedLogWarning, read_log
+from sim2real.policy import PolicyContract, save_bundle
+from sim2real.stages.pipeline import load_pipeline
+
+SAFE_S = 0.2
+KILLED, STOPPED, NAN = "killed", "stopped", "nan"
+QUICK = {"runs": 1, "faults": ["wild"]}
+_START_S, _END_S, _MOVING_V = 60.0, 30.0, 0.1
+_TRIES = 4
+"""How often a deployment is begun that ends before its fault."""
+_SWINGS_S = (0.5, 1.5)
+"""The fault comes so long after the motor has begun to turn."""
+
+
+class NotBegun(Sim2RealError):  # noqa: N818
+    """The deployment ended before the fault."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that goes wrong.
+
+    Attributes:
+        name: What it is called in the rows.
+        emulator: Settings of the emulator, from the moment on.
+        codes: What the command may end with.
+        said: A part of its reason; empty: it cannot say any more.
+    """
+
+    name: str
+    emulator: dict[str, Any]
+    codes: tuple[int, ...]
+    said: str
+
+
+FAULTS = {
+    fault.name: fault
+    for fault in (
+        Fault("silent", {"silent_after_s": 0.0}, (HARDWARE_LOST,), "no answer to"),
+        Fault("late", {"late": 1.0, "late_s": 0.05}, (HARDWARE_LOST, SAFETY_STOP), ""),
+        Fault("wild", {"wild": 1.0}, (SAFETY_STOP,), "rad from the last reading"),
+        Fault("frozen", {"frozen_after_s": 0.0}, (SAFETY_STOP,), "has read"),
+        Fault(NAN, {}, (SAFETY_STOP,), "is NaN"),
+        Fault(KILLED, {}, (-signal.SIGKILL,), ""),
+        Fault(STOPPED, {}, (SAFETY_STOP,), "the guardian has taken the torque off"),
+        Fault("unplugged", {"unplugged_after_s": 0.0}, (HARDWARE_LOST,), ""),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one run.
+
+    Attributes:
+        fault: The fault's name.
+        seed: The run's.
+        safe_s: From the fault to the motor's stop [s]; infinite: it did not stop.
+        code: What the command ended with.
+        said: The last of what it said.
+        readable: Whether the log could be read.
+        right: Whether code and reason are those of the fault.
+    """
+
+    fault: str
+    seed: int
+    safe_s: float
+    code: int
+    said: str
+    readable: bool
+    right: bool
+
+
+def swinging_bundle(folder: Path) -> Path:
+    """Write a policy that pumps the pendulum: full voltage in the direction of the motion."""
+    robot = load_pipeline("pendulum").load()
+    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    kernel = np.zeros((size, 1))
+    kernel[2] = 40.0  # thdot / 10
+    bias = np.full(1, 0.6)  # from rest it needs a push
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(1)}
+    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz)
+    return save_bundle(folder, {**weights, "layers.0.kernel": kernel, "layers.0.bias": bias}, contract)
+
+
+@contextlib.contextmanager
+def emulated(config: Any, plant: str, truth: Path) -> Iterator[tuple[str, int]]:
+    """Run an emulator that outlives the host; return its port and its process id."""
+    kind = f"{type(config).__module__}:{type(config).__qualname__}"
+    command = [sys.executable, "-P", "-m", "sim2real.hardware.emulator", "--plant", plant, "--truth", str(truth)]
+    command += ["--emulation", kind]
+    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(config).items() if v is not None]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None
+    try:
+        yield json.loads(process.stdout.readline())["port"], process.pid
+    finally:
+        process.terminate()
+        process.communicate(timeout=_END_S)
+
+
+def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float) -> BaseProcess:
+    """Start a deployment in a process of its own; SIGUSR1 makes its sensor's readings NaN from then on.
+
+    It is forked from a process that has imported everything and computed nothing: an import takes as long as a run.
+
+    Args:
+        port: The emulator's.
+        bundle: The policy.
+        runs: Folder of its run.
+        said: File for what it says.
+        watchdog_s: The gate's longest silence [s].
+    """
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["sim2real.stages.deploy", "sim2real.stages.gap", "sim2real.view.page"])
+    flags = ["--port", port, "--bundle", str(bundle), "--runs", str(runs), "--duration-s", "8", "--episodes", "1"]
+    process = server.Process(target=_deploy, args=([*flags, f"--gate.servo-watchdog-s={watchdog_s}"], said))
+    process.start()
+    return process
+
+
+def _deploy(flags: list[str], said: Path) -> None:
+    os.setsid()
+    sys.stdout = sys.stderr = said.open("w", buffering=1)
+    os.dup2(sys.stdout.fileno(), 1)  # the guardian, a process of its own, says there what it did
+    os.dup2(sys.stdout.fileno(), 2)
+    _nan_on_signal(load_pipeline("pendulum").load())
+    os._exit(cli.main(["deploy", "pendulum", *flags]))
+
+
+def _nan_on_signal(robot: Any) -> None:
+    kind, factor = type(robot), [1.0]
+    read: Callable[..., Any] = kind.read
+
+    def ill(self: Any, reading: Any) -> Any:
+        message = read(self, reading)
+        return message.replace(th=message.th * factor[0])
+
+    kind.read = ill
+    signal.signal(signal.SIGUSR1, lambda *_: factor.__setitem__(0, float("nan")))
+
+
+def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: float) -> Outcome:
+    """Deploy, let the fault happen, and see what comes of it.
+
+    Raises:
+        NotBegun: The deployment did not begin to move.
+    """
+    draw = random.Random(f"{fault.name}/{seed}")
+    robot = load_pipeline("pendulum").load()
+    config = replace(robot.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
+    truth, said = folder / "truth.bin", folder / "said.txt"
+    with emulated(config, robot.embedded.plant, truth) as (port, emulator):
+        child = deployed(port, bundle, folder / "runs", said, watchdog_s)
+        try:
+            wait_until_moving(truth, said, child)
+            time.sleep(draw.uniform(*_SWINGS_S))
+            number = {KILLED: signal.SIGKILL, STOPPED: signal.SIGSTOP, NAN: signal.SIGUSR1}.get(fault.name)
+            began_ns = time.monotonic_ns()
+            os.kill(emulator if number is None else child.pid, number or signal.SIGUSR1)
+            if fault.name == STOPPED:
+                time.sleep(0.5)
+                os.kill(child.pid, signal.SIGCONT)
+            code = ended(child)
+        finally:
+            child.kill()
+            child.join()
+        time.sleep(0.3)  # the last commands take effect
+    words = said.read_text(errors="replace")
+    (log,) = (folder / "runs").glob("pendulum/*/deploy/episode_0.mcap")
+    safe_s = safe_after(read_truth(truth), began_ns)
+    right = code in fault.codes and fault.said in words and (fault.name == KILLED or "error: " in words)
+    return Outcome(fault.name, seed, safe_s, code, words.strip()[-300:], _readable(log), right)
+
+
+def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) -> Outcome:
+    """Return what comes of a run whose robot moved before the fault: a busy machine may have to begin again.
+
+    Args:
+        fault: What goes wrong.
+        seed: Says when.
+        bundle: The policy.
+        root: Folder of the runs.
+        watchdog_s: The gate's longest silence [s].
+
+    Raises:
+        NotBegun: It never moved.
+    """
+    for again in range(_TRIES - 1):
+        with contextlib.suppress(NotBegun):
+            return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
+    return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+
+
+def _new(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def safe_after(truth: Truth, since_ns: int) -> float:
+    """Return how long after a moment [ns] the motor stopped for good [s]: torque off, or its own firmware's zero."""
+    effects = truth.of(Kind.EFFECT)
+    off = (effects["values"][:, 0] == OperatingMode.OFF) | (effects["values"][:, 1] == 0.0)
+    turning = np.flatnonzero(~off)
+    if not turning.size or turning[-1] + 1 == len(off):
+        return 0.0 if not turning.size else float("inf")
+    return max(0.0, 1e-9 * float(effects["t_ns"][turning[-1] + 1] - since_ns))
+
+
+def wait_until_moving(truth: Path, said: Path, child: BaseProcess) -> None:
+    """Wait until the emulator's motor has been driven.
+
+    Args:
+        truth: The emulator's account.
+        said: What the deployment says.
+        child: The deployment.
+
+    Raises:
+        NotBegun: It ended before, or took a minute.
+    """
+    end = time.monotonic() + _START_S
+    while time.monotonic() < end and child.is_alive():
+        time.sleep(0.1)
+        if truth.is_file() and truth.stat().st_size > 0:
+            effects = read_truth(truth).of(Kind.EFFECT)
+            if len(effects) and np.any(np.abs(effects["values"][:, 1]) > 0.0):
+                return
+    raise NotBegun(f"the deployment did not begin to move: {said.read_text(errors='replace')}")
+
+
+def ended(process: BaseProcess) -> int:
+    """Return the exit code of a process once it has ended; of one that a signal killed, minus its number.
+
+    Raises:
+        Sim2RealError: It did not end in time.
+    """
+    process.join(_END_S)
+    if process.exitcode is None:
+        raise Sim2RealError(f"the deployment had not ended after {_END_S:g} s")
+    return process.exitcode
+
+
+def _readable(log: Path) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TruncatedLogWarning)
+        try:
+            return len(read_log(log).steps["sensor"]) > 0
+        except Sim2RealError:
+            return False
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--runs", type=int, default=50, help="runs of each fault, each at another moment")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS), help="which; default: all")
+    parser.add_argument("--first-seed", type=int, default=0, help="seed of the first run")
+    parser.add_argument(
+        "--servo-watchdog-s", type=float, default=0.1, help="the gate's limit; more where others compute"
+    )
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Let each fault happen in some runs."""
+    rows, outcomes = [], []
+    with tempfile.TemporaryDirectory(prefix="sim2real-faults-") as name:
+        bundle = swinging_bundle(Path(name) / "bundle")
+        for kind in options.faults:
+            found = []
+            for seed in range(options.first_seed, options.first_seed + options.runs):
+                found.append(begun(FAULTS[kind], seed, bundle, Path(name), options.servo_watchdog_s))
+                print(f"{kind} {seed}: {found[-1].safe_s:.3f} s, exit {found[-1].code}", file=sys.stderr)
+            outcomes += found
+            safe = np.array([o.safe_s for o in found])
+            what, of = f"faults/{kind}", f"of {len(found)}"
+            rows.append(row(f"{what}/safe", int((safe < SAFE_S).sum()), of, goal="all within 0.2 s"))
+            spread = [round(float(s), 3) for s in np.sort(safe)[[len(safe) // 2, -1]]]
+            rows.append(row(f"{what}/safe_s", spread, "s", "p50, max", "< 0.2"))
+            rows.append(row(f"{what}/log_readable", sum(o.readable for o in found), of, goal="all"))
+            rows.append(row(f"{what}/code_and_reason", sum(o.right for o in found), of, goal="all"))
+    wrong = [asdict(o) for o in outcomes if not (o.safe_s < SAFE_S and o.readable and o.right)]
+    return {"rows": rows, "wrong": wrong}

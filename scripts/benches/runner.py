@@ -1,0 +1,135 @@
+"""What runs a policy on the robot: a step of it by itself, and the loop of twelve joints on an emulated bus."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benches.figures import row
+from sim2real.graph.node import BaseNode
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.rig import Rig
+from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, PolicyRunner
+from sim2real.policy.bundle import make_runner
+from sim2real.robots.agent import DirectAgent
+from sim2real.robots.hardware import ServoActuator, ServoSensor
+from sim2real.robots.loop import control_nodes
+from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.policy_node import PolicyNode
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import realtime
+
+QUICK = {"steps": 200, "seconds": 0.5, "rate": 50.0}
+JOINTS, SUPPLY_V, LIMIT_V = 12, 5.0, 2.0
+BAUD = 4_000_000
+"""Twelve servos' states are 280 bytes: 2.8 ms at 1 Mbaud, more than the period at 500 Hz; 0.7 ms at this rate."""
+
+
+def policy(observations: int, actions: int, rate_hz: float, hidden: tuple[int, ...] = (64, 64)) -> PolicyRunner:
+    """Return a policy of random weights.
+
+    Args:
+        observations: Size of its observation.
+        actions: Size of its action.
+        rate_hz: Its rate [Hz].
+        hidden: Widths of its hidden layers.
+    """
+    rng, sizes = np.random.default_rng(0), (observations, *hidden, actions)
+    bounds = {"low": np.full(actions, -LIMIT_V), "high": np.full(actions, LIMIT_V), "log_std": np.zeros(actions)}
+    weights = {"mean": np.zeros(observations), "std": np.ones(observations), **bounds}
+    for i, (a, b) in enumerate(itertools.pairwise(sizes)):
+        weights |= {f"layers.{i}.kernel": rng.normal(size=(a, b)) / np.sqrt(a), f"layers.{i}.bias": np.zeros(b)}
+    terms = (ObservationTerm("seen", ("1",) * observations),)
+    contract = PolicyContract(
+        terms, tuple(ActionTerm(f"u{i}", "V", -LIMIT_V, LIMIT_V) for i in range(actions)), rate_hz
+    )
+    return make_runner(weights, contract)
+
+
+def a_step(steps: int) -> list[dict[str, Any]]:
+    """Measure single steps of a policy, checks of what goes in and out included."""
+    runner, rng = policy(32, 8, 50.0), np.random.default_rng(1)
+    observations = rng.normal(size=(steps, 32)).astype(np.float32)
+    runner.reset()
+    took_us = np.empty(steps)
+    with realtime():
+        for i, observation in enumerate(observations):
+            begin = time.perf_counter_ns()
+            runner(observation)
+            took_us[i] = 1e-3 * (time.perf_counter_ns() - begin)
+    p50, p99 = np.quantile(took_us, [0.5, 0.99])
+    what = "runner/numpy/32-64-64-8"
+    return [row(f"{what}/p50_us", round(p50, 1), "us", goal="< 50"), row(f"{what}/p99_us", round(p99, 1), "us")]
+
+
+def _see(reading: JointReading) -> Any:
+    return np.concatenate([reading.position, reading.velocity]).astype(np.float32)
+
+
+def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
+    """Return sensor, policy and actuator of twelve joints."""
+    rest = JointReading(np.zeros(JOINTS), np.zeros(JOINTS))
+    agent = DirectAgent("agent", rate_hz, _see, (2 * JOINTS, JOINTS), 1, Goals, delay=0.0005)
+    return control_nodes(
+        ServoSensor(
+            "sensor", rate_hz, rig, lambda r: JointReading(r.position_rad, r.velocity_rad_s), rest, delay=0.001
+        ),
+        PolicyNode(agent, policy(5 * JOINTS, JOINTS, rate_hz)),
+        ServoActuator("actuator", rate_hz, rig, "goal", Goals, delay=0.0005),
+    )
+
+
+def loop(rate_hz: float, seconds: float, spin_s: float) -> list[dict[str, Any]]:
+    """Measure how late the nodes of twelve joints wake on the wall clock, an emulated bus beside them."""
+    plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
+    config = EmulatorConfig(baud_rate=BAUD, return_delay_us=0, plant_step_s=0.001)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        EmbeddedRobot(plant, config, None, Path(folder) / "truth.bin") as robot,
+    ):
+        bus = BusConfig(robot.port, baud_rate=BAUD, silence_s=1.0, max_silence_s=1.0)
+        device = DynamixelServos(bus, list(range(1, JOINTS + 1)), VoltageDrive(SUPPLY_V))
+        with Rig(device, GateConfig(LIMIT_V, stuck_effort=2.0)) as rig, realtime():
+            nodes = nodes_of(rig, rate_hz)
+            graph = AsyncGraph(nodes, nodes["agent"], spin_s=spin_s)
+            with graph:
+                graph.start(graph.init(jax.random.key(0)))
+                begin = time.process_time()
+                graph.run_for(seconds)
+                cpu = (time.process_time() - begin) / seconds
+                statistics = graph.statistics()
+            lost, bus_ms = device.counters.lost_replies, 1e-3 * np.array(rig.measuring.transfer_us)
+    what, rows = f"runner/{JOINTS}_joints_{rate_hz:g}_hz", []
+    for name, node in statistics.items():
+        late = [round(1e3 * q, 3) for q in node.lateness_s]
+        rows.append(row(f"{what}/{name}/lateness_ms", late, "ms", "p50, p99, max", "p99 < 1"))
+        rows.append(row(f"{what}/{name}/overruns", node.overruns, f"of {node.steps}"))
+    took = np.quantile(bus_ms, [0.5, 0.99]).round(3).tolist()
+    rows.append(row(f"{what}/reading_ms", took, "ms", "p50, p99; the period is 1 / rate", f"< {1e3 / rate_hz:g}"))
+    rows.append(row(f"{what}/cpu", round(cpu, 3), "cores"))
+    return [*rows, row(f"{what}/lost_replies", lost, "")]
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    parser.add_argument("--steps", type=int, default=20_000, help="steps of the policy by itself")
+    parser.add_argument("--rate", type=float, default=500.0, help="rate of sensor, policy and actuator [Hz]")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the loop")
+    parser.add_argument("--spin-s", type=float, default=0.0, help="how long before a step threads poll the clock [s]")
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure the policy by itself, and the loop."""
+    return {"rows": [*a_step(options.steps), *loop(options.rate, options.seconds, options.spin_s)]}

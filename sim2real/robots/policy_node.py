@@ -1,0 +1,77 @@
+"""The policy's node on the robot: the agent's observation and message around a bundle's runner, without JAX."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.node import BaseNode
+
+
+class Runner(Protocol):
+    """What runs a policy; see ``sim2real.policy.PolicyRunner``."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        ...
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action ``(A,)`` for the next observation ``(O,)``."""
+        ...
+
+
+class PolicyNode(BaseNode):
+    """Stands in for the agent on the wall clock: what is run is the bundle's runner, not a policy made again in JAX.
+
+    The agent makes observations and messages, from numpy arrays; its own ``step`` is not called.
+
+    Args:
+        agent: The agent's node, with ``observe(step_state)`` and ``act(step_state, action)``; it is left unconnected.
+        runner: The policy.
+    """
+
+    jittable = False
+
+    def __init__(self, agent: Any, runner: Runner) -> None:
+        super().__init__(agent.name, agent.rate, delay=agent.delay, delay_dist=agent.delay_dist)
+        self._agent, self._runner = agent, runner
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the agent's parameters, in numpy."""
+        return _in_numpy(self._agent.init_params, rng, graph_state)
+
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the agent's state, in numpy."""
+        return _in_numpy(self._agent.init_state, rng, graph_state)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the agent's default message, in numpy."""
+        return _in_numpy(self._agent.init_output, rng, graph_state)
+
+    def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
+        """Begin an episode."""
+        del graph_state, timeout
+        self._runner.reset()
+        return True
+
+    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+        """Make a step with the policy's action.
+
+        Raises:
+            SafetyStop: An observation or the action is not finite.
+        """
+        action = self._runner(np.asarray(self._agent.observe(step_state), np.float32))
+        return self._agent.act(step_state, action)
+
+
+def in_numpy(tree: Any) -> Any:
+    """Return a pytree with numpy arrays for leaves: arrays of JAX would draw all that meets them into JAX."""
+    return jax.tree_util.tree_map(np.asarray, tree)
+
+
+def _in_numpy(make: Callable[[Any, GraphState | None], Any], rng: Any, graph_state: GraphState | None) -> Any:
+    return in_numpy(make(rng, graph_state))

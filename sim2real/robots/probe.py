@@ -1,0 +1,182 @@
+"""The delay between a command and the motion that answers it, from a few small steps on the robot."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.errors import SafetyStop, Sim2RealError
+from sim2real.hardware.rig import Rig
+
+_PERIOD_S, _WATCHED_S = 0.004, 0.16
+"""Time between two samples; how long a step is watched."""
+_BUSY_S, _TRIES, _FEWEST = 0.012, 5, 4
+"""A step with a longer pause than this between two samples is made again: so many times as many steps at most, and so
+few undisturbed ones must do."""
+_RISE_RAD = 0.05
+"""The part of the answer up to here is fitted: later, weight and friction make it no polynomial."""
+_GRID_S = 0.0005
+_AGAIN = 5
+"""Samples after which a command is sent again: it must not become stale."""
+_STILL_RAD_S, _STILL_S, _REST_S = 0.05, 0.1, 3.0
+
+
+@dataclass(frozen=True)
+class StepAnswers:
+    """What the answers to some steps say.
+
+    Attributes:
+        delays_s: From each command's departure to the motion, in time stamps of measurements ``(N,)`` [s].
+    """
+
+    delays_s: np.ndarray
+
+    @property
+    def delay_s(self) -> float:
+        """Their median [s]."""
+        return float(np.median(self.delays_s))
+
+    @property
+    def jitter_s(self) -> float:
+        """By how much they differ: the range of the middle half [s]."""
+        return float(np.subtract(*np.quantile(self.delays_s, [0.75, 0.25])))
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Small steps by which a robot's delay is measured.
+
+    Attributes:
+        step: Size of a step [the command's unit].
+        lag_s: How much later than it does an answer seem to begin [s]: what starts softly is seen late. As found on the
+            robot in the computer, whose delay is known.
+        joint: The joint that is moved.
+        steps: How many steps.
+    """
+
+    step: float
+    lag_s: float = 0.0
+    joint: int = 0
+    steps: int = 8
+
+
+def measure_delay(rig: Rig, probe: Probe) -> StepAnswers:
+    """Step one joint to and fro, through the gate, and see when it answers; torque is off before and afterwards.
+
+    Args:
+        rig: The robot, at rest.
+        probe: The steps.
+
+    Raises:
+        Sim2RealError: The joint does not answer.
+        SafetyStop: This machine is too busy to measure, or what the gate stopped.
+    """
+    rig.start()
+    try:
+        answers = _answers(rig, probe)
+    except BaseException:
+        rig.stop_quietly()  # the reason must not be lost to what else fails
+        raise
+    rig.stop()
+    found = delays_of(answers)
+    return StepAnswers(found.delays_s - probe.lag_s)
+
+
+def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
+    """Return when each answer begins.
+
+    An answer is 0 until the delay is over, and then a square and a cube, the same for all: the delay and the factors
+    that fit all best are found first, then the delay of each.
+
+    Args:
+        answers: Each of shape ``(N, 2)``: time since the command [s], and motion since then in its direction [rad].
+
+    Raises:
+        Sim2RealError: They show no motion.
+    """
+    if np.median([np.max(a[:, 1]) for a in answers]) < _RISE_RAD:
+        raise Sim2RealError(
+            "the robot does not answer the steps by which its delay is measured",
+            hint="is it blocked, or its supply off? without this check: --no-measure-delay",
+        )
+    end_s = float(np.median([a[np.argmax(a[:, 1] >= _RISE_RAD), 0] for a in answers if a[:, 1].max() >= _RISE_RAD]))
+    grid = np.arange(0.0, end_s - 4 * _PERIOD_S, _GRID_S)
+    answers = [a[a[:, 0] <= end_s] for a in answers]  # the same samples, whatever the delay: else none fit best
+    samples = np.concatenate(answers)
+    delay = min(grid, key=lambda d: _misfit(samples, d, _fit(samples, d)))
+    curve = _fit(samples, delay)
+    return StepAnswers(np.array([min(grid, key=lambda d: _misfit(a, d, curve)) for a in answers]))
+
+
+def _answers(rig: Rig, probe: Probe) -> list[np.ndarray]:
+    """Return the answers to some steps; those during which this machine was busy are made again."""
+    answers: list[np.ndarray] = []
+    for before, goal in itertools.islice(itertools.cycle(_steps(rig, probe)), _TRIES * probe.steps):
+        found = _answer(rig, probe.joint, before, goal)
+        answers += [] if found is None else [found]
+        if len(answers) == probe.steps:
+            return answers
+    if len(answers) >= _FEWEST:
+        return answers
+    raise SafetyStop(
+        f"the delay cannot be measured: this machine was busy during all but {len(answers)} of "
+        f"{_TRIES * probe.steps} small steps",
+        hint="close what else runs on it; without this check: --no-measure-delay",
+    )
+
+
+def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the command before each step, and that of the step: from rest and back, or to both sides of zero."""
+    rest, away = rig.gate.fallback, rig.gate.fallback
+    away[probe.joint] += probe.step
+    if rig.gate.config.stale == "zero":
+        return [(rest, away), (rest, -away)]
+    if np.any(away > rig.gate.config.range[1]):
+        away[probe.joint] -= 2 * probe.step
+    return [(rest, away), (away, rest)]
+
+
+def _answer(rig: Rig, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+    """Return the answer to a step: times since the command [s], and motion in its direction [rad]; None: too few."""
+    _settle(rig, before)
+    begin, rows = rig.measure().position_rad[joint], []
+    left_s = time.monotonic()
+    rig.command(goal, 0.0, left_s)
+    sent_s = time.monotonic() - left_s
+    while (now := time.monotonic()) < left_s + _WATCHED_S:
+        reading = rig.measure()
+        rows.append((1e-9 * reading.transaction.t_sent_ns - left_s, reading.position_rad[joint] - begin))
+        if len(rows) % _AGAIN == 0:
+            rig.command(goal, 0.0, time.monotonic())
+        time.sleep(max(0.0, now + _PERIOD_S - time.monotonic()))
+    if rig.gate.config.stale == "zero":
+        rig.command(before, 0.0, time.monotonic())
+    longest_s = max(sent_s, *np.diff([0.0, *(t_s for t_s, _ in rows)]))
+    return np.array(rows) * [1.0, np.sign(goal[joint] - before[joint])] if longest_s < _BUSY_S else None
+
+
+def _settle(rig: Rig, command: np.ndarray) -> None:
+    begin = still = time.monotonic()
+    while (now := time.monotonic()) - still < _STILL_S and now - begin < _REST_S:
+        if np.max(np.abs(rig.measure().velocity_rad_s)) > _STILL_RAD_S:
+            still = time.monotonic()
+        rig.command(command, 0.0, time.monotonic())
+        time.sleep(0.01)
+
+
+def _powers(t_s: np.ndarray, delay_s: float) -> np.ndarray:
+    since = np.maximum(0.0, t_s - delay_s)[:, None] / _WATCHED_S
+    return since ** np.array([2, 3])
+
+
+def _fit(samples: np.ndarray, delay_s: float) -> np.ndarray:
+    """Return the coefficients of the polynomial that fits best behind a delay."""
+    return np.linalg.lstsq(_powers(samples[:, 0], delay_s), samples[:, 1], rcond=None)[0]
+
+
+def _misfit(samples: np.ndarray, delay_s: float, curve: np.ndarray) -> float:
+    return float(np.mean((samples[:, 1] - _powers(samples[:, 0], delay_s) @ curve) ** 2))

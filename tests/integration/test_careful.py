@@ -1,0 +1,123 @@
+"""A deployment that measures the delay first, is stopped softly, or meets a fault while the policy moves the robot."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor
+
+from sim2real import cli, errors
+from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.truth import Kind, read_truth
+from sim2real.log.reader import read_log
+from sim2real.policy import PolicyContract, save_bundle
+from sim2real.stages.pipeline import load_pipeline
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+from benches import faults
+
+pytestmark = pytest.mark.realtime
+
+
+@pytest.fixture(scope="module")
+def resting(tmp_path_factory):
+    """A bundle whose policy rests, trained with the delay that the pendulum has."""
+    robot = load_pipeline("pendulum").load()
+    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(1)}
+    weights |= {"layers.0.kernel": np.zeros((size, 1)), "layers.0.bias": np.zeros(1)}
+    trained = {"round_trip_delay": (0.043, 0.047)}
+    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz, trained_s=trained)
+    return save_bundle(tmp_path_factory.mktemp("bundle") / "resting", weights, contract)
+
+
+def deploy(name, bundle, root, *flags):
+    """Deploy for a second; return the exit code and the stage's folder."""
+    own = ["--bundle", str(bundle), "--episodes", "1", "--duration-s", "1", "--runs", str(root), *PATIENT]
+    code = cli.main(["deploy", name, *own, *flags])
+    (folder,) = (root / name).glob("*/deploy")
+    return code, folder
+
+
+def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resting):
+    code, folder = deploy("pendulum", resting, tmp_path)
+    assert code == errors.OK
+    said = manifest_of(folder)["summary"]["measured delay"]
+    assert 37 <= float(said.partition(" ms")[0]) <= 53
+    assert_torque_ends_off(read_truth(folder / "truth.bin"))
+
+
+def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsys):
+    latency = load_pipeline("pendulum").load().embedded.emulator.actuation_latency_s + 0.015
+    name = make_pipeline("late_pendulum", f"\n    embedded = faulty_emulator(actuation_latency_s={latency})\n")
+    code, folder = deploy(name, resting, tmp_path)
+    assert code == errors.SAFETY_STOP
+    said = capsys.readouterr().err
+    assert "the policy was trained with 43 to 47 ms" in said
+    assert "--force" in said
+    assert not (folder / "episode_0.mcap").exists(), "the policy never ran"
+    assert_torque_ends_off(read_truth(folder / "truth.bin"))
+
+
+def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
+    robot, truth, said = load_pipeline("pendulum").load().embedded, tmp_path / "truth.bin", tmp_path / "said.txt"
+    bundle = faults.swinging_bundle(tmp_path / "bundle")
+    with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
+        child = faults.deployed(port, bundle, tmp_path, said, 0.4)
+        faults.wait_until_moving(truth, said, child)
+        time.sleep(0.5)
+        os.kill(child.pid, signal.SIGINT)
+        assert faults.ended(child) == 130, said.read_text()
+    assert "coming to rest; Ctrl-C stops at once" in said.read_text()
+    (log,) = tmp_path.glob("pendulum/*/deploy/episode_0.mcap")
+    _, modes, goals = motor(read_truth(truth))
+    last = int(np.flatnonzero(modes == OperatingMode.PWM)[-1])
+    assert modes[-1] == OperatingMode.OFF
+    assert np.abs(goals[: last - 10]).max() > 0.3, "it swung at up to 2 of 5 V"
+    assert abs(goals[last]) < 0.05, "the voltage had faded when the torque went off"
+    assert read_log(log).complete
+
+
+@pytest.mark.slow
+def test_a_robot_that_would_fall_is_held_until_it_is_let_go(tmp_path, start_cli):
+    robot = load_pipeline("arm").load()
+    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(3)}
+    weights |= {"layers.0.kernel": np.zeros((size, 3)), "layers.0.bias": np.full(3, 0.2)}
+    bundle = save_bundle(tmp_path / "bundle", weights, PolicyContract(robot.observation, robot.action, robot.rate_hz))
+    flags = ["--bundle", bundle, "--episodes", 1, "--duration-s", 1, "--runs", tmp_path, *PATIENT]
+    process = start_cli("deploy", "arm", "--hold", *flags)
+    assert any("holding: support the robot" in line for line in process.stderr)
+    time.sleep(0.5)
+    told_ns = time.monotonic_ns()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 130
+    (path,) = tmp_path.glob("arm/*/deploy/truth.bin")
+    effects = read_truth(path).of(Kind.EFFECT, 1)
+    before, modes = effects["t_ns"] < told_ns, effects["values"][:, 0]
+    held = effects["values"][before & (effects["t_ns"] > told_ns - 400_000_000)]
+    assert len(held) > 5
+    assert np.all(held[:, 0] == OperatingMode.POSITION)
+    assert np.ptp(held[:, 1]) < 1e-6, "the goal stays"
+    assert modes[-1] == OperatingMode.OFF
+
+
+def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
+    code, folder = deploy("pendulum", resting, tmp_path, "--hold")
+    assert code == errors.USAGE
+    assert "hold no position" in capsys.readouterr().err
+    assert manifest_of(folder)["status"] == "failed"
+
+
+@pytest.mark.parametrize("name", faults.FAULTS)
+def test_a_fault_leaves_the_motor_safe_and_its_reason_said(tmp_path, name):
+    """One run of each; ``scripts/bench.py faults`` has fifty. Patient, for the machine may be busy."""
+    found = faults.begun(faults.FAULTS[name], 0, faults.swinging_bundle(tmp_path / "bundle"), tmp_path, 0.15)
+    assert found.right, found
+    assert found.readable
+    assert found.safe_s < 2 * faults.SAFE_S

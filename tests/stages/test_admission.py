@@ -1,0 +1,133 @@
+"""What deploy refuses to run."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.manifest import sha256
+from sim2real.artifacts.run_folder import StageFolder
+from sim2real.errors import SafetyStop, Sim2RealError
+from sim2real.policy import PolicyContract, save_bundle
+from sim2real.robots.probe import StepAnswers
+from sim2real.stages import admission
+from sim2real.stages.config import DeployConfig
+from sim2real.stages.pipeline import load_pipeline
+
+TRAINED = (0.044, 0.046)
+
+
+def still(contract):
+    """Return the weights of a policy that always asks for the middle."""
+    zeros, n = np.zeros(contract.observation_size, np.float32), len(contract.action)
+    low, high = (np.array([getattr(a, side) for a in contract.action], np.float32) for side in ("low", "high"))
+    last = {"layers.0.kernel": np.zeros((zeros.size, n)), "layers.0.bias": np.zeros(n)}
+    return {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(n), **last}
+
+
+def contract_of(robot, **changes):
+    """Return the contract of a policy that fits, but for some changes."""
+    bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.action]
+    actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.action, bounds, strict=True))
+    fits = {"observation": robot.observation, "action": actions, "rate_hz": robot.rate_hz, "limits": robot.limits}
+    return PolicyContract(**{**fits, **changes})
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_pipeline("arm").load()
+
+
+def test_a_policy_for_the_robot_is_let_in(arm):
+    contract = contract_of(arm)
+    admission.require_fit(arm, Bundle(contract, still(contract)))
+
+
+CHANGES = {
+    "another observation": ("observation", lambda o: (replace(o[0], name="other"), *o[1:]), "sees .*'other'"),
+    "another unit": ("observation", lambda o: (replace(o[0], units=("deg",) * o[0].size), *o[1:]), "sees .*'deg'"),
+    "another order": ("observation", lambda o: (o[1], o[0], *o[2:]), "sees "),
+    "a shorter history": ("observation", lambda o: (*o[:-1], replace(o[-1], history=1, low=(), high=())), "sees "),
+    "other bounds": (
+        "observation",
+        lambda o: tuple(replace(t, low=tuple(2 * x for x in t.low), high=tuple(2 * x for x in t.high)) for t in o),
+        "was trained with .* from ",
+    ),
+    "another action": ("action", lambda a: (replace(a[0], name="x"), *a[1:]), "sends .*'x'"),
+    "another unit of an action": ("action", lambda a: (replace(a[0], unit="V"), *a[1:]), "sends .*'V'"),
+    "other actions first": ("action", lambda a: a[::-1], "sends "),
+    "50 times the speed": ("action", lambda a: (replace(a[0], high=50 * a[0].high), *a[1:]), "this robot bears -"),
+    "another rate": ("rate_hz", lambda hz: 2 * hz, "runs at 100 Hz, this robot at 50 Hz"),
+    "other joint limits": ("limits", lambda m: {n: 2 * v for n, v in m.items()}, "was trained with 'lowest goal"),
+    "limits of no joint": ("limits", lambda m: {"elsewhere": 1.0}, "this robot has no such limit"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_policy_for_another_robot_is_refused(arm, what):
+    field, change, said = CHANGES[what]
+    contract = contract_of(arm)
+    contract = replace(contract, **{field: change(getattr(contract, field))})
+    with pytest.raises(Sim2RealError, match=rf"(?s){said}.*hint: train a policy"):
+        admission.require_fit(arm, Bundle(contract, still(contract)))
+
+
+def test_a_pendulum_policy_may_not_ask_for_100_volts():
+    robot = load_pipeline("pendulum").load()
+    contract = contract_of(robot, action=(replace(robot.action[0], low=-100.0, high=100.0),))
+    with pytest.raises(Sim2RealError, match="this robot bears -2 to 2"):
+        admission.require_fit(robot, Bundle(contract, still(contract)))
+
+
+@pytest.mark.parametrize(("value", "said"), [(np.nan, "not finite"), (1e9, "values up to 1e")])
+def test_weights_that_are_no_numbers_or_absurd_are_refused(arm, value, said):
+    contract = contract_of(arm)
+    weights = still(contract)
+    weights["layers.0.bias"] = weights["layers.0.bias"] + value
+    with pytest.raises(Sim2RealError, match=said):
+        Bundle(contract, weights).runner()
+
+
+def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
+    contract = contract_of(arm)
+    path = save_bundle(tmp_path / "train" / "bundle", still(contract), contract)
+    outputs = {"bundle": {"path": "bundle", "sha256": sha256(path)}}
+    trained = StageFolder(path.parent, {"outputs": outputs})
+    admission.require_untouched(trained)
+    about = json.loads((path / "policy.json").read_text())  # the hashes in it still fit: only the manifest tells
+    (path / "policy.json").write_text(json.dumps({**about, "rate_hz": 51.0}))
+    with pytest.raises(Sim2RealError, match=r"(?s)not the bundle that its training wrote.*hint: train again"):
+        admission.require_untouched(trained)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "varies_s", "said"),
+    [
+        (0.045, 0.003, None),
+        (0.050, 0.0, None),
+        (0.060, 0.0, "the policy was trained with 44 to 46 ms"),
+        (0.030, 0.0, "the policy was trained with 44 to 46 ms"),
+        (0.045, 0.020, "delays that vary by 2 ms"),
+    ],
+)
+def test_delay_and_jitter_must_be_those_of_the_training(delay_s, varies_s, said):
+    found = StepAnswers(delay_s + varies_s * np.array([-1.0, -0.8, 0.0, 0.0, 0.8, 1.0]))
+    reason = admission.misfit(found, TRAINED, 0.008)
+    assert reason is None if said is None else said in str(reason)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_delay_that_was_not_trained_is_refused_or_with_force_told(arm, monkeypatch, capsys, force):
+    monkeypatch.setattr(admission, "measure_delay", lambda rig, probe: StepAnswers(np.full(8, 0.060)))
+    rig = type("Rig", (), {"wait_until_still": lambda self, timeout_s: None})()
+    pendulum = load_pipeline("pendulum").load()
+    contract = contract_of(pendulum, trained_s={"round_trip_delay": TRAINED})
+    if force:
+        found = admission.check_delay(pendulum, rig, contract, DeployConfig(force=True))
+        assert found["measured delay"].startswith("60 ms")
+        assert "warning: the delay is 60 ms" in capsys.readouterr().err
+    else:
+        with pytest.raises(SafetyStop, match=r"(?s)the delay is 60 ms.*hint: .*--force"):
+            admission.check_delay(pendulum, rig, contract, DeployConfig())
