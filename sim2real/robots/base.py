@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import numpy as np
@@ -64,6 +65,8 @@ class RecordedRobot(ABC):
         units: Field of a message -> its unit.
         roles: Which node does what.
         profile_rad_s: How fast the actuators' setpoints move to their goals [rad/s]; infinite: at once.
+        causes: What may change several parameters at once: name -> parameter -> by how much it moves on its scale when
+            what is named grows by a factor of e.
         export_lead_s: What a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s], to do
             what the identified graph does.
     """
@@ -72,6 +75,7 @@ class RecordedRobot(ABC):
     roles: Roles = ROLES
     profile_rad_s: float = math.inf
     export_lead_s: float = 0.0
+    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 
     _DATA: ClassVar[Mapping[str, Datum]] = {
         "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),

@@ -17,6 +17,7 @@ from sim2real.robots.base import Robot, Session
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.gap import compare
+from sim2real.stages.judging import judged, show
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.rig import opened, show_withheld, warn
@@ -61,10 +62,10 @@ def deploy(
         nothing = tuple(Scores({}) for _ in recordings)
         none: tuple[dict[str, np.ndarray], ...] = tuple({} for _ in recordings)
         return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
-    if identification is None:
-        return compare(robot, recordings, policy, None, config.duration_s), sessions
-    simulated = moving_robot(pipeline, identification.world)
-    return compare(simulated, recordings, policy, identification.values, config.duration_s), sessions
+    values = None if identification is None else identification.values
+    simulated = robot if identification is None else moving_robot(pipeline, identification.world)
+    found = compare(simulated, recordings, policy, values, config.duration_s)
+    return judged(found, pipeline, bundle, identification, folder), sessions
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -103,6 +104,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         if found.gap:
             headers = ["quantity", "robot", "simulation", "gap"]
             print(table([[g.quantity, g.real, g.simulation, g.gap] for g in found.gap], headers))
+        show(found)
         stage.summary(_summary(found, sessions))
         if config.strict_timing:
             for summary in sessions:
