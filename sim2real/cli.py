@@ -157,6 +157,7 @@ def _run(command: str, arguments: list[str]) -> None:
         "epilog": _epilog(
             f"sim2real run {pipeline.name} --seed 3 --record.duration-s 20",
             f"sim2real run {pipeline.name} --resume runs/{pipeline.name}/TIME",
+            f"sim2real run {pipeline.name} --iterations 5 --until success=0.95",
         ),
     }
     parsed = flags.parse(default, rest, **texts)
@@ -334,25 +335,10 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
 
 
 def _run_all(pipeline: Pipeline, flags: Any) -> None:
-    """Run the four stages in one run folder; from the first one on that is not finished there."""
-    from sim2real.artifacts.run_folder import STAGES, finished
-    from sim2real.stages import console, targets
+    """Run the four stages in one run folder, and around again where that was asked for."""
+    from sim2real.stages.running import run_all
 
-    if flags.record.dry_run:
-        raise UsageError(
-            "a run cannot go on from a dry recording: there is nothing in it to identify",
-            hint=f"`sim2real record {pipeline.name} --dry-run` by itself; of a run, deploy alone may be dry",
-        )
-    run_dir = targets.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
-    redo = run_dir is None
-    for number, stage in enumerate(STAGES, 1):
-        done = None if redo or run_dir is None else finished(run_dir, stage)
-        if done is not None:
-            console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")
-            continue
-        redo = True  # what comes after a stage that ran again is out of date
-        console.note(f"{stage} ({number}/{len(STAGES)})")
-        run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir).run_dir
+    run_all(pipeline, flags, lambda stage, config, run_dir: _call_stage(stage, pipeline, config, flags.runs, run_dir))
 
 
 def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> StageFolder:

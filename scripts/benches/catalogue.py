@@ -43,6 +43,16 @@ BENCHES = {
     "demo": Bench(
         "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")
     ),
+    "drift": Bench(
+        "drift",
+        "whether a deployment's log tells that a hidden robot has changed, and what",
+        (
+            *_GRAPH,
+            "sim2real/identify",
+            "sim2real/stages/judging.py",
+            "scripts/benches/hidden_robots.py",
+        ),
+    ),
     "graph": Bench(
         "graph", "the compiled graph against a robot written by hand", (*_GRAPH, "scripts/benches/graph_mjx.py")
     ),

@@ -129,17 +129,27 @@ class Deployment:
         return {"result": RESULT, "simulation": SIMULATION}
 
     @staticmethod
-    def load(folder: Path) -> Deployment:
-        """Read what ``save`` wrote, and the logs beside it.
+    def read(folder: Path) -> Deployment:
+        """Read scores and verdict alone, without simulations and logs.
 
         Raises:
-            Sim2RealError: When something is missing, of another format, or not as it should be.
+            Sim2RealError: When the file is missing, of another format, or not as it should be.
         """
         file = folder / RESULT
         with malformed(file, _AGAIN):
             found = read_json(file, Deployment)
             if found.format != FORMAT:
                 raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+        return found
+
+    @staticmethod
+    def load(folder: Path) -> Deployment:
+        """Read what ``save`` wrote, and the logs beside it.
+
+        Raises:
+            Sim2RealError: When something is missing, of another format, or not as it should be.
+        """
+        found = Deployment.read(folder)
         arrays: dict[str, np.ndarray] = {}
         if not found.dry_run:
             with malformed(folder / SIMULATION, _AGAIN):

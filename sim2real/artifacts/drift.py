@@ -16,8 +16,7 @@ class Changed:
         now: What the later log says, if nothing else has changed.
         low95: Lower end of the 95 % interval of ``now``, for the identification's own uncertainty as well.
         high95: Its upper end.
-        chi2: By how much the change alone explains the log better: chi-square with one degree of freedom where nothing
-            has changed.
+        explains: Share of the error that the change takes away, beyond what the identification leaves open.
         p: Probability of as much by chance, before the correction for several tests.
     """
 
@@ -27,7 +26,7 @@ class Changed:
     now: float
     low95: float
     high95: float
-    chi2: float
+    explains: float
     p: float
 
 
@@ -38,7 +37,7 @@ class Drift:
     Attributes:
         changes: Each way in which the robot may have changed, the one that explains most first.
         level: Share of robots that did not change for which any of the tests raises an alarm.
-        alarms: Names of those that are significant at this level, all tests together (Holm), in the same order.
+        alarms: Names of those that are significant at this level, all tests together (Holm), the surest first.
         seconds: Length of the log that was tested [s].
     """
 
@@ -49,5 +48,5 @@ class Drift:
 
     @property
     def named(self) -> Changed | None:
-        """The change that explains most; None where nothing is significant."""
-        return self.changes[0] if self.alarms else None
+        """The significant change that explains most; None where nothing is significant."""
+        return next((c for c in self.changes if c.name in self.alarms), None)

@@ -18,6 +18,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify import drift, prediction
 from sim2real.identify.problem import Problem
+from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
 from sim2real.robots.base import RecordedRobot
 from sim2real.robots.worlds import in_world
@@ -26,7 +27,7 @@ from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.cutting import reach
 from sim2real.stages.interruption import patiently
-from sim2real.stages.next_step import commands
+from sim2real.stages.next_step import LATER, commands
 from sim2real.stages.pipeline import Pipeline
 
 AS_HERE = "as in this log"
@@ -35,10 +36,13 @@ _SEGMENT_S = 0.4
 """Length of a segment at least [s]; a balanced pendulum's errors grow tenfold in 0.2 s: longer ones say little."""
 _LEAST = 12
 """Segments that a test needs at least."""
-_OFF = 1.5
-"""Up to this many times the error that the identification promised, the model holds."""
-_UNEXPLAINED = 3.0
-"""Above this many times, with parameters fitted to the log itself, no parameters explain a joint's motion."""
+_STEPS = 15
+"""Most steps of a refinement of all parameters."""
+_OFF = 3.0
+"""Up to this many times the error that the identification promised, the model holds: a policy moves otherwise than an
+excitation, and of hidden pendulums that had not changed some were 1.6 times as far off."""
+_UNEXPLAINED = 0.5
+"""Above this share of the error, parameters that are fitted to the log itself do not explain a joint's motion."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement are its noise."""
 _LATE = 0.01
@@ -98,9 +102,9 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
     problem, ahead_s = segments(robot, found, episodes, config)
     if found.posterior is None:
         raise Sim2RealError("this identification was interrupted: it does not say how sure its estimates are")
-    moved = drift.moved(problem, found.posterior, found.widening or 1.0)
-    drifted = drift.weigh(moved, problem.table, found.posterior, robot.causes)
-    here = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(moved.z).items()}
+    drifted, x = drift.drift(problem, found.posterior, found.widening or 1.0, robot.causes)
+    z = refine(problem, problem.table.at_scale(x)[None], _STEPS, 2).z
+    here = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
     models = {"identified": {n: found.values[n] for n in nominal}, AS_HERE: here, "nominal": nominal}
     every = np.ones(problem.segments, bool)
@@ -158,22 +162,15 @@ def segments(
 def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
     """Return what a deployment that was tested asks for, the command left out.
 
-    First what no parameters explain: then it is no use to identify again. Then drift, then a model that is further off
-    than it promised, then a policy that was trained for other times, or that is not good enough.
+    What is wrong with the model comes first, see ``verdict_of``; then a policy that was trained for other times, or
+    that is not good enough.
 
     Args:
         deployed: With replay, drift and times.
         bundle: The policy.
     """
-    odd = [r for r in deployed.replay if _beyond(r, AS_HERE) > _UNEXPLAINED]
-    if odd:
-        worst = max(odd, key=lambda r: _beyond(r, AS_HERE))
-        why = f"no parameters explain how {worst.name} moves: {_error(worst, AS_HERE)}"
-        return Advice("look at this joint", (why, "it may be loose, blocked, or touch something"), joint=worst.name)
-    if deployed.drift is not None and (named := deployed.drift.named):
-        return Advice("re-identify", (f"the robot has changed: {_change(named)}", *_also(deployed.drift)))
-    if off := [r for r in deployed.replay if _beyond(r, "identified") > _OFF]:
-        return Advice("re-identify", tuple(f"{r.name}: {_error(r, 'identified')}" for r in off))
+    if told := verdict_of(deployed.replay, deployed.drift):
+        return told
     if late := list(_too_late(deployed, bundle)):
         return Advice("re-train", tuple(late))
     success = next((g for g in deployed.gap if g.quantity == "success"), None)
@@ -185,6 +182,29 @@ def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
         if success.real < _GOOD:
             return Advice("re-train", (f"the model holds, and success is {success.real:.2f}, as in simulation",))
     return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
+
+
+def verdict_of(replay: Sequence[Replay], drifted: Drift | None) -> Advice | None:
+    """Return what is wrong with the model; None if it holds.
+
+    First what no parameters explain: then it is no use to identify again. Then drift, then a model that is further off
+    than it promised.
+
+    Args:
+        replay: How far models are off.
+        drifted: What has changed.
+    """
+    share = {r.name: _beyond(r, AS_HERE) / max(_beyond(r, "identified"), 1e-9) for r in replay}
+    odd = [r for r in replay if _beyond(r, AS_HERE) > _OFF and not share[r.name] <= _UNEXPLAINED]
+    if odd:
+        worst = max(odd, key=lambda r: _beyond(r, AS_HERE))
+        why = f"no parameters explain how {worst.name} moves: {_error(worst, AS_HERE)}"
+        return Advice("look at this joint", (why, "it may be loose, blocked, or touch something"), joint=worst.name)
+    if drifted is not None and (named := drifted.named):
+        return Advice("re-identify", (f"the robot has changed: {_change(named)}", *_also(drifted)))
+    if off := [r for r in replay if _beyond(r, "identified") > _OFF]:
+        return Advice("re-identify", tuple(f"{r.name}: {_error(r, 'identified')}" for r in off))
+    return None
 
 
 def show(deployed: Deployment) -> None:
@@ -199,10 +219,10 @@ def show(deployed: Deployment) -> None:
     if deployed.drift is not None:
         alarms = set(deployed.drift.alarms)
         rows = [
-            [c.name, c.before, c.now, f"[{c.low95:.4g}, {c.high95:.4g}]", c.unit, c.chi2, c.name in alarms]
+            [c.name, c.before, c.now, f"[{c.low95:.4g}, {c.high95:.4g}]", c.unit, c.explains, c.name in alarms]
             for c in deployed.drift.changes
         ]
-        print(table(rows, ["changed alone", "identified", "now", "95 % interval", "unit", "chi2", "alarm"]))
+        print(table(rows, ["changed alone", "identified", "now", "95 % interval", "unit", "explains", "alarm"]))
     if deployed.advice is not None:
         note(f"verdict: {deployed.advice.status}")
         for reason in deployed.advice.reasons:
@@ -254,7 +274,7 @@ def _too_late(deployed: Deployment, bundle: Bundle) -> list[str]:
         longest = float(drawn.max())
         share = float(np.mean(taken > longest))
         if share > _LATE:
-            said.append(f"{share:.1%} of the steps of {node} take longer than the {1e3 * longest:.1f} ms of training")
+            said.append(f"{share:.1%} of the steps of {node} {LATER} the {1e3 * longest:.1f} ms of training")
     return said
 
 

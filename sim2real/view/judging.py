@@ -29,7 +29,7 @@ def tables(deployed: Deployment) -> list[Block]:
         rows = [
             [
                 *(c.name, c.unit or "factor", number(c.before), number(c.now)),
-                *(f"{number(c.low95)} to {number(c.high95)}", number(c.chi2), "yes" if c.name in alarms else "no"),
+                *(f"{number(c.low95)} to {number(c.high95)}", f"{c.explains:.0%}", "yes" if c.name in alarms else "no"),
             ]
             for c in deployed.drift.changes
         ]
@@ -38,7 +38,7 @@ def tables(deployed: Deployment) -> list[Block]:
             f"one that explains most first. {deployed.drift.level:.0%} of the robots that have not changed raise any "
             "alarm."
         )
-        columns = ("changed alone", "unit", "identified", "now", "95 % interval", "chi-square", "alarm")
+        columns = ("changed alone", "unit", "identified", "now", "95 % interval", "explains", "alarm")
         blocks.append(TableBlock(caption, columns, rows, text_columns=(1, 4, 6)))
     if deployed.replay:
         models = list(deployed.replay[0].rmse)

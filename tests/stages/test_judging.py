@@ -16,8 +16,8 @@ from sim2real.stages.next_step import commands
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.view.judging import tables, verdict_blocks
 
-FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 300.0, 1e-20)
-STEADY = Drift((replace(FRICTION, now=6.1, chi2=0.1, p=0.8),), 0.05, (), 20.0)
+FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
+STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
 ALARM = Drift((FRICTION,), 0.05, ("friction",), 20.0)
 BUNDLE = SimpleNamespace(
     contract=SimpleNamespace(delays_s={"sensor_delay": 0.02, "actuator_delay": 0.03}),
@@ -44,12 +44,14 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     [
         ({}, "fine", "is the one that was identified"),
         ({"drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
-        ({"identified": 0.02}, "re-identify", "promised were 0.01 rad"),
+        ({"identified": 0.02}, "fine", "is the one that was identified"),
+        ({"identified": 0.04}, "re-identify", "promised were 0.01 rad"),
         ({"identified": None}, "re-identify", "it diverges"),
         ({"took_s": 0.004}, "re-train", "100.0% of the steps of agent take longer than the 1.0 ms of training"),
         ({"success": 0.7}, "re-train", "success is 0.70, in simulation 1.00"),
         ({"success": 0.85, "simulated": 0.9}, "re-train", "as in simulation"),
-        ({"identified": 0.5, "here": 0.2, "drift": ALARM}, "look at this joint",
+        ({"identified": 0.5, "here": 0.2, "drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
+        ({"identified": 0.5, "here": 0.4, "drift": ALARM}, "look at this joint",
          "no parameters explain how hinge moves"),
     ],
 )  # fmt: skip
@@ -81,11 +83,11 @@ OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/
     [
         (Advice("fine", ()), {}, ""),
         (Advice("re-identify", ()), {"drift": ALARM}, f"sim2real identify pendulum {OWN} --run runs/pendulum/T"),
-        (Advice("re-identify", ()), {"drift": ALARM, "seconds": 4.0}, "sim2real record pendulum"),
+        (Advice("re-identify", ()), {"drift": replace(ALARM, seconds=8.0)}, "sim2real record pendulum"),
         (Advice("re-identify", ()), {},
          f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"),
         (Advice("re-train", ("success is 0.7",)), {}, "sim2real train pendulum --run runs/pendulum/T"),
-        (Advice("re-train", ("10% of the steps take longer",)), {},
+        (Advice("re-train", ("10% of the steps take longer than 1 ms",)), {},
          f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"
          " && sim2real train pendulum --run runs/pendulum/T"),
         (Advice("look at this joint", (), joint="hinge"), {}, ""),
