@@ -50,6 +50,7 @@ BENCHES = {
             *_GRAPH,
             "sim2real/identify",
             "sim2real/stages/judging.py",
+            "sim2real/stages/replaying.py",
             "scripts/benches/hidden_robots.py",
         ),
     ),

@@ -93,8 +93,9 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     import sim2real
     from sim2real.artifacts.recording import Recording
     from sim2real.errors import Sim2RealError
-    from sim2real.stages import judging
+    from sim2real.stages.judging import verdict_of
     from sim2real.stages.pipeline import load_pipeline
+    from sim2real.stages.replaying import tested
 
     robot, pipeline = hidden.Hidden.draw(number), load_pipeline("pendulum")
     session = hidden.play(robot, hidden.excited(options.record_s, number), options.record_s, 0)
@@ -114,11 +115,11 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
                 logs.append(Recording.load(path).episode)
                 upright.append(float((np.cos(played.angle) > 0.95)[len(played.t) // 2 :].mean()))
             try:
-                replay, drifted = judging.tested(pipeline, identified, logs)
+                replay, drifted = tested(pipeline, identified, logs)
             except Sim2RealError as error:
                 said[change] = {"upright": upright, "refused": str(error)}
                 continue
-            told = judging.verdict_of(replay, drifted)
+            told = verdict_of(replay, drifted)
             said[change] = {
                 "upright": upright,
                 "alarms": list(drifted.alarms),

@@ -52,7 +52,8 @@ class Replay:
         unit: Its unit.
         horizon_s: How far ahead is predicted [s].
         rmse: Model -> root mean square error; None where it diverged. ``as in this log`` has parameters fitted to it.
-        promised: That of the identified model on held-out recordings; None where that is not known.
+        promised: That of the identified model on held-out recordings, more where this log moves more; None where that
+            is not known.
     """
 
     name: str

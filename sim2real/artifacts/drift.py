@@ -38,7 +38,7 @@ class Drift:
         changes: Each way in which the robot may have changed, the one that explains most first.
         level: Share of robots that did not change for which any of the tests raises an alarm.
         alarms: Names of those that are significant at this level, all tests together (Holm), the surest first.
-        seconds: Length of the log that was tested [s].
+        seconds: How much of the log is in motion, and was tested [s].
     """
 
     changes: tuple[Changed, ...]

@@ -121,9 +121,9 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
 def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Alone:
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
 
-    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the sum
-    of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its errors, in whatever
-    direction, move the size.
+    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
+    sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
+    errors, in whatever direction, move the size.
     """
     table = problem.table
 
@@ -169,7 +169,8 @@ def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> f
     """
     flat, rest = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
     # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
-    root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+    values, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
     pulled, informed = root.T @ (flat.T @ rest), root.T @ (flat.T @ flat) @ root
     gain = pulled @ np.linalg.solve(informed + variance * np.eye(len(root)), pulled)
     return float(rest @ rest - gain) / max(int(np.count_nonzero(rest)), 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,36 +15,17 @@ from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
-from sim2real.graph.episode import Episode
-from sim2real.identify import drift, prediction
-from sim2real.identify.problem import Problem
-from sim2real.identify.refine import refine
-from sim2real.identify.segments import Span
-from sim2real.robots.base import RecordedRobot
-from sim2real.robots.worlds import in_world
-from sim2real.stages import identified, left_out
-from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, table
-from sim2real.stages.cutting import reach
 from sim2real.stages.interruption import patiently
 from sim2real.stages.next_step import LATER, commands
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.replaying import AS_HERE, tested
 
-AS_HERE = "as in this log"
-"""The model with the parameters that the deployment's own log has."""
-_SEGMENT_S = 0.4
-"""Length of a segment at least [s]; a balanced pendulum's errors grow tenfold in 0.2 s: longer ones say little."""
-_LEAST = 12
-"""Segments that a test needs at least."""
-_STEPS = 15
-"""Most steps of a refinement of all parameters."""
 _OFF = 3.0
 """Up to this many times the error that the identification promised, the model holds: a policy moves otherwise than an
 excitation, and of hidden pendulums that had not changed some were 1.6 times as far off."""
 _UNEXPLAINED = 0.5
 """Above this share of the error, parameters that are fitted to the log itself do not explain a joint's motion."""
-_NOISE = 2.0
-"""Errors below this many deviations of the measurement are its noise."""
 _LATE = 0.01
 """Share of the steps that may take longer than any in training."""
 _GOOD, _WORSE = 0.9, 0.1
@@ -75,88 +56,12 @@ def judged(
         advice = Advice("not judged", (str(error.args[0]),))
         return replace(deployed, advice=commands(advice, pipeline, found, folder, deployed))
     if any(row.quantity == f"{ROUND_TRIP}_s" for row in times):
-        now = {c.name: c.now for c in drifted.changes}.get(ROUND_TRIP)
+        other = drifted.named is not None and drifted.named.name != ROUND_TRIP
+        now = None if other else {c.name: c.now for c in drifted.changes}.get(ROUND_TRIP)
         times = tuple(_with_real(t, now) if t.quantity == f"{ROUND_TRIP}_s" else t for t in times)
     deployed = replace(deployed, trained=times, replay=tuple(rows), drift=drifted)
     advice = verdict(deployed, bundle)
     return replace(deployed, advice=commands(advice, pipeline, found, folder, deployed))
-
-
-def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode]) -> tuple[list[Replay], Drift]:
-    """Play recorded commands to the identified and to the nominal model, and test the parameters.
-
-    What is compared is what the sensor said with what the model's sensor would say, as late and at the log's times.
-
-    Args:
-        pipeline: The robot.
-        found: What was identified.
-        episodes: The logs.
-
-    Raises:
-        Sim2RealError: When the logs are too short, or what was identified does not fit the robot.
-    """
-    robot = left_out.having(in_world(pipeline.load(), found.world), [p.name for p in found.parameters])
-    late = [p.upper for p in found.parameters if p.kind == "delay" and p.upper is not None]
-    longest_s = max([pipeline.identify.max_delay_s, *late])
-    config = replace(pipeline.identify, settle_s=found.settle_s, max_delay_s=longest_s)
-    problem, ahead_s = segments(robot, found, episodes, config)
-    if found.posterior is None:
-        raise Sim2RealError("this identification was interrupted: it does not say how sure its estimates are")
-    drifted, x = drift.drift(problem, found.posterior, found.widening or 1.0, robot.causes)
-    z = refine(problem, problem.table.at_scale(x)[None], _STEPS, 2).z
-    here = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
-    nominal = {p.name: p.nominal for p in problem.model.parameters}
-    models = {"identified": {n: found.values[n] for n in nominal}, AS_HERE: here, "nominal": nominal}
-    every = np.ones(problem.segments, bool)
-    columns = prediction.samples(problem, models, config.settle_s, every)
-    errors = prediction.errors(problem, columns, list(models), config.settle_s, [ahead_s])
-    promised = _promised(found, ahead_s)
-    rows = []
-    for position in identified.positions(problem, robot.units):
-        rmse = {e.model: e.rmse.get(position.column) for e in errors if e.held_out}
-        rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
-        own = promised.get(position.column)
-        least = _NOISE * position.sigma
-        rows.append(Replay(position.name, position.unit, ahead_s, rmse, None if own is None else max(own, least)))
-    return rows, drifted
-
-
-def segments(
-    robot: RecordedRobot, found: Identification, episodes: Sequence[Episode], config: IdentifyConfig
-) -> tuple[Problem, float]:
-    """Return logs in short segments, with the parameters that were identified, and how far ahead they predict [s].
-
-    Args:
-        robot: The robot.
-        found: What was identified.
-        episodes: The logs.
-        config: How residuals are made.
-
-    Raises:
-        Sim2RealError: When there is too little to test.
-    """
-    model = robot.identifiable(config.max_delay_s)
-    if own := [p.name for p in model.parameters if p.free and p.per_recording]:
-        raise Sim2RealError(f"{', '.join(own)} differ from recording to recording: of a new log they are not known")
-    horizons = sorted({p.horizon_s for p in found.prediction})
-    length_s = max(_SEGMENT_S, config.settle_s + (horizons[0] if horizons else 0.0))
-    ahead_s = max([h for h in horizons if config.settle_s + h <= length_s + 1e-9], default=length_s - config.settle_s)
-    spans = []
-    for r, episode in enumerate(episodes):
-        begin, end = reach(episode, config)
-        spans += [Span(r, float(b)) for b in np.arange(begin, end - length_s + 1e-6, length_s)]
-    if len(spans) < _LEAST:
-        seconds = sum(e.duration_s for e in episodes)
-        raise Sim2RealError(f"{seconds:.1f} s of deployment are too little to test the model on")
-    fixed = {p.name: p.estimate for p in found.parameters if p.verdict == "fixed"}
-    table = model.parameters.with_fixed({n: v for n, v in fixed.items() if n in {p.name for p in model.parameters}})
-    free = {p.name for p in table if p.free}
-    wider = {
-        p.name: (min(p.lower, table[p.name].low), max(p.upper, table[p.name].high))
-        for p in found.parameters
-        if p.name in free and p.kind != "delay" and p.lower is not None and p.upper is not None
-    }
-    return Problem(model, list(episodes), spans, length_s, config, table.with_bounds(wider)), ahead_s
 
 
 def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
@@ -229,12 +134,6 @@ def show(deployed: Deployment) -> None:
             note(f"  {reason}")
         if deployed.advice.next:
             note(f"next: {deployed.advice.next}")
-
-
-def _promised(found: Identification, ahead_s: float) -> Mapping[str, float]:
-    """Return the identified model's error on held-out data, by field."""
-    rows = [p for p in found.prediction if p.model == "identified" and p.held_out and p.horizon_s == ahead_s]
-    return {n: e for row in rows for n, e in row.rmse.items() if e is not None}
 
 
 def _trained(deployed: Deployment, bundle: Bundle) -> list[Gap]:

@@ -18,7 +18,7 @@ from sim2real.stages.pipeline import Pipeline
 LATER = "take longer than"
 """How the reason is put that asks for other times in training."""
 ENOUGH_S = 12.0
-"""So much of a deployment's own logs is enough to identify from [s]."""
+"""So much motion in a deployment's own logs is enough to identify from [s]."""
 
 
 def commands(
