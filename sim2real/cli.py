@@ -16,6 +16,7 @@ from sim2real.stages import ending
 from sim2real.stages.interruption import SignalHandling
 
 if TYPE_CHECKING:
+    from sim2real.artifacts.run_folder import StageFolder
     from sim2real.stages.pipeline import Pipeline
 
 DEMO_PIPELINE = "pendulum"
@@ -156,6 +157,7 @@ def _run(command: str, arguments: list[str]) -> None:
         "epilog": _epilog(
             f"sim2real run {pipeline.name} --seed 3 --record.duration-s 20",
             f"sim2real run {pipeline.name} --resume runs/{pipeline.name}/TIME",
+            f"sim2real run {pipeline.name} --iterations 5 --until success=0.95",
         ),
     }
     parsed = flags.parse(default, rest, **texts)
@@ -329,29 +331,19 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
 
 
 def _run_all(pipeline: Pipeline, flags: Any) -> None:
-    """Run the four stages in one run folder; from the first one on that is not finished there."""
-    from sim2real.artifacts.run_folder import STAGES, finished
-    from sim2real.stages import console, targets
+    """Run the four stages in one run folder, and around again where that was asked for."""
+    from sim2real.stages.running import run_all
 
-    if flags.record.dry_run:
-        raise UsageError(
-            "a run cannot go on from a dry recording: there is nothing in it to identify",
-            hint=f"`sim2real record {pipeline.name} --dry-run` by itself; of a run, deploy alone may be dry",
-        )
-    run_dir = targets.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
-    redo = run_dir is None
-    for number, stage in enumerate(STAGES, 1):
-        done = None if redo or run_dir is None else finished(run_dir, stage)
-        if done is not None:
-            console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")
-            continue
-        redo = True  # what comes after a stage that ran again is out of date
-        console.note(f"{stage} ({number}/{len(STAGES)})")
-        run_dir = _call_stage(stage, pipeline, getattr(flags, stage), flags.runs, run_dir)
+    def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
+        done = _call_stage(stage, pipeline, config, flags.runs, run_dir)
+        assert done is not None, "RunFlags refuses several processes"
+        return done
+
+    run_all(pipeline, flags, call)
 
 
-def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> Path | None:
-    """Call a stage's entry point, print its summary and what it wrote, and return its run folder."""
+def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> StageFolder | None:
+    """Call a stage's entry point, print its summary and what it wrote, and return what it left."""
     from sim2real.stages import console
 
     if (done := importlib.import_module(f"sim2real.stages.{stage}").run(pipeline, config, root, run_dir)) is None:
@@ -360,7 +352,7 @@ def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir
         print(console.pairs(done.manifest["summary"]))
     for path in [*done.outputs.values(), done.folder / "manifest.json"]:
         console.wrote(path)
-    return done.run_dir
+    return done
 
 
 def _pipeline_first(command: str, arguments: list[str]) -> tuple[Pipeline, list[str]]:

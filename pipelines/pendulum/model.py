@@ -130,6 +130,14 @@ def dynamics() -> list[Parameter]:
     ]  # fmt: skip
 
 
+def causes() -> dict[str, dict[str, float]]:
+    """Return what moves several groups at once: a payload where the mass is, and inertia about the axis alone."""
+    p, names = nominal_params(), ("gain", "gravity", "damping", "friction")
+    share = float(p.mass * p.length**2 / p.J)  # of the mass in the inertia
+    payload = dict.fromkeys(names, -share) | {"gravity": 1.0 - share}
+    return {"payload": payload, "inertia": dict.fromkeys(names, -1.0)}
+
+
 class PendulumWorld(OdeWorld):
     """The pendulum as an ordinary differential equation, driven by the ``actuator`` input."""
 

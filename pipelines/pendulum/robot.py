@@ -30,7 +30,7 @@ from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.probe import Probe
 from sim2real.robots.training import Draw
 
-from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, dynamics, from_groups
+from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, causes, dynamics, from_groups
 from .plant import SUPPLY_V
 
 SERVO_ID = 1
@@ -66,6 +66,7 @@ class PendulumRobot(LoopRobot):
     mounting = (HINGE,)
     probe = Probe(step=1.5, lag_s=0.004)
     tick_s = 1 / WORLD_HZ
+    causes = causes()
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
     # Latencies that the stages never read; ``--reveal`` compares with them.

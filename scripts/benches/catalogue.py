@@ -43,6 +43,17 @@ BENCHES = {
     "demo": Bench(
         "demo", "the pendulum's whole run for several seeds", (*_STAGES, "!sim2real/composer", "pipelines/pendulum")
     ),
+    "drift": Bench(
+        "drift",
+        "whether a deployment's log tells that a hidden robot has changed, and what",
+        (
+            *_GRAPH,
+            "sim2real/identify",
+            "sim2real/stages/judging.py",
+            "sim2real/stages/replaying.py",
+            "scripts/benches/hidden_robots.py",
+        ),
+    ),
     "faults": Bench(
         "faults",
         "what goes wrong while a policy runs: how soon the motor is safe, the log, and what is said",

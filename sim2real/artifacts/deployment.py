@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from sim2real.artifacts.drift import Drift
 from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.errors import Sim2RealError
@@ -42,6 +44,43 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """How far the recorded commands, played to models, are off the measurements of one position.
+
+    Attributes:
+        name: What people call the position.
+        unit: Its unit.
+        horizon_s: How far ahead is predicted [s].
+        rmse: Model -> root mean square error; None where it diverged. ``as in this log`` has parameters fitted to it.
+        promised: That of the identified model on held-out recordings, more where this log moves more; None where that
+            is not known.
+    """
+
+    name: str
+    unit: str
+    horizon_s: float
+    rmse: Mapping[str, float | None]
+    promised: float | None = None
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do after a deployment.
+
+    Attributes:
+        status: The verdict.
+        reasons: Why, in sentences.
+        next: The command to type; "" where there is none.
+        joint: The joint to look at; "" for none.
+    """
+
+    status: Literal["fine", "re-identify", "re-train", "look at this joint", "not judged"]
+    reasons: tuple[str, ...]
+    next: str = ""
+    joint: str = ""
+
+
+@dataclass(frozen=True)
 class Deployment:
     """Episodes on the robot beside the same policy in simulation.
 
@@ -52,6 +91,10 @@ class Deployment:
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; times of its own as
             ``t_FIELD``. Empty where nothing was simulated.
         recordings: The robot's sessions.
+        trained: Times on the robot beside those that the policy was trained with.
+        replay: The recorded commands, played to the identified and to the nominal model.
+        drift: Which parameters are no longer what was identified; None where that was not tested.
+        advice: What to do next; None in older files and after a dry run.
         dry_run: Whether nothing was moved: then there are no scores, no simulation and no gap.
         format: Version of the file.
     """
@@ -61,6 +104,10 @@ class Deployment:
     units: Mapping[str, str] = field(default_factory=dict)
     simulated: tuple[Mapping[str, np.ndarray], ...] = ()
     recordings: tuple[Recording, ...] = ()
+    trained: tuple[Gap, ...] = ()
+    replay: tuple[Replay, ...] = ()
+    drift: Drift | None = None
+    advice: Advice | None = None
     dry_run: bool = False
     format: int = FORMAT
 
@@ -83,17 +130,27 @@ class Deployment:
         return {"result": RESULT, "simulation": SIMULATION}
 
     @staticmethod
-    def load(folder: Path) -> Deployment:
-        """Read what ``save`` wrote, and the logs beside it.
+    def read(folder: Path) -> Deployment:
+        """Read scores and verdict alone, without simulations and logs.
 
         Raises:
-            Sim2RealError: When something is missing, of another format, or not as it should be.
+            Sim2RealError: When the file is missing, of another format, or not as it should be.
         """
         file = folder / RESULT
         with malformed(file, _AGAIN):
             found = read_json(file, Deployment)
             if found.format != FORMAT:
                 raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+        return found
+
+    @staticmethod
+    def load(folder: Path) -> Deployment:
+        """Read what ``save`` wrote, and the logs beside it.
+
+        Raises:
+            Sim2RealError: When something is missing, of another format, or not as it should be.
+        """
+        found = Deployment.read(folder)
         arrays: dict[str, np.ndarray] = {}
         if not found.dry_run:
             with malformed(folder / SIMULATION, _AGAIN):

@@ -106,6 +106,10 @@ class Parameter:
         """Return where a value stands on the parameter's scale."""
         return float(TRANSFORMS[self.transform][0](value))
 
+    def from_scale(self, x: float) -> float:
+        """Return the value at a point of the parameter's scale."""
+        return float(from_scale(self.transform, x))
+
 
 @dataclass(frozen=True)
 class Column:

@@ -18,20 +18,23 @@ from sim2real.identify.programs import program
 Values = Mapping[str, Any]
 
 
-def samples(problem: Problem, models: Mapping[str, Values], settle_s: float) -> dict[str, np.ndarray]:
+def samples(
+    problem: Problem, models: Mapping[str, Values], settle_s: float, held_out: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Simulate all segments with each model; initial states of held-out segments are fitted to their first part alone.
 
     Args:
         problem: The segments.
         models: Values of all parameters by model.
         settle_s: Length of that first part [s].
+        held_out: Shape ``(S,)``, bool: which segments count as held out; default: those that are not fitted.
 
     Returns:
         Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each channel's field
         what was ``measured`` and what each model says, as ``FIELD_measured``, ``FIELD_MODEL``. ``FIELD_told`` is where
         a joint was told to be at that time, where commands are positions.
     """
-    held_out = ~np.isin(np.arange(problem.segments), problem.train)
+    held_out = ~np.isin(np.arange(problem.segments), problem.train) if held_out is None else held_out
     every, fit_s = np.arange(problem.segments), np.where(held_out, settle_s, problem.segment_s)
     columns: dict[str, np.ndarray] = {}
     for name, values in models.items():

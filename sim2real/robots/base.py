@@ -66,6 +66,8 @@ class RecordedRobot(ABC):
         units: Field of a message -> its unit.
         roles: Which node does what.
         profile_rad_s: How fast the actuators' setpoints move to their goals [rad/s]; infinite: at once.
+        causes: What may change several parameters at once: name -> parameter -> by how much it moves on its scale when
+            what is named grows by a factor of e.
         export_lead_s: What a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s], to do
             what the identified graph does.
     """
@@ -74,6 +76,7 @@ class RecordedRobot(ABC):
     roles: Roles = ROLES
     profile_rad_s: float = math.inf
     export_lead_s: float = 0.0
+    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 
     _DATA: ClassVar[Mapping[str, Datum]] = {
         "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),

@@ -67,11 +67,13 @@ def deploy(
         return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
     sessions = [{**summary, **delay} for summary in sessions]
     from sim2real.stages.gap import compare  # what simulates is imported, and compiled, when the robot is at rest
+    from sim2real.stages.judging import judged
     from sim2real.train.networks import Policy
 
     world, values = (None, None) if identification is None else (identification.world, identification.values)
     trained = Policy.from_weights(bundle.weights, bundle.spec)
-    return compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s), sessions
+    gap = compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s)
+    return judged(gap, pipeline, bundle, identification, folder), sessions
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -110,6 +112,9 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         if found.gap:
             headers = ["quantity", "robot", "simulation", "gap"]
             print(table([[g.quantity, g.real, g.simulation, g.gap] for g in found.gap], headers))
+        from sim2real.stages.judging import show
+
+        show(found)
         stage.summary(_summary(found, sessions))
         if config.strict_timing:
             for summary in sessions:

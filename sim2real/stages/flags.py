@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
+import math
 import os
 import re
 import sys
@@ -50,6 +51,11 @@ class DemoFlags:
 class RunFlags(DemoFlags):
     """Flags of all four stages."""
 
+    iterations: int = 1
+    """How often to go around at most: the verdict on a deployment says what is done again, from its own log."""
+    until: Annotated[str | None, tyro.conf.arg(metavar="QUANTITY=VALUE")] = None
+    """Go around until a quantity of the gap report is at least so large on the robot, such as success=0.95; default:
+    until the verdict is 'fine'."""
     record: RecordConfig = field(default_factory=RecordConfig)
     identify: IdentifyConfig = field(default_factory=IdentifyConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -62,6 +68,30 @@ class RunFlags(DemoFlags):
                 "only training is divided among processes: each of them would record and deploy",
                 hint="record and identify in one, then `sim2real train PIPELINE --hosts...` in all",
             )
+        if self.iterations < 1 or (self.until and self.iterations == 1):
+            raise UsageError(
+                f"a run goes around at least once, and more often to reach a goal; got {self.iterations}",
+                hint="--iterations 5 --until success=0.95",
+            )
+        _ = self.goal
+
+    @property
+    def goal(self) -> tuple[str, float] | None:
+        """The quantity to reach, and its least value; None: no goal.
+
+        Raises:
+            UsageError: When ``until`` says neither.
+        """
+        if self.until is None:
+            return None
+        name, _, value = self.until.partition("=")
+        try:
+            least = float(value)
+        except ValueError:
+            least = math.nan
+        if not name or not math.isfinite(least):
+            raise UsageError(f"until must be QUANTITY=VALUE, got {self.until!r}", hint="--until success=0.95")
+        return name, least
 
 
 @dataclass(frozen=True)

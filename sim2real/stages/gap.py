@@ -36,7 +36,8 @@ def compare(
 ) -> Deployment:
     """Return how deployments went, beside simulations of the same policy.
 
-    What is compared is of one kind: true states with true ones, and what sensors said with what they would say.
+    What is compared is of one kind: scores of true states with those of true ones, where all are known; everything
+    else, and what is drawn, is what sensors said beside what they would say.
 
     Args:
         robot: The robot.
@@ -45,24 +46,26 @@ def compare(
         values: Identified parameters to simulate with; None: nothing is simulated.
         duration_s: How long to simulate [s].
     """
-    real = [_states(recording, robot) for recording in recordings]
-    seen = robot.roles.world if all(r.true_states() is not None for r in recordings) else robot.roles.sensor
+    known = all(r.true_states() is not None for r in recordings)
+    real = [_states(recording, robot, known) for recording in recordings]
+    seen = robot.roles.world if known else robot.roles.sensor
     with progress(None, "simulate the same"):
         simulated, timeline = patiently(
             lambda: _simulate(robot, policy, values, recordings[0].timing, duration_s, len(recordings), seen)
         )
-    episodes, gap = _scored(robot, real, simulated)
+    scored, measured = (None, []) if simulated is None else ([s for s, _ in simulated], [m for _, m in simulated])
+    episodes, gap = _scored(robot, real, scored)
     gap += _age_rows(robot, [r.episode for r in recordings], timeline)
-    columns = [{"t": t, **states} for t, states in (simulated or [])[: len(recordings)]]
+    columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
     return Deployment(episodes, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings))
 
 
-def _states(recording: Recording, robot: Robot) -> States:
-    """Return times [s] and states of a deployment: the true ones of an embedded robot, else what was measured."""
+def _states(recording: Recording, robot: Robot, known: bool) -> States:
+    """Return times [s] and states of a deployment: the true ones where all are ``known``, else what was measured."""
     episode = recording.episode
     sent = as_sent(robot, episode.outputs[robot.roles.supervisor], episode.outputs[robot.roles.actuator])
-    if (true := recording.true_states()) is not None:
+    if known and (true := recording.true_states()) is not None:
         t_s, states = true
         return t_s, {**sent, **states}
     sensor = robot.roles.sensor
@@ -77,10 +80,11 @@ def _simulate(
     duration_s: float,
     episodes: int,
     seen: str,
-) -> tuple[list[States] | None, Timeline | None]:
+) -> tuple[list[tuple[States, States]] | None, Timeline | None]:
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
 
-    ``seen`` says which states: those of the world, or as the sensor measures them, as late as on the robot.
+    ``seen`` says which states the first are: those of the world, or as the sensor measures them, as late as on the
+    robot; the second are always the sensor's.
     Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
     once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
     None and None where there is nothing to simulate with.
@@ -102,13 +106,15 @@ def _simulate(
     # Each deployment's own trial in turn: its simulation has the same to do.
     trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
-    recorded = (seen, robot.roles.supervisor, robot.roles.actuator)
+    recorded = tuple({seen, robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator})
 
     def one(eps: jax.Array, params: Any) -> Any:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
     records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
-    return [_run(graph, records, robot, e, seen) for e in range(_SIMULATIONS)], timeline
+    kinds = (seen, robot.roles.sensor)
+    pairs = [tuple(_run(graph, records, robot, e, kind) for kind in kinds) for e in range(_SIMULATIONS)]
+    return [(scored, measured) for scored, measured in pairs], timeline
 
 
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:

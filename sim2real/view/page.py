@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sim2real.artifacts.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
 from sim2real.view.blocks import NoteBlock, PageSection
+from sim2real.view.iterations import iterations_sections
 from sim2real.view.sections import SECTIONS, headline
 
 PAGE = "report.html"
@@ -29,7 +30,7 @@ def report(run_dir: Path) -> Path:
     """
     run_dir = Path(run_dir)
     artifacts = finished_stages(run_dir)
-    sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()]
+    sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()] + iterations_sections(run_dir)
     notes = _about_others(run_dir, artifacts)
     return _write(run_dir / PAGE, list(artifacts.values()), sections, run_dir.resolve().name, notes)
 

@@ -17,7 +17,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
 from sim2real.log.schema import unit_of
-from sim2real.view import figures, timing
+from sim2real.view import figures, judging, timing
 from sim2real.view.about import about
 from sim2real.view.blocks import (
     MISSING,
@@ -125,6 +125,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     if deployed.dry_run:
         return _dry_section(artifact, logs)
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    blocks += judging.verdict_blocks(deployed)
     rows = [
         [
             spoken(row.quantity)[0],
@@ -136,6 +137,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     blocks.append(
         TableBlock("Robot and simulation", ("quantity", "unit", "robot", "simulation", "gap"), rows, text_columns=(1,))
     )
+    blocks += judging.tables(deployed)
     for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
         caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
         figure = figures.deployment(log, simulated_series(columns), deployed.units, index, f"deploy-{index}")
@@ -151,6 +153,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     if real:
         note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
         tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
+    tiles += judging.verdict_tile(deployed)
     tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in logs])]
     lead = "The policy on the robot, beside the same policy in simulation."
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])

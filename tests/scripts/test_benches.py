@@ -101,6 +101,18 @@ def test_randomise(run):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_drift(run):
+    report = run("drift", "--changes", "friction")
+    (robot,) = report["robots"]
+    tested = robot["changes"]["friction"]
+    rows = {r["name"].removeprefix("drift/pendulum/friction/"): r["value"] for r in report["rows"]}
+    assert rows["detected"] == bool(tested["alarms"])
+    assert rows["named"] == (tested["named"] == "friction")
+    assert rows["not_tested"] == 0
+    assert {c["name"] for c in tested["changes"]} >= {"friction", "payload", "round_trip_delay"}
+
+
 def test_interop(run):
     pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
     report = run("interop")

@@ -1,0 +1,251 @@
+"""Whether a later log is still of the robot that was identified: a test of each parameter, and of their causes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import fminbound
+from scipy.special import stdtr, stdtrit
+
+from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.posterior import Posterior
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem import Problem
+from sim2real.identify.uncertainty import Linearised, linearise, loss_variance
+
+LEVEL = 0.05
+"""Share of robots that did not change for which there is an alarm."""
+_SIZES = (-0.4, -0.25, -0.12, -0.05, 0.05, 0.12, 0.25, 0.4)
+"""How large changes are that are tried first, in shares of the bounds' width: of a factor of four up and down, the
+largest is 3."""
+_ALIKE = 0.02
+"""Changes whose shares of the error that they take away differ by less explain as much."""
+_POLISH = 12
+"""Most simulations of the log between the best of these and its neighbours."""
+Causes = Mapping[str, Mapping[str, float]]
+"""Name of a cause -> parameter -> by how much it moves on its scale when what is named grows by a factor of e."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A change that may have come alone: a direction ``(P,)`` on the parameters' scales, and what it is called."""
+
+    name: str
+    along: np.ndarray
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What a log says about one change, if it came alone.
+
+    Attributes:
+        way: The change.
+        size: How far along it.
+        own: Variance of ``size`` by the log's residuals.
+        before: Its variance by what the identification leaves open.
+        segments: How many segments of the log say something about it, those that say little counted less.
+        loss: Of the log, with this change, and all else as far off as the identification leaves open.
+    """
+
+    way: Way
+    size: float
+    own: float
+    before: float
+    segments: float
+    loss: float
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the whole variance (Satterthwaite, Biometrics Bulletin 2, 1946).
+
+        The log's part is known as well as segments that say something are many: a pendulum that is held upright says
+        nothing. The identification's part counts as known.
+        """
+        return max(self.segments - 1.0, 1.0) * ((self.own + self.before) / max(self.own, 1e-300)) ** 2
+
+
+def ways(table: ParameterTable, causes: Causes) -> list[Way]:
+    """Return the changes that may have come alone: of each parameter, and those of several that have a cause.
+
+    A log tells of the delays on either side of the world their sum alone: both move by half. Causes that move what was
+    not identified are left out.
+    """
+    delays = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
+    found = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(table.names) if len(delays) < 2 or i not in delays]
+    if len(delays) > 1:
+        found.append(Way(ROUND_TRIP, np.isin(np.arange(len(table)), delays) / len(delays)))
+    for cause, shares in causes.items():
+        if set(shares) <= set(table.names):
+            found.append(Way(cause, np.array([shares.get(n, 0.0) for n in table.names])))
+    return found
+
+
+def drift(problem: Problem, posterior: Posterior, widening: float, causes: Causes) -> tuple[Drift, np.ndarray]:
+    """Test whether a log is still of the robot that was identified.
+
+    Each change is fitted to the log by itself: one that comes alone leaves all else as it was, and a short log of a
+    policy that soon holds still says too little to fit everything anew. A linear step from what was identified does not
+    do: where friction has doubled a joint stands still that should move, and there derivatives are those of another
+    motion.
+
+    Args:
+        problem: The log, all of its segments fitted.
+        posterior: What was identified.
+        widening: Factor on the posterior's deviations that covers the errors of the model: a robot that is not of its
+            form acts, from motion to motion, like one with other parameters, and a policy moves otherwise than an
+            excitation.
+        causes: Known causes that move several parameters.
+
+    Returns:
+        The tests, and the point ``(P,)`` on the parameters' scales of the change that explains most.
+
+    Raises:
+        UsageError: When the parameters are others than the posterior's.
+    """
+    table = problem.table
+    if table.names != posterior.names:
+        tested, known = ", ".join(table.names), ", ".join(posterior.names)
+        raise UsageError(f"the log is tested for {tested}, identified were {known}")
+    found = [_alone(problem, posterior, widening, way) for way in ways(table, causes)]
+    at = _finite(linearise(problem, table.at_scale(posterior.mean)))
+    now = _with_the_rest(at, widening**2 * posterior.covariance, loss_variance(problem, at))
+    found = _ordered(found, now, table)
+    seconds = problem.segment_s * len(problem.train)
+    return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
+
+
+def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Alone:
+    """Fit one change to a log, and say how sure its size is for a robot that did not change.
+
+    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
+    sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
+    errors, in whatever direction, move the size.
+    """
+    table = problem.table
+
+    def point(size: float) -> np.ndarray:
+        return table.at_scale(posterior.mean + size * way.along)
+
+    def loss(size: float) -> float:
+        found = problem.at(point(size))[1]
+        return found if np.isfinite(found) else 1e30
+
+    moving = way.along != 0.0
+    unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
+    sizes = unit * np.array(sorted([0.0, *_SIZES]))
+    best = int(np.argmin([loss(s) for s in sizes]))
+    ends = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
+    size = float(fminbound(loss, *ends, maxfun=_POLISH, disp=0))
+    at = _finite(linearise(problem, point(size)))
+    J = at.jacobian @ way.along  # (S, C, F)
+    said = np.sum(J**2, axis=(1, 2))
+    information = max(float(said.sum()), 1e-300)
+    segments = information**2 / max(float(np.sum(said**2)), 1e-300)
+    pulls = np.sum(J * at.residuals, axis=(1, 2))
+    spread = float(np.sum(pulls**2)) / information**2 * segments / max(segments - 1.0, 0.5)
+    variance, open_before = loss_variance(problem, at), widening**2 * posterior.covariance
+    # Residuals are large where much moves, and there the log says most: each segment counts with its own.
+    squares, counted = np.sum(at.residuals**2, axis=(1, 2)), np.count_nonzero(at.residuals, axis=(1, 2))
+    uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)
+    own = max(variance * float(said @ uneven) / information**2, spread)
+    carried = np.einsum("scf,scfp->p", J, at.jacobian) / information
+    before = float(carried @ open_before @ carried)
+    return Alone(way, size, own, before, segments, _with_the_rest(at, open_before, variance))
+
+
+def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> float:
+    """Return the loss at a point once all parameters moved as far as the identification leaves open.
+
+    The right change needs little more; another one that imitates it needs much, and that costs.
+
+    Args:
+        at: The point.
+        covariance: Shape ``(P, P)``: what the identification leaves open.
+        variance: Of a residual.
+    """
+    flat, rest = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
+    # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
+    values, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    pulled, informed = root.T @ (flat.T @ rest), root.T @ (flat.T @ flat) @ root
+    gain = pulled @ np.linalg.solve(informed + variance * np.eye(len(root)), pulled)
+    return float(rest @ rest - gain) / max(int(np.count_nonzero(rest)), 1)
+
+
+def _finite(at: Linearised) -> Linearised:
+    """Return the same without segments that cannot be simulated: of an unstable motion, say, that runs away."""
+    whole = np.isfinite(at.residuals).all(axis=(1, 2)) & np.isfinite(at.jacobian).all(axis=(1, 2, 3))
+    gone = lambda a: np.where(whole.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
+    return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw))
+
+
+def _ordered(found: Sequence[Alone], loss: float, table: ParameterTable) -> list[Alone]:
+    """Return changes, the one that explains most first; of those that explain as much, friction.
+
+    Where a motor always pushes the way that it moves, as one that pumps energy does, more friction looks like a weaker
+    motor. Friction changes with wear, grease and temperature, a motor seldom.
+
+    Args:
+        found: What the log says about each change.
+        loss: Of the log, without any change.
+        table: The parameters.
+    """
+    friction = {c.label for c in table.columns if c.parameter.vanishes}
+    ordered = sorted(found, key=lambda one: one.loss)
+    alike = [one for one in ordered if one.loss - ordered[0].loss <= _ALIKE * loss]
+    first = next((one for one in alike if one.way.name in friction), ordered[0])
+    return [first, *(one for one in ordered if one is not first)]
+
+
+def weigh(found: Sequence[Alone], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:
+    """Say which changes are significant: all tests together raise an alarm for 5 % of the robots that did not change.
+
+    By Holm's correction (Scandinavian Journal of Statistics 6, 1979), with Student's distribution.
+
+    Args:
+        found: What the log says about each change, the one that explains most first.
+        loss: Of the log, without any change.
+        table: The parameters.
+        posterior: What was identified.
+        seconds: Length of the log [s].
+    """
+    rows = []
+    for one in found:
+        error = (one.own + one.before) ** 0.5
+        reach = error * float(stdtrit(one.freedom, 0.975))
+        p = 2.0 * float(stdtr(one.freedom, -abs(one.size) / error))
+        ends = (one.size, one.size - reach, one.size + reach)
+        explains = 1.0 - one.loss / max(loss, 1e-300)
+        rows.append(Changed(one.way.name, *_values(one.way.name, ends, table, posterior), max(explains, 0.0), p))
+    return Drift(tuple(rows), LEVEL, tuple(_holm(rows)), seconds)
+
+
+def _holm(rows: Sequence[Changed]) -> list[str]:
+    """Return the names of what is significant, all tests together."""
+    alarms: list[str] = []
+    for i, row in enumerate(sorted(rows, key=lambda row: row.p)):
+        if row.p > LEVEL / (len(rows) - i):
+            break
+        alarms.append(row.name)
+    return alarms
+
+
+def _values(
+    name: str, ends: Sequence[float], table: ParameterTable, posterior: Posterior
+) -> tuple[str, float, float, float, float]:
+    """Return the unit, the value before, and those after moving by ``ends`` on the scale; of a cause factors."""
+    if name == ROUND_TRIP and name not in posterior.names:
+        total = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.parameter.kind == "delay")
+        now, low, high = (float(max(total + e, 0.0)) for e in ends)
+        return "s", float(total), now, low, high
+    if name not in posterior.names:
+        now, low, high = (float(np.exp(e)) for e in ends)
+        return "", 1.0, now, low, high
+    i = posterior.names.index(name)
+    parameter = table.columns[i].parameter
+    before, now, low, high = (float(parameter.from_scale(posterior.mean[i] + e)) for e in (0.0, *ends))
+    return parameter.unit, before, now, low, high

@@ -1,0 +1,126 @@
+"""The test for drift: what may change alone, how often it is wrong, and how sure it is from few segments."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2real.artifacts.posterior import Posterior
+from sim2real.errors import UsageError
+from sim2real.identify.drift import Alone, drift, ways, weigh
+from sim2real.identify.parameters import Parameter, ParameterTable
+
+TABLE = ParameterTable(
+    [
+        Parameter("gain", "V", 20.0, 5.0, 80.0),
+        Parameter("friction", "N", 6.0, 1.5, 24.0),
+        Parameter("sensor_delay", "s", 0.0, 0.0, 0.06, "linear", "delay", side="measurement"),
+        Parameter("actuator_delay", "s", 0.0, 0.0, 0.06, "linear", "delay", side="command"),
+    ]
+)
+MEAN = np.array([np.log(20.0), np.log(6.0), 0.02, 0.03])
+POSTERIOR = Posterior(TABLE.names, ("log", "log", "linear", "linear"), MEAN, np.eye(4) * 1e-6, TABLE.low, TABLE.high)
+CAUSES = {"load": {"gain": -1.0, "friction": -1.0}, "of another robot": {"cogging": 1.0}}
+WAYS = {way.name: way for way in ways(TABLE, CAUSES)}
+
+
+def alone(name="friction", size=0.0, own=1e-3, before=1e-3, segments=50.0, loss=1.0):
+    return Alone(WAYS[name], size, own, before, segments, loss)
+
+
+def test_delays_change_as_their_sum_and_causes_of_other_robots_are_left_out():
+    assert set(WAYS) == {"gain", "friction", "round_trip_delay", "load"}
+    assert WAYS["round_trip_delay"].along.tolist() == [0.0, 0.0, 0.5, 0.5]
+    assert WAYS["load"].along.tolist() == [-1.0, -1.0, 0.0, 0.0]
+    one = ParameterTable([TABLE["gain"], TABLE["sensor_delay"]])
+    assert [way.name for way in ways(one, {})] == ["gain", "sensor_delay"]
+
+
+def test_one_in_twenty_robots_that_did_not_change_raises_an_alarm():
+    rng = np.random.default_rng(0)
+    sizes = np.sqrt(2e-3) * rng.standard_normal((2000, len(WAYS)))
+    raised = [
+        bool(weigh([alone(n, s) for n, s in zip(WAYS, row, strict=True)], 1.0, TABLE, POSTERIOR, 20.0).alarms)
+        for row in sizes
+    ]
+    assert np.mean(raised) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "unit", "before", "now"),
+    [
+        ("friction", np.log(2.0), "N", 6.0, 12.0),
+        ("round_trip_delay", 0.015, "s", 0.05, 0.065),
+        ("load", np.log(1.3), "", 1.0, 1.3),
+    ],
+)
+def test_a_change_is_told_in_the_units_of_what_changed(name, size, unit, before, now):
+    one = alone(name, size, own=1e-6, before=1e-6, loss=0.2)
+    found = weigh([one, alone("gain", 0.01, loss=0.9)], 1.0, TABLE, POSTERIOR, 20.0)
+    row = found.named
+    assert (row.name, row.unit, found.alarms) == (name, unit, (name,))
+    assert [row.before, row.now, row.explains] == pytest.approx([before, now, 0.8])
+    assert row.low95 < row.now < row.high95
+
+
+def test_few_segments_that_say_something_make_few_degrees_of_freedom():
+    """A pendulum that is held upright says nothing: of fifty segments two moved."""
+    assert alone(before=0.0, segments=50.0).freedom == pytest.approx(49.0)
+    assert alone(before=0.0, segments=2.0).freedom == pytest.approx(1.0)
+    assert alone(own=1e-3, before=9e-3, segments=2.0).freedom == pytest.approx(100.0), "the rest is known"
+    sure, unsure = (weigh([alone(size=0.2, before=1e-5, segments=s)], 1.0, TABLE, POSTERIOR, 20.0) for s in (50.0, 2.0))
+    assert sure.alarms
+    assert not unsure.alarms
+    assert unsure.named is None
+
+
+class Robot:
+    """A log whose residuals are those of a straight line through 40 segments: 3 numbers each, of two parameters."""
+
+    def __init__(self, true, seed=0):
+        rng = np.random.default_rng(seed)
+        self.table = ParameterTable([TABLE["gain"], TABLE["friction"]])
+        self.train, self.segment_s = np.arange(40), 0.4
+        self.channels, self.config, self.programs = (), SimpleNamespace(initial_state="measured"), {}
+        self.true, self.slopes = np.log(true), rng.standard_normal((40, 3, 1, 2))
+        self.noise = 0.1 * rng.standard_normal((40, 3, 1))
+
+    def _residuals(self, z):
+        x = self.table.low + self.table.span / (1.0 + jnp.exp(-z))
+        return jnp.tensordot(self.slopes, x - self.true, 1) + self.noise
+
+    def at(self, z, data=None):
+        r = np.asarray(self._residuals(jnp.asarray(z)))
+        return None, float(np.mean(r**2))
+
+    def linearised(self, z, columns):
+        import jax
+
+        r = self._residuals(z)
+        return r, jax.jacfwd(self._residuals)(z), r
+
+
+OF_TWO = Posterior(("gain", "friction"), ("log", "log"), MEAN[:2], np.eye(2) * 1e-4, TABLE.low[:2], TABLE.high[:2])
+
+
+@pytest.mark.parametrize(
+    ("true", "named"), [((20.0, 12.0), "friction"), ((20 / 1.3, 6 / 1.3), "load"), ((20, 6), None)]
+)
+def test_what_a_log_shows_is_named(true, named):
+    found, x = drift(Robot(np.array(true)), OF_TWO, 1.0, CAUSES)
+    assert (found.named.name if found.named else None) == named
+    assert found.seconds == pytest.approx(16.0)
+    assert np.exp(x) == pytest.approx(true, rel=0.05)
+
+
+def test_errors_of_the_model_in_other_motions_are_no_change():
+    """What the identification leaves open, widened by its misfit, is not drift."""
+    moved = Robot(np.array([20.0, 6.6]))
+    assert drift(moved, OF_TWO, 1.0, {})[0].alarms
+    assert not drift(moved, OF_TWO, 10.0, {})[0].alarms
+
+
+def test_parameters_of_another_model_are_refused():
+    with pytest.raises(UsageError, match="tested for gain, friction, identified were gain, friction, sensor_delay"):
+        drift(Robot(np.array([20.0, 6.0])), POSTERIOR, 1.0, {})

@@ -1,0 +1,132 @@
+"""The verdict on a deployment: which finding decides, and the command that follows."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay, Scores
+from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.recording import Recording
+from sim2real.graph.episode import Episode, Steps
+from sim2real.stages import judging
+from sim2real.stages.next_step import commands
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.view.judging import tables, verdict_blocks
+
+FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
+STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
+ALARM = Drift((FRICTION,), 0.05, ("friction",), 20.0)
+BUNDLE = SimpleNamespace(
+    contract=SimpleNamespace(delays_s={"sensor_delay": 0.02, "actuator_delay": 0.03}),
+    episodes=SimpleNamespace(drawn_s={"agent": np.full(100, 0.001)}),
+)
+
+
+def episode(seconds=10.0, took_s=0.001):
+    at = np.arange(0, round(seconds * 1e6), 20_000)
+    steps = Steps(scheduled=at, start=at, woken=at, ts_overwrite=0 * at - 1, end=at + round(1e6 * took_s), drift=0 * at)
+    return Episode(steps={"agent": steps}, messages={}, outputs={})
+
+
+def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEADY, took_s=0.001, seconds=10.0):
+    """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
+    rows = (Replay("hinge", "rad", 0.1, {"identified": identified, judging.AS_HERE: here, "hold": 0.5}, 0.01),)
+    logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
+    gap = (Gap("success", success, simulated, success - simulated),)
+    return Deployment((Scores({}),) * 2, gap, recordings=logs, replay=rows, drift=drift)
+
+
+@pytest.mark.parametrize(
+    ("found", "status", "said"),
+    [
+        ({}, "fine", "is the one that was identified"),
+        ({"drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
+        ({"identified": 0.02}, "fine", "is the one that was identified"),
+        ({"identified": 0.04}, "re-identify", "promised were 0.01 rad"),
+        ({"identified": None}, "re-identify", "it diverges"),
+        ({"took_s": 0.004}, "re-train", "100.0% of the steps of agent take longer than the 1.0 ms of training"),
+        ({"success": 0.7}, "re-train", "success is 0.70, in simulation 1.00"),
+        ({"success": 0.85, "simulated": 0.9}, "re-train", "as in simulation"),
+        ({"identified": 0.5, "here": 0.2, "drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
+        ({"identified": 0.5, "here": 0.4, "drift": ALARM}, "look at this joint",
+         "no parameters explain how hinge moves"),
+    ],
+)  # fmt: skip
+def test_one_finding_decides(found, status, said):
+    told = judging.verdict(deployed(**found), BUNDLE)
+    assert told.status == status
+    assert said in told.reasons[0]
+    assert told.joint == ("hinge" if status == "look at this joint" else "")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The deployment's folder in a run with a recording."""
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "pendulum" / "T"
+    (run / "record").mkdir(parents=True)
+    (run / "record" / "session.mcap").touch()
+    (run / "deploy").mkdir()
+    (run / "deploy" / "manifest.json").write_text('{"stage": "deploy"}')
+    return run / "deploy"
+
+
+IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")])
+OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/episode_1.mcap"
+
+
+@pytest.mark.parametrize(
+    ("told", "found", "command"),
+    [
+        (Advice("fine", ()), {}, ""),
+        (Advice("re-identify", ()), {"drift": ALARM}, f"sim2real identify pendulum {OWN} --run runs/pendulum/T"),
+        (Advice("re-identify", ()), {"drift": replace(ALARM, seconds=8.0)}, "sim2real record pendulum"),
+        (Advice("re-identify", ()), {},
+         f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"),
+        (Advice("re-train", ("success is 0.7",)), {}, "sim2real train pendulum --run runs/pendulum/T"),
+        (Advice("re-train", ("10% of the steps take longer than 1 ms",)), {},
+         f"sim2real identify pendulum {OWN} --log runs/pendulum/T/record/session.mcap --run runs/pendulum/T"
+         " && sim2real train pendulum --run runs/pendulum/T"),
+        (Advice("look at this joint", (), joint="hinge"), {}, ""),
+    ],
+)  # fmt: skip
+def test_the_command_can_be_typed(told, found, command, folder):
+    """Where the robot has changed, recordings of before are left out."""
+    assert commands(told, load_pipeline("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
+
+
+def test_times_stand_beside_those_of_training():
+    rows = {g.quantity: g for g in judging._trained(deployed(took_s=0.004), BUNDLE)}
+    assert rows["step_of_agent_p99_s"].gap == pytest.approx(0.003)
+    assert rows["round_trip_delay_s"].simulation == pytest.approx(0.05)
+
+
+def test_a_deployment_without_an_identification_says_so(folder):
+    told = judging.judged(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
+    assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
+
+
+def test_console_and_page_end_in_the_verdict(capsys):
+    shown = deployed(drift=ALARM)
+    shown = replace(shown, advice=Advice("re-identify", ("friction is 12",), "sim2real identify pendulum"))
+    judging.show(shown)
+    said = capsys.readouterr()
+    assert "friction" in said.out
+    assert said.err.splitlines() == ["verdict: re-identify", "  friction is 12", "next: sim2real identify pendulum"]
+    (block,) = verdict_blocks(shown)
+    assert (block.caption, block.items[-1]) == ("Verdict: re-identify", "next: sim2real identify pendulum")
+    assert [t.rows[0][0] for t in tables(shown)] == ["friction", "hinge"]
+    assert tables(shown)[0].rows[0][-1] == "yes"
+
+
+def test_the_verdict_is_in_the_artifact(tmp_path):
+    told = replace(deployed(drift=ALARM), recordings=(), advice=Advice("re-identify", ("why",), "sim2real identify"))
+    told = replace(told, episodes=(Scores({}),))
+    told.save(tmp_path)
+    from sim2real.artifacts.files import read_json
+
+    found = read_json(tmp_path / "result.json", Deployment)
+    assert (found.advice, found.drift, found.replay) == (told.advice, told.drift, told.replay)

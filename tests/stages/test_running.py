@@ -1,0 +1,132 @@
+"""Around the loop: what each verdict makes a run do again, and when it stops."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
+from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.artifacts.iterations import Iterations
+from sim2real.artifacts.run_folder import STAGES, Source, open_stage
+from sim2real.errors import UsageError
+from sim2real.stages import running
+from sim2real.stages.flags import RunFlags
+from sim2real.stages.pipeline import load_pipeline
+
+FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
+
+
+def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
+    alarms = Drift((FRICTION,), 0.05, ("friction",) if drift else (), seconds)
+    gap = (Gap("success", success, 1.0, success - 1.0),)
+    return Deployment((Scores({}),), gap, drift=alarms, advice=Advice(status, (reason,)))
+
+
+@pytest.fixture
+def world(tmp_path, monkeypatch):
+    """Stages that leave what the loop reads; each deployment takes the next verdict."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
+    seen = SimpleNamespace(calls=[], verdicts=[])
+
+    def call(stage, config, run_dir):
+        seen.calls.append((stage, config))
+        with open_stage(tmp_path / "runs", "pendulum", stage, config, run_dir=run_dir) as opened:
+            if stage == "record":
+                opened.output("log", "session.mcap").touch()
+            if stage == "identify":
+                logs = (Source("record/session.mcap", ""),)
+                found = Identification("pendulum", logs, Judgement("accepted", ()), ())
+                found.write(opened.output("parameters", "parameters.json"))
+            if stage == "deploy":
+                opened.output("log_0", "episode_0.mcap").touch()
+                found = seen.verdicts.pop(0)
+                found.save(opened.folder)
+                opened.output("result", "result.json")
+        return opened.result
+
+    def go(*verdicts, iterations=5, **told):
+        pipeline = load_pipeline("pendulum")
+        seen.verdicts = list(verdicts)
+        stages = {stage: getattr(pipeline, stage) for stage in STAGES}
+        flags = RunFlags(iterations=iterations, runs=tmp_path / "runs", **stages, **told)
+        running.run_all(pipeline, flags, call)
+        (run_dir,) = (tmp_path / "runs" / "pendulum").iterdir()
+        return [s for s, _ in seen.calls[4:]], Iterations.load(run_dir).rows
+
+    seen.go = go
+    return seen
+
+
+def test_without_the_flag_a_run_goes_around_once(world):
+    again, rows = world.go(verdict("re-identify"), iterations=1)
+    assert (again, rows) == ([], ())
+
+
+def test_a_fine_robot_ends_the_loop(world, capsys):
+    again, rows = world.go(verdict("re-train", 0.6), verdict("fine", 1.0))
+    assert again == ["train", "deploy"]
+    assert [(r.number, r.verdict, r.real) for r in rows] == [(1, "re-train", 0.6), (2, "fine", 1.0)]
+    assert rows[0].stages == STAGES
+    assert rows[1].stages == ("train.2", "deploy.2")
+    assert [c.seed for s, c in world.calls if s == "train"] == [0, 1], "the same seed would train the same policy"
+    assert "stop: nothing is left to do" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("found", "stages", "logs"),
+    [
+        (verdict("re-identify"), ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
+        (verdict("re-identify", drift=True), ["identify", "train", "deploy"], ["deploy/episode_0.mcap"]),
+        (verdict("re-identify", drift=True, seconds=6.0), ["record", "identify", "train", "deploy"], []),
+        (verdict("re-train", reason="3% of the steps of agent take longer than 2 ms"),
+         ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
+    ],
+)  # fmt: skip
+def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, stages, logs):
+    """What was recorded before the robot changed is of another robot."""
+    again, _ = world.go(found, verdict("fine", 1.0))
+    assert again == stages
+    (config,) = (c for s, c in world.calls[4:] if s == "identify")
+    assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
+
+
+@pytest.mark.parametrize("status", ["look at this joint", "not judged"])
+def test_what_nobody_can_mend_unattended_ends_the_loop(world, status):
+    again, (row,) = world.go(verdict(status, reason="it is loose"))
+    assert again == []
+    assert row.then == "stop: it is loose"
+
+
+def test_a_goal_goes_on_until_it_is_reached_or_the_iterations_end(world):
+    again, rows = world.go(verdict("fine", 0.92), verdict("fine", 0.93), verdict("fine", 0.96), until="success=0.95")
+    assert again == ["train", "deploy"] * 2
+    assert rows[-1].then == "stop: success is at least 0.95"
+    assert [r.number for r in rows] == [1, 2, 3]
+
+
+def test_the_last_iteration_says_what_it_would_do(world):
+    again, rows = world.go(verdict("re-train"), verdict("re-train"), iterations=2)
+    assert again == ["train", "deploy"]
+    assert rows[-1].then == "the last iteration: it would train with another seed, deploy"
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"iterations": 0}, "at least once"),
+        ({"iterations": 1, "until": "success=0.9"}, "at least once"),
+        ({"iterations": 2, "until": "success"}, "QUANTITY=VALUE"),
+        ({"iterations": 2, "until": "success=high"}, "QUANTITY=VALUE"),
+    ],
+)
+def test_a_goal_that_is_none_is_refused_before_anything_moves(told, said):
+    with pytest.raises(UsageError, match=said):
+        RunFlags(**told)
+
+
+def test_a_goal_that_the_task_does_not_know_is_refused(world):
+    with pytest.raises(UsageError, match=r"no .speed. in the gap report"):
+        world.go(replace(verdict("fine"), episodes=(Scores({}),)), until="speed=1")
