@@ -39,7 +39,7 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Alone:
+class Fitted:
     """What a log says about one change, if it came alone.
 
     Attributes:
@@ -118,7 +118,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
 
 
-def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Alone:
+def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Fitted:
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
 
     The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
@@ -139,7 +139,7 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
     sizes = unit * np.array(sorted([0.0, *_SIZES]))
     best = int(np.argmin([loss(s) for s in sizes]))
     ends = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
-    size = float(fminbound(loss, *ends, maxfun=_POLISH, disp=0))
+    size = float(np.ravel(fminbound(loss, *ends, maxfun=_POLISH, disp=0))[0])
     at = _finite(linearise(problem, point(size)))
     J = at.jacobian @ way.along  # (S, C, F)
     said = np.sum(J**2, axis=(1, 2))
@@ -154,7 +154,7 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
     own = max(variance * float(said @ uneven) / information**2, spread)
     carried = np.einsum("scf,scfp->p", J, at.jacobian) / information
     before = float(carried @ open_before @ carried)
-    return Alone(way, size, own, before, segments, _with_the_rest(at, open_before, variance))
+    return Fitted(way, size, own, before, segments, _with_the_rest(at, open_before, variance))
 
 
 def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> float:
@@ -183,7 +183,7 @@ def _finite(at: Linearised) -> Linearised:
     return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw))
 
 
-def _ordered(found: Sequence[Alone], loss: float, table: ParameterTable) -> list[Alone]:
+def _ordered(found: Sequence[Fitted], loss: float, table: ParameterTable) -> list[Fitted]:
     """Return changes, the one that explains most first; of those that explain as much, friction.
 
     Where a motor always pushes the way that it moves, as one that pumps energy does, more friction looks like a weaker
@@ -201,7 +201,7 @@ def _ordered(found: Sequence[Alone], loss: float, table: ParameterTable) -> list
     return [first, *(one for one in ordered if one is not first)]
 
 
-def weigh(found: Sequence[Alone], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:
+def weigh(found: Sequence[Fitted], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:
     """Say which changes are significant: all tests together raise an alarm for 5 % of the robots that did not change.
 
     By Holm's correction (Scandinavian Journal of Statistics 6, 1979), with Student's distribution.

@@ -53,7 +53,8 @@ def judged(
         with progress(None, "test the model on the deployment"):
             rows, drifted = patiently(lambda: tested(pipeline, found, [r.episode for r in deployed.recordings]))
     except Sim2RealError as error:  # the robot has run: what it did must not be lost
-        advice = Advice("not judged", (str(error.args[0]),))
+        told, why = _of_policy(deployed, bundle), str(error.args[0])
+        advice = Advice("not judged", (why,)) if told is None else replace(told, reasons=(*told.reasons, why))
         return replace(deployed, advice=commands(advice, pipeline, found, folder, deployed))
     if any(row.quantity == f"{ROUND_TRIP}_s" for row in times):
         other = drifted.named is not None and drifted.named.name != ROUND_TRIP
@@ -76,17 +77,22 @@ def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
     """
     if told := verdict_of(deployed.replay, deployed.drift):
         return told
+    if told := _of_policy(deployed, bundle):
+        return replace(told, reasons=(*told.reasons, "the model holds"))
+    return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
+
+
+def _of_policy(deployed: Deployment, bundle: Bundle) -> Advice | None:
+    """Return what is wrong with the policy, whatever its model is; None if it is good enough."""
     if late := list(_too_late(deployed, bundle)):
         return Advice("re-train", tuple(late))
     success = next((g for g in deployed.gap if g.quantity == "success"), None)
-    if success is not None and success.real is not None:
-        simulated = success.simulation if success.simulation is not None else 1.0
-        if success.real < min(_GOOD, simulated - _WORSE):
-            why = f"the model holds, but success is {success.real:.2f}, in simulation {simulated:.2f}"
-            return Advice("re-train", (why,))
-        if success.real < _GOOD:
-            return Advice("re-train", (f"the model holds, and success is {success.real:.2f}, as in simulation",))
-    return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
+    if success is None or success.real is None:
+        return None
+    simulated = success.simulation if success.simulation is not None else 1.0
+    if success.real < min(_GOOD, simulated - _WORSE):
+        return Advice("re-train", (f"success is {success.real:.2f}, in simulation {simulated:.2f}",))
+    return Advice("re-train", (f"success is {success.real:.2f}, as in simulation",)) if success.real < _GOOD else None
 
 
 def verdict_of(replay: Sequence[Replay], drifted: Drift | None) -> Advice | None:

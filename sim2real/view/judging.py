@@ -35,8 +35,8 @@ def tables(deployed: Deployment) -> list[Block]:
         ]
         caption = (
             "Has the robot changed? Each row: what was identified, and what it is now if nothing else has changed, the "
-            f"one that explains most first. {deployed.drift.level:.0%} of the robots that have not changed raise any "
-            "alarm."
+            "one that explains most first. The tests together are set to raise an alarm for "
+            f"{deployed.drift.level:.0%} of the robots that have not changed."
         )
         columns = ("changed alone", "unit", "identified", "now", "95 % interval", "explains", "alarm")
         blocks.append(TableBlock(caption, columns, rows, text_columns=(1, 4, 6)))

@@ -8,7 +8,7 @@ import pytest
 
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import UsageError
-from sim2real.identify.drift import Alone, drift, ways, weigh
+from sim2real.identify.drift import Fitted, drift, ways, weigh
 from sim2real.identify.parameters import Parameter, ParameterTable
 
 TABLE = ParameterTable(
@@ -26,7 +26,7 @@ WAYS = {way.name: way for way in ways(TABLE, CAUSES)}
 
 
 def alone(name="friction", size=0.0, own=1e-3, before=1e-3, segments=50.0, loss=1.0):
-    return Alone(WAYS[name], size, own, before, segments, loss)
+    return Fitted(WAYS[name], size, own, before, segments, loss)
 
 
 def test_delays_change_as_their_sum_and_causes_of_other_robots_are_left_out():

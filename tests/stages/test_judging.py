@@ -10,6 +10,7 @@ import pytest
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay, Scores
 from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.recording import Recording
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages import judging
 from sim2real.stages.next_step import commands
@@ -107,6 +108,18 @@ def test_times_stand_beside_those_of_training():
 def test_a_deployment_without_an_identification_says_so(folder):
     told = judging.judged(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
+
+
+def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be_tested(folder, monkeypatch):
+    def too_little(*_):
+        raise Sim2RealError("0.0 s of them in motion")
+
+    monkeypatch.setattr(judging, "tested", too_little)
+    pipeline = load_pipeline("pendulum")
+    told = judging.judged(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
+    assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
+    assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
+    assert judging.judged(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
 
 
 def test_console_and_page_end_in_the_verdict(capsys):
