@@ -1,4 +1,7 @@
-"""The devices of a training: a row for each group of seeds, in which each has some of their copies."""
+"""The devices of a training: a row for each group of seeds, in which each has some of their copies.
+
+The policies of a sweep count as seeds.
+"""
 
 from __future__ import annotations
 

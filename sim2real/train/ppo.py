@@ -70,9 +70,11 @@ def train(
     key = key if typed else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
     state, numbers = make_start(env, sweep.configs(config), key), swept_numbers(sweep, config.num_seeds)
-    layout = shardings_of(state, config)
+    # Settings that are swept have as little to tell each other as seeds have, and are divided as those are.
+    shared = with_numbers(config, {"num_seeds": config.num_seeds * len(sweep.grid)})
+    layout = shardings_of(state, shared)
     state = place(state, layout)
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), state))
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(shared, numbers), state))
     where = layout and (layout.state, layout.whole, layout.whole)
     lowered = jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)
     now = Checkpoint(state, None, None, [])
