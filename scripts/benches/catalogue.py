@@ -120,8 +120,8 @@ BENCHES = {
     ),
     "scaling": Bench(
         "scaling",
-        "training on all devices of a host against one",
-        (*_GRAPH, "sim2real/train", "scripts/benches/train.py"),
+        "training and identification on all devices of a host against one",
+        (*_GRAPH, "sim2real/train", "sim2real/identify", "scripts/benches/train.py"),
     ),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),

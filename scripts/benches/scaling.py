@@ -1,8 +1,11 @@
-"""How much faster several devices of a host train than one, with as many copies on each, in one run."""
+"""How much faster several devices of a host are than one, with as much work on each: training, and identification."""
 
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,6 +13,13 @@ import numpy as np
 
 from benches.figures import row
 from benches.train import environment
+from sim2real.errors import UsageError
+from sim2real.identify.config import FitConfig
+from sim2real.identify.problem import Problem
+from sim2real.identify.search import search
+from sim2real.identify.segments import Span
+from sim2real.log.reader import read_log
+from sim2real.stages.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
 from sim2real.train.ppo import TrainResult, train
 
@@ -17,7 +27,18 @@ EVALUATIONS = 6
 """Speed is the median over what lies between them; the first has what happens once."""
 GOAL = 0.9
 """Share of as many times the speed as there are devices."""
-QUICK = {"envs": 8, "updates": 1, "timelines": 2, "episode_s": 0.5, "minibatches": 2}
+LOG = Path(__file__).resolve().parents[2] / "datasets" / "pendulum" / "multisine.mcap"
+SEGMENTS, SEGMENT_S = 16, 1.0
+"""What each candidate is simulated on."""
+GENERATIONS = 60
+QUICK = {
+    **{"envs": 8, "updates": 1, "timelines": 2, "episode_s": 0.5, "minibatches": 2},
+    **{"candidates": 4, "generations": 20, "segments": 1},
+}
+
+
+Measure = Callable[[int], tuple[float, float, int]]
+"""``devices -> speed [1/s], time to compile [s], size``."""
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -28,19 +49,48 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minibatches", type=int, default=4, help="they must divide --envs")
     parser.add_argument("--timelines", type=int, default=32, help="timelines that episodes are drawn from")
     parser.add_argument("--episode-s", type=float, default=5.0, help="length of an episode [s]")
+    parser.add_argument("--candidates", type=int, help="candidates on each device; default: 4096, on a CPU 16")
+    parser.add_argument(
+        "--generations", type=int, default=GENERATIONS, help="most generations of a search, 20 at least"
+    )
+    parser.add_argument("--segments", type=int, default=SEGMENTS, help="seconds of a log that each is simulated on")
+    parser.add_argument("--parts", nargs="+", choices=["train", "identify"], default=["train", "identify"])
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Train on one device, then on several."""
+    """Measure on one device, then on several."""
+    several = options.devices or jax.local_device_count()
+    measure = {"train": train_on(options), "identify": identify_on(options)}
+    name = f"scaling/{options.name or jax.default_backend()}"
+    rows = []
+    for part, unit in (("train", "env_steps_per_s"), ("identify", "candidates_per_s")):
+        if part not in options.parts:
+            continue
+        speeds = {}
+        for devices in sorted({1, several}):
+            speeds[devices], compile_s, size = measure[part](devices)
+            own = f"{name}/{part}/{devices}_devices"
+            rows += [
+                row(f"{own}/size", size, "copies" if part == "train" else "candidates"),
+                row(f"{own}/{unit}", round(speeds[devices]), "1/s"),
+                row(f"{own}/compile_s", round(compile_s, 1), "s"),
+            ]
+        if several > 1:
+            ratio = round(speeds[several] / speeds[1], 2)
+            goal = f"at least {GOAL * several:g}" if part == "train" else ""
+            rows.append(row(f"{name}/{part}/{several}_over_1", ratio, "times the speed", "one device", goal))
+    return {"rows": rows}
+
+
+def train_on(options: argparse.Namespace) -> Measure:
+    """Return what measures PPO on the pendulum."""
     small = jax.default_backend() == "cpu"
     envs = options.envs or (64 if small else 8192)
     updates = options.updates or (4 if small else 40)
-    several = options.devices or jax.local_device_count()
-    env = environment(options.timelines, options.episode_s)
-    name = f"scaling/{options.name or jax.default_backend()}/pendulum"
-    rows, speeds = [], {}
-    for devices in sorted({1, several}):
+
+    def measure(devices: int) -> tuple[float, float, int]:
+        env = environment(options.timelines, options.episode_s)
         config = PPOConfig(
             num_envs=devices * envs,
             minibatches=options.minibatches,
@@ -50,17 +100,38 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             devices=devices,
         )
         result = train(env, config, jax.random.key(0))
-        speeds[devices] = speed(result)
-        rows += [
-            row(f"{name}/{devices}_devices/envs", config.num_envs, "copies"),
-            row(f"{name}/{devices}_devices/env_steps_per_s", round(speeds[devices]), "1/s"),
-            row(f"{name}/{devices}_devices/compile_s", round(result.compile_s, 1), "s"),
-        ]
-    if several > 1:
-        ratio = round(speeds[several] / speeds[1], 2)
-        goal = f"at least {GOAL * several:g}"
-        rows.append(row(f"{name}/{several}_over_1", ratio, "times the steps a second", "one device", goal))
-    return {"rows": rows}
+        return speed(result), result.compile_s, config.num_envs
+
+    return measure
+
+
+def identify_on(options: argparse.Namespace) -> Measure:
+    """Return what measures the search for the pendulum's parameters, from a log of it."""
+    small = jax.default_backend() == "cpu"
+    candidates = options.candidates or (16 if small else 4096)
+    if options.generations < 20:
+        raise UsageError(f"--generations must be 20 at least, got {options.generations}: the first ten are not counted")
+
+    def measure(devices: int) -> tuple[float, float, int]:
+        size = devices * candidates
+        config = FitConfig(engine="compiled", devices=devices, population=size, generations=options.generations)
+        robot, episode = load_pipeline("pendulum").load(), read_log(LOG)
+        spans = [Span(0, 1.0 + SEGMENT_S * i) for i in range(options.segments)]
+        problem = Problem(robot.identifiable(config.max_delay_s), [episode], spans, SEGMENT_S, config)
+        done, compiling = [0.0], [0.0, 0.0]
+        begin = time.perf_counter()
+
+        def told(count: int, best: float, z: np.ndarray) -> None:
+            done.append(time.perf_counter() - begin)
+
+        def on_compile(on: bool) -> None:
+            compiling[0 if on else 1] = time.perf_counter()
+
+        search(problem.losses, problem.table.start(), config, on_generations=told, on_compile=on_compile)
+        took = np.diff(done[1:])  # without what happens before the first ten generations have ended
+        return 10 * size / float(np.median(took)), compiling[1] - compiling[0], size
+
+    return measure
 
 
 def speed(result: TrainResult) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.tree import strong
@@ -208,7 +208,7 @@ class _Run:
     def _spread(self, values: Any, how: PartitionSpec) -> Any:
         if len(self.devices) == 1:
             return values
-        where = NamedSharding(Mesh(np.array(self.devices), ("candidates",)), how)
+        where = NamedSharding(Mesh(np.array(self.devices), ("candidates",), (AxisType.Auto,)), how)
         return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, where), values)
 
     def _advance(self, state: Any, params: Any, key: Any) -> tuple[Any, Any]:

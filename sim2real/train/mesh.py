@@ -1,4 +1,7 @@
-"""The devices of a training: a row for each group of seeds, in which each has some of their copies."""
+"""The devices of a training: a row for each group of seeds, in which each has some of their copies.
+
+The policies of a sweep count as seeds.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
@@ -41,7 +44,7 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
         )
     own = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
     chosen = [device for devices in own for device in devices[: config.devices]]
-    return Mesh(np.array(chosen).reshape(by_seed, by_copy), (SEEDS, COPIES))
+    return Mesh(np.array(chosen).reshape(by_seed, by_copy), (SEEDS, COPIES), (AxisType.Auto,) * 2)
 
 
 def spread(arrays: T, config: PPOConfig) -> T:

@@ -83,9 +83,11 @@ def train(
     sweep = sweep or Sweep({})
     networks = make_networks(env, config, actor, critic, teacher)
     state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
-    layout = shardings_of(state, config)
+    # Settings that are swept have as little to tell each other as seeds have, and are divided as those are.
+    shared = with_numbers(config, {"num_seeds": config.num_seeds * len(sweep.grid)})
+    layout = shardings_of(state, shared)
     state = place(state, layout)
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(shared, numbers), networks, state))
     where = layout and (layout.state, layout.whole, layout.whole)
     with small_random_numbers():
         lowered = jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)

@@ -33,6 +33,8 @@ def join(hosts: HostsConfig) -> None:
     """
     if not hosts.several:
         return
+    # Or it takes SIGTERM for a message to itself: a launcher's time limit would not end the training, but be noted.
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
             hosts.coordinator,

@@ -82,7 +82,7 @@ def named(point: Mapping[str, float]) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 
-def with_numbers(config: PPOConfig, numbers: Mapping[str, jax.Array]) -> PPOConfig:
+def with_numbers(config: PPOConfig, numbers: Mapping[str, jax.Array | int]) -> PPOConfig:
     """Return settings some of which are arguments of the program, in place of constants.
 
     ``dataclasses.replace`` would compare them with their bounds, which is done before the program is made.

@@ -86,8 +86,10 @@ def test_train(run):
 
 
 def test_scaling(run):
-    name = f"scaling/{jax.default_backend()}/pendulum/1_devices"
-    assert {f"{name}/env_steps_per_s", f"{name}/compile_s"} <= names(run("scaling"))
+    name = f"scaling/{jax.default_backend()}"
+    found = names(run("scaling"))
+    assert {f"{name}/train/1_devices/{n}" for n in ("env_steps_per_s", "compile_s")} <= found
+    assert {f"{name}/identify/1_devices/{n}" for n in ("candidates_per_s", "compile_s")} <= found
 
 
 def test_randomise(run):

@@ -20,18 +20,27 @@ import jax
 import numpy as np
 from environments import Bandit
 from sim2real.train.config import PPOConfig
-from sim2real.train.ppo import train
+from sim2real.train import ppo
+from sim2real.train.sweep import Sweep
+
+divided, shardings_of = [], ppo.shardings_of
+def seen(state, config):
+    divided.append(shardings_of(state, config))
+    return divided[-1]
+ppo.shardings_of = seen
 
 config = PPOConfig(
     num_seeds=2, num_envs=32, minibatches=4, rollout_steps=4, total_steps=512, hidden=(8,), evaluations=2, eval_steps=2,
 )
 found = {}
 for devices in (1, 8):
-    result = train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3))
+    sweep = Sweep({"learning_rate": (1e-3, 3e-3)})
+    result = ppo.train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3), sweep=sweep)
     leaves = jax.tree.leaves(jax.device_get(result.policies))
     found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
 
-from sim2real.train.devices import place, shardings_of
+found["mesh"] = dict(divided[-1].whole.mesh.shape)
+from sim2real.train.devices import place
 from sim2real.train.ppo import _epoch
 from sim2real.train.start import make_networks, make_start
 
@@ -62,6 +71,7 @@ def found():
 @pytest.mark.slow
 def test_eight_devices_learn_what_one_learns(found):
     assert len(found["1"]) > 10
+    assert found["mesh"] == {"seeds": 4, "copies": 2}, "two seeds, each with two settings"
     for one, eight in zip(found["1"], found["8"], strict=True):
         np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
 

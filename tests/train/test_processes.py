@@ -129,8 +129,9 @@ def test_who_loses_another_process_says_so(told):
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["slurm", "open_mpi"])
 def test_processes_of_a_launcher_find_each_other(launcher):
-    text = "from sim2real.train.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
-    text += "print(jax.process_index(), jax.process_count(), leads())"
+    text = "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ended', flush=True)); "
+    text += "from sim2real.train.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
+    text += "os.kill(os.getpid(), signal.SIGTERM); print(jax.process_index(), jax.process_count(), leads())"
     with socket.socket() as free:  # both launchers' processes derive their port from the job's number
         free.bind(("127.0.0.1", 0))
         job = free.getsockname()[1] % 2**12 + 2**12
@@ -148,7 +149,7 @@ def test_processes_of_a_launcher_find_each_other(launcher):
         for i in (0, 1)
     ]
     said = [process.communicate(timeout=120)[0].split() for process in both]
-    assert said == [["0", "2", "True"], ["1", "2", "False"]]
+    assert said == [["ended", "0", "2", "True"], ["ended", "1", "2", "False"]], "a launcher ends both by SIGTERM"
 
 
 @pytest.mark.parametrize(

@@ -201,3 +201,11 @@ def test_commands_come_in_through_the_graph():
     for name, a, b in zip(("position", "velocity"), first, then, strict=True):
         found = np.asarray(getattr(records["world"].output, name))[:49]
         np.testing.assert_allclose(found, np.concatenate([a, b]), atol=1e-5)
+
+
+def test_a_pushed_joint_moves_as_one_that_had_this_velocity():
+    world = Pendulum("world", 100.0)
+    moving = JointState(jnp.float32(1.0), jnp.float32(2.0))
+    pushed = world.with_velocity(world.init_state(), world.velocity(world.init_state()) + 2.0)
+    params = world.init_params()
+    assert world.integrate(params, pushed, 0.0) == world.integrate(params, moving, 0.0)

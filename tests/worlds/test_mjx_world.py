@@ -9,7 +9,7 @@ from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled import CompiledGraph
-from sim2real.worlds.mjx import MjxWorld
+from sim2real.worlds.mjx import MjxState, MjxWorld
 
 ARM = """
 <mujoco>
@@ -39,6 +39,14 @@ class Waves(BaseNode):
 
     def step(self, step_state):
         return step_state, Torque(0.5 * jnp.sin(4.0 * step_state.ts + jnp.arange(2.0)))
+
+
+def test_a_push_changes_velocities_and_nothing_else():
+    world = MjxWorld("world", 100.0, arm())
+    state = MjxState(jnp.array([0.1, 0.2]), jnp.array([1.0, -1.0]))
+    pushed = world.with_velocity(state, world.velocity(state) + jnp.array([0.5, 0.0]))
+    np.testing.assert_allclose(pushed.qvel, [1.5, -1.0])
+    np.testing.assert_array_equal(pushed.qpos, state.qpos)
 
 
 def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():
