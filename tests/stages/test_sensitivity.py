@@ -14,6 +14,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
+from sim2real.policy import NetworkSpec
 from sim2real.robots.loop import DelayParams
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.pipeline import load_pipeline
@@ -73,7 +74,12 @@ def judged():
     robot = with_room(Holding(), models)
     nodes, task = robot.training(found.values, {}, {}, True)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
-    policy = SimpleNamespace(low=np.array([-2.0]), get_action=lambda observation: jnp.array([VOLTS]))
+    policy = SimpleNamespace(
+        low=np.array([-2.0]),
+        spec=NetworkSpec(),
+        initial_carry=lambda: (),
+        step=lambda carry, observation: (carry, jnp.array([VOLTS])),
+    )
     return sensitivity(robot, env, policy, moves, models, seed=0)
 
 
