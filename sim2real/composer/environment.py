@@ -17,6 +17,7 @@ from sim2real.composer.c.compiled import Compiler
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.hooks import Hooks
 from sim2real.composer.observation.updater import Updater
+from sim2real.composer.reward import split_reward
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
 
@@ -213,6 +214,8 @@ class Environment(dm_env.Environment):
         reward, discount, last = 0.0, 0.0, True
         if not diverged:
             reward, discount = self._task.get_reward(self._proxy), self._task.get_discount(self._proxy)
+            if self._task.get_reward_spec() is None:
+                reward, _ = split_reward(reward)
             last = bool(self._task.should_terminate_episode(self._proxy)) or self._steps_taken >= self._step_limit
         self._reset_next_step = last
         step_type = dm_env.StepType.LAST if last else dm_env.StepType.MID

@@ -184,7 +184,7 @@ class Task(ABC):
 
     @abstractmethod
     def get_reward(self, physics: AnyPhysics) -> Any:
-        """Return the reward of the step that was just taken."""
+        """Return the reward of the step that was just taken, or its terms by name, whose sum it is."""
 
     def should_terminate_episode(self, physics: AnyPhysics) -> bool | Array:
         """Return whether the episode ends here; default: what ``get_termination`` says."""

@@ -239,7 +239,9 @@ def is_recurrent(network: Network) -> bool:
     return bool(jax.tree.leaves(network.initial_carry()))
 
 
-def make_network(kind: str | Factory, hidden: tuple[int, ...], inputs: int, outputs: int) -> Network:
+def make_network(
+    kind: str | Factory, hidden: tuple[int, ...], inputs: int, outputs: int, exported: bool = True
+) -> Network:
     """Return a network.
 
     Args:
@@ -247,15 +249,23 @@ def make_network(kind: str | Factory, hidden: tuple[int, ...], inputs: int, outp
         hidden: Widths of the hidden layers of our own.
         inputs: Number of entries of its input.
         outputs: Number of entries of its output.
+        exported: Whether a robot is to run it, as it does an actor; refused here if it could not, before it is trained.
 
     Raises:
-        UsageError: There is no such network, or it is none.
+        UsageError: There is no such network, it is none, or it cannot be exported.
     """
     if kind in ("mlp", "gru"):
         if kind == "gru" and not hidden:
             raise UsageError("a GRU needs a width: hidden is empty", hint="--ppo.hidden 64 64")
         return MLP((*hidden, outputs)) if kind == "mlp" else GRU((*hidden, outputs))
-    made = (find_factory(kind) if isinstance(kind, str) else kind)(outputs)
+    factory = find_factory(kind) if isinstance(kind, str) else kind
+    try:
+        made = factory(outputs)
+    except TypeError as error:
+        raise UsageError(
+            f"network {name_of(kind)} cannot be made of its number of outputs alone: {error}",
+            hint="give its other arguments defaults, or, in Python, train(..., actor=lambda outputs: ...)",
+        ) from error
     network = FlaxNetwork(made, inputs) if isinstance(made, linen.Module) else made
     if not isinstance(network, Network):
         raise UsageError(
@@ -263,14 +273,17 @@ def make_network(kind: str | Factory, hidden: tuple[int, ...], inputs: int, outp
             hint="a Network has init, initial_carry and apply: sim2real.train.architectures.Network",
         )
     _check_network(network, name_of(kind), inputs, outputs)
+    if exported:
+        _check_export(network, name_of(kind), inputs)
     return network
 
 
 def find_factory(name: str) -> Factory:
-    """Return the class or function with a name such as ``package.module:Class``.
+    """Return the class with a name such as ``package.module:Class``.
 
     Raises:
-        UsageError: It cannot be imported, or is nothing that can be called.
+        UsageError: It cannot be imported, or is no class: a bundle from elsewhere has such a name, and shall call none
+            of a library's functions.
     """
     module, sign, attribute = name.partition(":")
     hint = "write mlp, gru, or package.module:Class; found as Python finds modules, and in the current directory"
@@ -284,8 +297,8 @@ def find_factory(name: str) -> Factory:
         raise UsageError(f"network {name!r} cannot be imported: {error}", hint=hint) from error
     finally:
         sys.path.remove(here)
-    if not callable(found):
-        raise UsageError(f"network {name!r} is a {type(found).__name__}, no class or function", hint=hint)
+    if not isinstance(found, type):
+        raise UsageError(f"network {name!r} is a {type(found).__name__}, no class", hint=hint)
     return found
 
 
@@ -297,10 +310,7 @@ def name_of(kind: str | Factory) -> str:
 
 
 def _check_network(network: Network, name: str, inputs: int, outputs: int) -> None:
-    """Raise unless a network takes and returns what it should and can be exported, by tracing it.
-
-    So it is refused before it is trained, not after.
-    """
+    """Raise unless a network takes and returns what it should, by tracing it."""
     params = network.init(np.random.default_rng(0), inputs, 1.0)
     carry = network.initial_carry()
     after, y = jax.eval_shape(network.apply, params, carry, jax.ShapeDtypeStruct((inputs,), np.float32))
@@ -317,9 +327,14 @@ def _check_network(network: Network, name: str, inputs: int, outputs: int) -> No
             f"network {name} must carry on what it began with, arrays of float32: {kinds[1]} after {kinds[0]}",
             hint="apply returns (carry, output), the carry of the structure, shapes and dtypes of initial_carry",
         )
+
+
+def _check_export(network: Network, name: str, inputs: int) -> None:
+    """Raise unless a network can be translated to ONNX."""
     from sim2real.train.jaxpr_onnx import Translation, trace  # onnx takes 0.2 s to import
 
-    leaves, tree = jax.tree.flatten((carry, np.zeros(inputs, np.float32)))
+    params = network.init(np.random.default_rng(0), inputs, 1.0)
+    leaves, tree = jax.tree.flatten((network.initial_carry(), np.zeros(inputs, np.float32)))
     traced = trace(
         lambda *given: network.apply(params, *jax.tree.unflatten(tree, given)), [np.shape(x) for x in leaves]
     )

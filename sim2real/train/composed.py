@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,22 @@ from sim2real.composer.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
 from sim2real.train.protocol import Step
+from sim2real.train.tasks import REWARD
 
 if TYPE_CHECKING:
     from sim2real.composer.mjx.environment import State
+
+
+class TaskState(NamedTuple):
+    """The state of a ``TaskEnvironment``.
+
+    Attributes:
+        own: The composed environment's.
+        terms: Sum of each term of the reward that has a name, so far.
+    """
+
+    own: State
+    terms: dict[str, jax.Array]
 
 
 class TaskEnvironment:
@@ -39,12 +52,12 @@ class TaskEnvironment:
             )
         self.action_low, self.action_high = bounds
 
-    def reset(self, key: jax.Array) -> tuple[State, jax.Array]:
+    def reset(self, key: jax.Array) -> tuple[TaskState, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state = self.environment.reset(key)
-        return state, _vector(state)
+        return TaskState(state, state.terms), _vector(state)
 
-    def step(self, state: State, action: jax.Array, key: jax.Array) -> Step:
+    def step(self, state: TaskState, action: jax.Array, key: jax.Array) -> Step:
         """Make one control step.
 
         Args:
@@ -53,9 +66,21 @@ class TaskEnvironment:
             key: Not used: the state has a key of its own.
         """
         del key
-        new = self.environment.step(state, action)
+        new = self.environment.step(state.own, action)
         ends = new.done & ~new.truncated
-        return Step(new, _vector(new), new.reward, ends, new.truncated, jnp.bool_(True), {})
+        terms = {name: state.terms[name] + term for name, term in new.terms.items()}
+        metrics = {f"{REWARD}{name}": term for name, term in terms.items()}
+        return Step(TaskState(new, terms), _vector(new), new.reward, ends, new.truncated, jnp.bool_(True), metrics)
+
+    def privileged(self, state: TaskState) -> jax.Array:
+        """Return what is true in a state, shape ``(P,)``, in MuJoCo's units.
+
+        Positions and velocities of all joints, then the fields of the model that hooks set, such as drawn masses, and
+        what the task keeps in ``physics.variables``, by name.
+        """
+        own = state.own
+        known = jax.tree.leaves((own.data.qpos, own.data.qvel, own.leaves, own.variables))
+        return jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in known])
 
 
 def _vector(state: State) -> jax.Array:

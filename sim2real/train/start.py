@@ -88,7 +88,7 @@ def make_networks(
     size, actions = env.observation_size, np.shape(env.action_low)[0]
     return ActorCritic(
         actor=make_network(kind, config.hidden, size, actions),
-        critic=make_network(judge, config.hidden, size + (privileged_size(env, config) or 0), 1),
+        critic=make_network(judge, config.hidden, size + (privileged_size(env, config) or 0), 1, exported=False),
         name=name_of(kind),
         teacher=teacher,
     )

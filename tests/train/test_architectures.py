@@ -191,15 +191,21 @@ class Wrong:
         (Averaged, r"Averaged has variables besides its parameters: batch_stats[\s\S]*hint: .*LayerNorm"),
         (lambda n: Wrong(n, shape=5), r"returns float32 of shape \(5,\) for an input of shape \(3,\), .*\(2,\)"),
         (lambda n: Wrong(n, carry=np.int32(0)), "must carry on what it began with, arrays of float32"),
+        (lambda n, more: n, "cannot be made of its number of outputs alone: .*'more'"),
         (lambda n: n, "makes a int, neither a flax.linen.Module nor a Network"),
         ("transformer", "there is no network 'transformer'"),
         ("nowhere:Net", "cannot be imported: No module named 'nowhere'"),
-        (f"{__name__}:CONFIG", "is a PPOConfig, no class or function"),
+        (f"{__name__}:CONFIG", "is a PPOConfig, no class"),
+        ("os:_exit", "is a builtin_function_or_method, no class"),
     ],
 )
 def test_what_cannot_be_trained_or_exported_is_refused_before(kind, message):
     with pytest.raises(UsageError, match=message):
         make_network(kind, (8,), 3, 2)
+
+
+def test_a_value_function_need_not_be_exported():
+    assert make_network(Sorted, (), 3, 1, exported=False).initial_carry() == ()
 
 
 def test_a_network_without_flax_needs_three_functions():

@@ -11,8 +11,9 @@ from flax import struct
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
+from sim2real.composer.reward import split_reward
 from sim2real.errors import UsageError
-from sim2real.train.composed import TaskEnvironment
+from sim2real.train.composed import TaskEnvironment, TaskState
 from sim2real.train.env import GraphEnvironment
 from sim2real.train.protocol import check_environment
 
@@ -44,6 +45,7 @@ class State:
     truncated: jax.Array
     reward: jax.Array
     observation: dict
+    terms: dict = struct.field(default_factory=dict)
 
 
 @pytest.mark.parametrize(("done", "truncated"), [(True, True), (True, False), (False, False)])
@@ -53,7 +55,7 @@ def test_a_time_limit_is_no_end(done, truncated):
     env = TaskEnvironment(
         SimpleNamespace(observation_spec=lambda: state.observation, action_spec=lambda: spec, step=lambda *_: state)
     )
-    step = env.step(state, jnp.zeros(1), jax.random.key(0))
+    step = env.step(TaskState(state, {}), jnp.zeros(1), jax.random.key(0))
     assert (bool(step.terminated), bool(step.truncated)) == (done and not truncated, truncated)
     assert step.observation.tolist() == [1, 1, 0]
 
@@ -99,3 +101,59 @@ def test_what_is_over_stays_over(monkeypatch):
         )
         new, _ = world.step(made)
         assert tuple(map(bool, world.ends(new.state))) == (not truncated, truncated)
+
+
+class Named(composer.NullTask):
+    """A cart of random friction, whose reward has two terms."""
+
+    def initialize_episode(self, physics, random_state):
+        rail = self.root_entity.mjcf_model.find("joint", "rail")
+        physics.bind(rail).damping = random_state.uniform(0.5, 2.0)
+
+    def get_reward(self, physics):
+        rail = self.root_entity.mjcf_model.find("joint", "rail")
+        return {"far": -(physics.bind(rail).qpos[0] ** 2), "alive": 0.25}
+
+
+@pytest.fixture(scope="module")
+def named():
+    task = Named(cart('ctrlrange="-2 1" ctrllimited="true"').task.root_entity)
+    return TaskEnvironment(composer.MjxEnvironment(task, time_limit=0.1))
+
+
+def test_terms_of_a_reward_are_summed_by_name(named):
+    check_environment(named)
+    step = jax.jit(named.step)
+    state, _ = jax.jit(named.reset)(jax.random.key(0))
+    rewards = []
+    for i in range(3):
+        made = step(state, jnp.ones(1), jax.random.key(i))
+        state, rewards = made.state, [*rewards, float(made.reward)]
+    metrics = {name: float(value) for name, value in made.metrics.items()}
+    assert metrics.keys() == {"reward/far", "reward/alive"}
+    assert metrics["reward/alive"] == pytest.approx(0.75)
+    assert sum(metrics.values()) == pytest.approx(sum(rewards), rel=1e-5)
+    assert metrics["reward/far"] < 0.0
+    again = jax.jit(named.reset)(jax.random.key(1))[0]
+    assert set(map(float, again.terms.values())) == {0.0}
+
+
+def test_the_truth_of_a_composed_task_has_what_its_hooks_drew(named):
+    reset = jax.jit(lambda key: named.privileged(named.reset(key)[0]))
+    one, other = np.asarray(reset(jax.random.key(0))), np.asarray(reset(jax.random.key(1)))
+    assert one.shape == (3,)
+    np.testing.assert_array_equal(one[:2], 0.0)
+    assert one[-1] != other[-1]
+    assert 0.5 <= one[-1] <= 2.0
+
+
+def test_named_terms_are_one_reward_in_the_c_engine(named):
+    environment = composer.Environment(named.environment.task)
+    environment.reset()
+    reward = environment.step(np.ones(1)).reward
+    assert reward == pytest.approx(0.25 - environment.physics.data.qpos[0] ** 2)
+
+
+def test_names_without_terms_are_refused():
+    with pytest.raises(UsageError, match=r"returned no terms[\s\S]*hint: return a number"):
+        split_reward({})

@@ -67,6 +67,20 @@ def test_an_observation_alone_tells_no_action(learnt):
         learnt.best.get_action(jnp.zeros(2))
 
 
+def test_it_is_resumed_in_the_middle_of_episodes(tmp_path):
+    config = dataclasses.replace(CONFIG, total_steps=2 * 16 * 64, evaluations=2, hidden=(4,), epochs=1)
+    file, whole = tmp_path / "checkpoint", train(Sign(), config, jax.random.key(2))
+
+    def stop(progress):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(Sign(), config, jax.random.key(2), stop, checkpoint=file)
+    found = train(Sign(), config, jax.random.key(2), resume=file)
+    pairs = zip(jax.tree.leaves(found.policies), jax.tree.leaves(whole.policies), strict=True)
+    assert all(np.array_equal(a, b) for a, b in pairs)
+
+
 def test_its_equations_are_those_of_flax():
     unit, cell = GRU((5, 1)), linen.GRUCell(5)
     params = unit.init(np.random.default_rng(0), 3, 1.0)

@@ -22,11 +22,11 @@ from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import Samples, make_rings
 from sim2real.composer.mjx.tracing import TracedHooks
 from sim2real.composer.models.translate import mj
+from sim2real.composer.reward import split_reward
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from dm_env import specs
     from jax.typing import ArrayLike
 
     from sim2real.composer.entity import Entity
@@ -52,6 +52,7 @@ class State:
         done: Whether the episode ended with the last step.
         truncated: Whether it ended only because of the time limit.
         failed: Whether no acceptable initial state was found in ``max_reset_attempts`` attempts.
+        terms: The terms of the reward by name; none where it is a single number.
     """
 
     data: mjx.Data
@@ -68,6 +69,7 @@ class State:
     done: jax.Array
     truncated: jax.Array
     failed: jax.Array
+    terms: dict[str, jax.Array]
 
 
 class MjxEnvironment:
@@ -144,7 +146,7 @@ class MjxEnvironment:
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
         self._steady = True
-        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())  # of rewards and discounts
+        self._earned: Any = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
         self._discover()
 
     def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
@@ -176,11 +178,11 @@ class MjxEnvironment:
     def _discover(self) -> None:
         """Trace resets and steps, without physics, to find out what hooks set and keep; programs must carry it."""
         key = jax.random.key(0)
-        action = jax.tree_util.tree_map(_zeros, self._action_spec)
+        action = jax.tree.map(lambda s: jnp.zeros(s.shape, jax.dtypes.canonicalize_dtype(s.dtype)), self._action_spec)
         self._dry = True
         with self._hooks.watching((self.task, *self.task.iter_entities())):
             state, after = self._trace(key, action)
-            self._shapes = after.reward.shape, after.discount.shape
+            self._earned = after.reward, after.discount, after.terms
             if self._stays_dirty:
                 state, after = self._trace(key, action)
         self._dry = False
@@ -224,9 +226,9 @@ class MjxEnvironment:
         observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
-        reward, discount = (jnp.zeros(shape, data.qpos.dtype) for shape in self._shapes)
+        reward, discount, terms = jax.tree.map(lambda x: jnp.zeros(x.shape, data.qpos.dtype), self._earned)
         no = jnp.zeros((), bool)
-        outcome = (observation, reward, discount + 1, no, no, failed)
+        outcome = (observation, reward, discount + 1, no, no, failed, terms)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def reset_apart(
@@ -290,7 +292,7 @@ class MjxEnvironment:
         now = steps * self.substeps
         rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
         dtype, task = state.reward.dtype, type(self.task).__name__
-        reward = jnp.asarray(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics), dtype)
+        reward, terms = split_reward(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics))
         discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
         ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
         observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
@@ -300,10 +302,11 @@ class MjxEnvironment:
         data, leaves, variables, key, memory = physics.tree(random_state)
         diverged = diverged | is_unstable(data)
         diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
-        reward, discount = (jnp.where(diverged, 0.0, x).astype(dtype) for x in (reward, discount))
+        earned = (reward, discount, terms)
+        reward, discount, terms = jax.tree.map(lambda x: jnp.where(diverged, 0.0, x).astype(dtype), earned)
         ended = diverged | jnp.asarray(ends, bool)
         late = jnp.zeros((), bool) if self.step_limit is None else steps >= self.step_limit
-        outcome = (observation, reward, discount, ended | late, late & ~ended, state.failed)
+        outcome = (observation, reward, discount, ended | late, late & ~ended, state.failed, terms)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
 
     def _substeps(
@@ -380,10 +383,6 @@ def is_unstable(data: mjx.Data) -> jax.Array:
     """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
     return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
-
-
-def _zeros(spec: specs.Array) -> jax.Array:
-    return jnp.zeros(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))
 
 
 def _check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
