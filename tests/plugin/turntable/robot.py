@@ -10,7 +10,6 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
-from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.registry import load_device
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
@@ -90,9 +89,7 @@ class TurntableRobot(LoopRobot):
         return load_device("odrive")(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=silence_s)
 
     def gate(self, limits):
-        return GateConfig(
-            limits.limit, limits.slew_per_s, limits.command_timeout_s, limits.max_speed_rad_s, joints=("table",)
-        )
+        return limits.gate(limits.limit, joints=("table",))
 
     def read(self, reading):
         return JointReading(reading.position_rad, reading.velocity_rad_s)
