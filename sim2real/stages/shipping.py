@@ -9,7 +9,8 @@ from sim2real.artifacts.bundle import BUNDLE
 from sim2real.artifacts.run_folder import newest, pipeline_of
 from sim2real.errors import UsageError
 from sim2real.policy import standalone
-from sim2real.policy.bundle import CONTRACT, GRAPH, WEIGHTS, load_bundle
+from sim2real.policy.bundle import CONTRACT, GRAPH, WEIGHTS, load_bundle, read_contract
+from sim2real.policy.network import NetworkSpec
 from sim2real.stages.config import ShipConfig
 from sim2real.stages.console import note, wrote
 from sim2real.stages.pipeline import available
@@ -33,15 +34,19 @@ def run(config: ShipConfig) -> Path:
     """
     bundle = find_bundle(config)
     contract = load_bundle(bundle).contract  # what is damaged is not passed on
+    plain = read_contract(bundle)[1] == NetworkSpec()
     out = config.to or Path(f"{bundle.resolve().parent.name}_policy")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} is there and not empty", hint="name another folder with --to")
     out.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, GRAPH, CONTRACT):
         shutil.copyfile(bundle / name, out / name)
-    shutil.copyfile(Path(standalone.__file__), out / EXAMPLE)
     note(f"{contract.observation_size} observations to {len(contract.action)} actions at {contract.rate_hz:g} Hz")
     wrote(out / CONTRACT)
+    if not plain:
+        note(f"{EXAMPLE} runs clipped perceptrons alone: run {GRAPH} with onnxruntime, or sim2real.policy.load_bundle")
+        return out
+    shutil.copyfile(Path(standalone.__file__), out / EXAMPLE)
     wrote(out / EXAMPLE)
     return out
 

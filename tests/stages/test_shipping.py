@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle
+from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
+from sim2real.policy.network import NetworkSpec
 from sim2real.stages import shipping
 from sim2real.stages.config import ShipConfig
 
@@ -103,6 +104,21 @@ def test_a_policy_with_other_layers_is_not_run_as_if_it_had_none(trained, bare, 
     done = subprocess.run([bare, "-I", "-c", code], cwd=out, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "memory" in done.stderr
+
+
+def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_path, capsys):
+    """Nor does the example run such a bundle, should it come beside one: squashed and clipped have the same arrays."""
+    import safetensors.numpy
+
+    weights = safetensors.numpy.load((trained[0] / "policy.safetensors").read_bytes())
+    squashed = save_bundle(
+        tmp_path / "bundle", weights, load_bundle(trained[0]).contract, spec=NetworkSpec("mlp", True)
+    )
+    out = shipping.run(ShipConfig(str(squashed), tmp_path / "out"))
+    assert sorted(path.name for path in out.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
+    assert "run policy.onnx with onnxruntime" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="clipped tanh layers"):
+        standalone.load(squashed)
 
 
 def test_a_folder_that_holds_something_is_left_alone(trained, tmp_path):
