@@ -14,6 +14,7 @@ from sim2real.errors import UsageError
 from sim2real.stages import running
 from sim2real.stages.flags import RunFlags
 from sim2real.stages.pipeline import load_pipeline
+from sim2real.view.iterations import iterations_sections
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 
@@ -29,7 +30,7 @@ def world(tmp_path, monkeypatch):
     """Stages that leave what the loop reads; each deployment takes the next verdict."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
-    seen = SimpleNamespace(calls=[], verdicts=[])
+    seen = SimpleNamespace(calls=[], verdicts=[], root=tmp_path / "runs" / "pendulum")
 
     def call(stage, config, run_dir):
         seen.calls.append((stage, config))
@@ -63,6 +64,8 @@ def world(tmp_path, monkeypatch):
 def test_without_the_flag_a_run_goes_around_once(world):
     again, rows = world.go(verdict("re-identify"), iterations=1)
     assert (again, rows) == ([], ())
+    (folder,) = world.root.iterdir()
+    assert iterations_sections(folder) == []
 
 
 def test_a_fine_robot_ends_the_loop(world, capsys):
@@ -72,6 +75,12 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
     assert rows[0].stages == STAGES
     assert rows[1].stages == ("train.2", "deploy.2")
     assert [c.seed for s, c in world.calls if s == "train"] == [0, 1], "the same seed would train the same policy"
+    (folder,) = world.root.iterdir()
+    (section,) = iterations_sections(folder)
+    assert [row[:3] for row in section.blocks[0].rows] == [
+        ["1", "record, identify, train, deploy", "0.6000"],
+        ["2", "train.2, deploy.2", "1.000"],
+    ]
     assert "stop: nothing is left to do" in capsys.readouterr().out
 
 
