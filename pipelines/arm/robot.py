@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.graph.arrays import namespace
+from sim2real.arrays import namespace
 from sim2real.graph.base import Array
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.robots.hardware import Embedded

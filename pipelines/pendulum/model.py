@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sim2real.graph.arrays import namespace
+from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.agent import DirectAgent

@@ -10,13 +10,15 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.drift import Drift
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, malformed, read_arrays, read_json, shown, write_arrays, write_json
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.errors import Sim2RealError
 
 FORMAT = 2
 RESULT, SIMULATION = "result.json", "simulation.npz"
 _AGAIN = "run `sim2real deploy` again"
+_RUN = "{run}"
+"""Stands in the file for the run's folder, which may move, in the command to type next."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,11 @@ class Deployment:
         Returns:
             Output -> name of the file in the folder.
         """
-        arrays = ("simulated", "recordings")
-        write_json(folder / RESULT, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
+        arrays, advice = ("simulated", "recordings"), self.advice
+        if advice is not None:
+            advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
+        write_json(folder / RESULT, values | {"advice": advice})
         if self.dry_run:
             return {"result": RESULT}
         columns = {f"{n}_{i}": v for i, own in enumerate(self.simulated) for n, v in own.items()}
@@ -141,7 +146,9 @@ class Deployment:
             found = read_json(file, Deployment)
             if found.format != FORMAT:
                 raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
-        return found
+        if found.advice is None:
+            return found
+        return replace(found, advice=replace(found.advice, next=found.advice.next.replace(_RUN, shown(folder.parent))))
 
     @staticmethod
     def load(folder: Path) -> Deployment:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sim2real.graph.arrays import is_jax as is_jax
-from sim2real.graph.arrays import namespace as namespace
+from sim2real.arrays import is_jax as is_jax
+from sim2real.arrays import namespace as namespace
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Array

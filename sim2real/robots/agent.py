@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sim2real.graph.arrays import namespace
+from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.robots.messages import Decision, JointReading

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.arrays import namespace
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.graph.arrays import namespace
 from sim2real.graph.base import Array
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits

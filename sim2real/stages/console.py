@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 import time
@@ -10,6 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
+
+from sim2real.artifacts.files import shown as shown
 
 # Shortest time between two lines of progress in a log file.
 _LINE_EVERY_S = 15.0
@@ -152,13 +153,6 @@ def note(text: str) -> None:
 def wrote(path: Path | str) -> None:
     """Print the name of a file or folder that was written, on stdout."""
     print(f"wrote {clean(shown(path))}", flush=True)
-
-
-def shown(path: Path | str) -> str:
-    """Return a path for display: relative to the working directory if it is inside that."""
-    absolute = Path(os.path.abspath(path))
-    here = Path.cwd()
-    return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
 
 
 def _cell(value: Any) -> str:

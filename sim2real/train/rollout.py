@@ -232,15 +232,15 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
         fraction of those that ended by themselves. Each of shape ``()``.
     """
     reset = get_reset(env, config, jnp.int32(0))
-    shapes = jax.eval_shape(jax.vmap(reset), jax.random.split(key, config.num_envs))
+    shapes = jax.eval_shape(lambda: jax.vmap(reset)(jax.random.split(jax.random.key(0), config.num_envs)))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
     blank = blank._replace(carry=spread(policy.initial_carry(), config.num_envs))
 
-    def rollout(carry: tuple[Copies, Tested], i: jax.Array) -> tuple[tuple[Copies, Tested], None]:
-        copies, tested = carry
-        played, rows = collect(env, config, policy, copies, i, jax.random.fold_in(key, i), testing=jnp.asarray(True))
+    def rollout(carry: tuple[Copies, Tested], x: tuple[jax.Array, jax.Array]) -> tuple[tuple[Copies, Tested], None]:
+        (copies, tested), (number, own) = carry, x
+        played, rows = collect(env, config, policy, copies, number, own, testing=jnp.asarray(True))
         return (played, watch(tested, rows, config)), None
 
-    start = blank, untested(env, config)
-    (_, tested), _ = jax.lax.scan(rollout, start, jnp.arange(config.rollouts_per_test))
+    start, numbers = (blank, untested(env, config)), jnp.arange(config.rollouts_per_test)
+    (_, tested), _ = jax.lax.scan(rollout, start, (numbers, jax.random.split(key, len(numbers))))
     return figures_of(tested)

@@ -118,7 +118,7 @@ def test_an_interrupted_search_is_refused(arm, here, capsys):
     ("arguments", "words"),
     [
         ([], "needs to be told what to do"),
-        (["policy"], "there is no `export policy`"),
+        (["weights"], "there is no `export weights`"),
         (["identified"], "needs a run folder, a pipeline or a parameters.json"),
         (["identified", "no_such"], "there is no file, pipeline or run 'no_such'"),
         (["identified", "arm"], "no finished 'identify' of pipeline 'arm'"),
