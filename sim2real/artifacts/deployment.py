@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.drift import Drift
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, shown, write_arrays, write_json
+from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.errors import Sim2RealError
 

@@ -115,10 +115,3 @@ def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")
-
-
-def shown(path: Path | str) -> str:
-    """Return a path for display: relative to the working directory if it is inside that."""
-    absolute = Path(os.path.abspath(path))
-    here = Path.cwd()
-    return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from sim2real.artifacts.files import shown as shown
+from sim2real.artifacts.paths import shown as shown
 
 # Shortest time between two lines of progress in a log file.
 _LINE_EVERY_S = 15.0
