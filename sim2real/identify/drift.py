@@ -12,7 +12,7 @@ from scipy.special import stdtr, stdtrit
 from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.posterior import Posterior
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.uncertainty import Linearised, linearise, loss_variance
@@ -26,6 +26,8 @@ _ALIKE = 0.02
 """Changes whose shares of the error that they take away differ by less explain as much."""
 _POLISH = 12
 """Most simulations of the log between the best of these and its neighbours."""
+_FELT = 1e-3
+"""A change over all of the bounds moves residuals by at least so many of their variances where a log feels it."""
 Causes = Mapping[str, Mapping[str, float]]
 """Name of a cause -> parameter -> by how much it moves on its scale when what is named grows by a factor of e."""
 
@@ -105,12 +107,16 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
 
     Raises:
         UsageError: When the parameters are others than the posterior's.
+        Sim2RealError: When the log says nothing about any of them.
     """
     table = problem.table
     if table.names != posterior.names:
         tested, known = ", ".join(table.names), ", ".join(posterior.names)
         raise UsageError(f"the log is tested for {tested}, identified were {known}")
-    found = [_alone(problem, posterior, widening, way) for way in ways(table, causes)]
+    tried = [_alone(problem, posterior, widening, way) for way in ways(table, causes)]
+    found = [one for one in tried if one is not None]
+    if not found:
+        raise Sim2RealError("this log says nothing about any parameter", hint="deploy something that moves")
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
     now = _with_the_rest(at, widening**2 * posterior.covariance, loss_variance(problem, at))
     found = _ordered(found, now, table)
@@ -118,8 +124,10 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
 
 
-def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Fitted:
+def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Fitted | None:
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
+
+    None for a change that this log does not feel, as of a torque limit that no motion of it reached.
 
     The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
     sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
@@ -143,11 +151,13 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
     at = _finite(linearise(problem, point(size)))
     J = at.jacobian @ way.along  # (S, C, F)
     said = np.sum(J**2, axis=(1, 2))
-    information = max(float(said.sum()), 1e-300)
-    segments = information**2 / max(float(np.sum(said**2)), 1e-300)
+    information, variance = float(said.sum()), loss_variance(problem, at)
+    if information * unit**2 <= _FELT * variance:
+        return None
+    segments = information**2 / float(np.sum(said**2))
     pulls = np.sum(J * at.residuals, axis=(1, 2))
     spread = float(np.sum(pulls**2)) / information**2 * segments / max(segments - 1.0, 0.5)
-    variance, open_before = loss_variance(problem, at), widening**2 * posterior.covariance
+    open_before = widening**2 * posterior.covariance
     # Residuals are large where much moves, and there the log says most: each segment counts with its own.
     squares, counted = np.sum(at.residuals**2, axis=(1, 2)), np.count_nonzero(at.residuals, axis=(1, 2))
     uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)

@@ -52,7 +52,7 @@ def judged(
     try:
         with progress(None, "test the model on the deployment"):
             rows, drifted = patiently(lambda: tested(pipeline, found, [r.episode for r in deployed.recordings]))
-    except Sim2RealError as error:  # the robot has run: what it did must not be lost
+    except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:  # what the robot did must not be lost
         told, why = _of_policy(deployed, bundle), str(error.args[0])
         advice = Advice("not judged", (why,)) if told is None else replace(told, reasons=(*told.reasons, why))
         return replace(deployed, advice=commands(advice, pipeline, found, folder, deployed))

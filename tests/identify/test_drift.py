@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.posterior import Posterior
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.drift import Fitted, drift, ways, weigh
 from sim2real.identify.parameters import Parameter, ParameterTable
 
@@ -119,6 +119,18 @@ def test_errors_of_the_model_in_other_motions_are_no_change():
     moved = Robot(np.array([20.0, 6.6]))
     assert drift(moved, OF_TWO, 1.0, {})[0].alarms
     assert not drift(moved, OF_TWO, 10.0, {})[0].alarms
+
+
+def test_what_a_log_does_not_feel_is_not_tested():
+    """As a torque limit that no motion reached: its derivative is 0, and no change of it can be told."""
+    robot = Robot(np.array([20.0, 12.0]))
+    robot.slopes[..., 0] = 0.0
+    found, _ = drift(robot, OF_TWO, 1.0, {})
+    assert [change.name for change in found.changes] == ["friction"]
+    assert found.alarms == ("friction",)
+    robot.slopes[...] = 0.0
+    with pytest.raises(Sim2RealError, match=r"(?s)says nothing about any parameter.*hint: deploy something that moves"):
+        drift(robot, OF_TWO, 1.0, {})
 
 
 def test_parameters_of_another_model_are_refused():
