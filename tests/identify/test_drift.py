@@ -123,14 +123,14 @@ def test_errors_of_the_model_in_other_motions_are_no_change():
 
 def test_what_a_log_does_not_feel_is_not_tested():
     """As a torque limit that no motion reached: its derivative is 0, and no change of it can be told."""
-    robot = Robot(np.array([20.0, 12.0]))
+    robot, other = Robot(np.array([20.0, 12.0])), Robot(np.array([20.0, 12.0]))
     robot.slopes[..., 0] = 0.0
     found, _ = drift(robot, OF_TWO, 1.0, {})
     assert [change.name for change in found.changes] == ["friction"]
     assert found.alarms == ("friction",)
-    robot.slopes[...] = 0.0
-    with pytest.raises(Sim2RealError, match=r"(?s)says nothing about any parameter.*hint: deploy something that moves"):
-        drift(robot, OF_TWO, 1.0, {})
+    other.slopes[...] = 0.0
+    with pytest.raises(Sim2RealError, match="says nothing about any parameter"):
+        drift(other, OF_TWO, 1.0, {})
 
 
 def test_parameters_of_another_model_are_refused():
