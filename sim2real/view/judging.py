@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sim2real.artifacts.deployment import Deployment
-from sim2real.view.blocks import Block, ListBlock, TableBlock, Tile, number
+from sim2real.view.blocks import Block, ListBlock, TableBlock, Tile, number, spoken
 
 
 def verdict_blocks(deployed: Deployment) -> list[Block]:
@@ -28,7 +28,7 @@ def tables(deployed: Deployment) -> list[Block]:
         alarms = set(deployed.drift.alarms)
         rows = [
             [
-                *(c.name, c.unit or "factor", number(c.before), number(c.now)),
+                *(c.name.replace("_", " "), c.unit or "factor", number(c.before), number(c.now)),
                 *(f"{number(c.low95)} to {number(c.high95)}", f"{c.explains:.0%}", "yes" if c.name in alarms else "no"),
             ]
             for c in deployed.drift.changes
@@ -49,7 +49,7 @@ def tables(deployed: Deployment) -> list[Block]:
         )
         blocks.append(TableBlock(caption, ("position", "unit", *models, "promised"), rows, text_columns=(1,)))
     if deployed.trained:
-        rows = [[g.quantity, g.unit, number(g.real), number(g.simulation), number(g.gap)] for g in deployed.trained]
+        rows = [[*spoken(g.quantity), number(g.real), number(g.simulation), number(g.gap)] for g in deployed.trained]
         caption = "Times on the robot, and those that the policy was trained with"
         blocks.append(TableBlock(caption, ("time", "unit", "robot", "in training", "gap"), rows, text_columns=(1,)))
     return blocks
