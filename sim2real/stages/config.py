@@ -151,8 +151,9 @@ class DeployConfig:
     """Longest wait for the robot to come to rest before a deployment [s]."""
     seed: int = 0
     """Seed of the embedded robot."""
-    backend: Literal["numpy", "onnx"] = "numpy"
-    """What runs the policy: numpy, or onnxruntime, where that is installed."""
+    backend: Literal["numpy", "onnx"] | None = None
+    """What runs the policy: numpy, or onnxruntime, where that is installed; default: numpy, for a network of your own
+    onnxruntime."""
     blend_s: float = 0.0
     """Time in which the policy's action grows from none to all of it, for a first try on a robot [s]."""
     measure_delay: bool = True
