@@ -76,7 +76,7 @@ FAULTS = {
         Fault("frozen", {"frozen_after_s": 0.0}, (SAFETY_STOP,), "has read"),
         Fault(NAN, {}, (SAFETY_STOP,), "is NaN"),
         Fault(KILLED, {}, (-signal.SIGKILL,), ""),
-        Fault(STOPPED, {}, (SAFETY_STOP,), "the guardian has taken the torque off"),
+        Fault(STOPPED, {}, (SAFETY_STOP,), "guardian: the control process was silent"),
         Fault("unplugged", {"unplugged_after_s": 0.0}, (HARDWARE_LOST,), ""),
     )
 }
