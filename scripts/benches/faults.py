@@ -76,7 +76,7 @@ FAULTS = {
         Fault("frozen", {"frozen_after_s": 0.0}, (SAFETY_STOP,), "has read"),
         Fault(NAN, {}, (SAFETY_STOP,), "is NaN"),
         Fault(KILLED, {}, (-signal.SIGKILL,), ""),
-        Fault(STOPPED, {}, (SAFETY_STOP,), "guardian: the control process was silent"),
+        Fault(STOPPED, {}, (SAFETY_STOP,), "the guardian has taken the torque off"),
         Fault("unplugged", {"unplugged_after_s": 0.0}, (HARDWARE_LOST,), ""),
     )
 }
@@ -133,7 +133,7 @@ def emulated(config: Any, plant: str, truth: Path) -> Iterator[tuple[str, int]]:
         process.communicate(timeout=_END_S)
 
 
-def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float) -> BaseProcess:
+def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float, *more: str) -> BaseProcess:
     """Start a deployment in a process of its own; SIGUSR1 makes its sensor's readings NaN from then on.
 
     It is forked from a process that has imported everything and computed nothing: an import takes as long as a run.
@@ -144,11 +144,12 @@ def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float)
         runs: Folder of its run.
         said: File for what it says.
         watchdog_s: The gate's longest silence [s].
+        *more: Further flags.
     """
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(["sim2real.stages.deploy", "sim2real.stages.gap", "sim2real.view.page"])
     flags = ["--port", port, "--bundle", str(bundle), "--runs", str(runs), "--duration-s", "8", "--episodes", "1"]
-    process = server.Process(target=_deploy, args=([*flags, f"--gate.servo-watchdog-s={watchdog_s}"], said))
+    process = server.Process(target=_deploy, args=([*flags, f"--gate.servo-watchdog-s={watchdog_s}", *more], said))
     process.start()
     return process
 

@@ -267,6 +267,9 @@ class Device(ABC):
             SafetyStop: There is one.
         """
 
+    def require_watching(self) -> None:  # noqa: B027
+        """Raise SafetyStop if another process that watches this one has taken over; nothing to do where none does."""
+
     @property
     @abstractmethod
     def counters(self) -> Counters:

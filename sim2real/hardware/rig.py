@@ -196,11 +196,13 @@ class Rig:
         """Refuse to go on without a recent measurement.
 
         Raises:
-            SafetyStop: The newest is older than ``max_sample_age_s``.
+            SafetyStop: The newest is older than ``max_sample_age_s``, or, of a process that was stopped meanwhile, the
+                guardian has taken the torque off: that is the reason then.
         """
         now_s, most_s = time.monotonic(), self.gate.config.max_sample_age_s
         age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, all is at rest
         if age_s > most_s:
+            self.device.require_watching()
             raise SafetyStop(
                 f"node {self.gate.config.node!r} stopped: the newest measurement is {age_s:.3g} s old, "
                 f"{most_s:g} s are allowed",

@@ -99,6 +99,11 @@ class GuardedServos(Generic[L]):
         """Whether nothing can move a motor; see `withhold_torque`."""
         return self._link is not None and self._link.torque_withheld
 
+    def require_watching(self) -> None:
+        """Raise SafetyStop if the guardian has taken over, or has died."""
+        if self._link is not None and self._link.guardian is not None:
+            self._link.guardian.require_watching()
+
     @property
     def guardian_pid(self) -> int | None:
         """Process id of the guardian; None before it is started."""

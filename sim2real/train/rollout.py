@@ -117,7 +117,7 @@ def collect(
     update: jax.Array,
     key: jax.Array,
     teacher: Policy | None = None,
-    testing: jax.Array | None = None,
+    testing: jax.Array | bool = False,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
@@ -142,15 +142,14 @@ def collect(
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    widened = update if testing is None else jnp.where(testing, config.updates, update)
+    widened = jnp.where(testing, config.updates, update)
     begun = jax.vmap(get_reset(env, config, widened))(jax.random.split(key_reset, count))
     fresh = Copies(*begun, spread(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
-    std = jnp.exp(policy.log_std) if testing is None else jnp.where(testing, 0.0, jnp.exp(policy.log_std))
+    std = jnp.where(testing, 0.0, jnp.exp(policy.log_std))
     see = get_privileged(env, config)
-    cut = 1 + jnp.arange(count) * config.eval_steps // count
-    cut = cut if testing is None else jnp.where(testing, 0, cut)
+    cut = jnp.where(testing, 0, 1 + jnp.arange(count) * config.eval_steps // count)
 
     def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
         noise, keys, number = x
@@ -238,7 +237,7 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
 
     def rollout(carry: tuple[Copies, Tested], x: tuple[jax.Array, jax.Array]) -> tuple[tuple[Copies, Tested], None]:
         (copies, tested), (number, own) = carry, x
-        played, rows = collect(env, config, policy, copies, number, own, testing=jnp.asarray(True))
+        played, rows = collect(env, config, policy, copies, number, own, testing=True)
         return (played, watch(tested, rows, config)), None
 
     start, numbers = (blank, untested(env, config)), jnp.arange(config.rollouts_per_test)

@@ -67,7 +67,8 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
     robot, truth, said = load_pipeline("pendulum").load().embedded, tmp_path / "truth.bin", tmp_path / "said.txt"
     bundle = faults.swinging_bundle(tmp_path / "bundle")
     with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
-        child = faults.deployed(port, bundle, tmp_path, said, 0.4)
+        patient = ("--gate.stop-s=2", "--gate.max-sample-age-s=1")  # on a busy machine commands come late
+        child = faults.deployed(port, bundle, tmp_path, said, 0.4, *patient)
         faults.wait_until_moving(truth, said, child)
         time.sleep(0.5)
         os.kill(child.pid, signal.SIGINT)
@@ -78,8 +79,7 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
     last = int(np.flatnonzero(modes == OperatingMode.PWM)[-1])
     assert modes[-1] == OperatingMode.OFF
     assert np.abs(goals[: last - 10]).max() > 0.3, "it swung at up to 2 of 5 V"
-    # Of 2 V: on a busy machine the last commands come late, and the time for the stop is up.
-    assert abs(goals[last]) < 0.5, "the voltage had faded when the torque went off"
+    assert abs(goals[last]) < 0.05, "the voltage had faded when the torque went off"
     assert read_log(log).complete
 
 
