@@ -23,8 +23,31 @@ SHEET = {"gain": 26.96, "gravity": 129.5, "damping": 0.99, "friction": 6.1}
 """About the pendulum's data sheet, around which robots are drawn: [rad/s^2/V], [rad/s^2], [1/s], [rad/s^2]."""
 SPREAD = 0.3
 _RETRY_S = 0.004
+_SPEED_NOISE = 15.0
+"""A speed is this many times as noisy as an angle [1/s]."""
 Controller = Callable[[float, float], float]
 """Angle [rad] and angular velocity [rad/s], as measured -> voltage [V]."""
+
+
+@dataclass(frozen=True)
+class Wear:
+    """How far robots that are drawn may be from ideal ones.
+
+    Attributes:
+        jitter_s: Largest deviation of either latency [s].
+        lost: Share of the answers that are lost, where some are.
+        play_rad: Half of the encoder's backlash, where there is some [rad].
+        noise_rad: Largest deviation of the encoder's noise [rad]; the speed's is 15 times that [rad/s].
+        hiccups_hz: Pauses of the computer a second.
+        hiccup_s: Their mean length [s].
+    """
+
+    jitter_s: float = 0.003
+    lost: float = 0.02
+    play_rad: float = 0.008
+    noise_rad: float = 0.0
+    hiccups_hz: float = 0.0
+    hiccup_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +64,8 @@ class Hidden:
         jitter: Deviation of each.
         lost: Share of the answers that are lost, and asked for again.
         play: Half of the encoder's backlash [rad].
+        noise: Deviation of the encoder's noise [rad].
+        hiccups: Pauses of the computer a second, of a mean length.
         seed: Of jitter and losses.
     """
 
@@ -53,10 +78,12 @@ class Hidden:
     jitter: float
     lost: float
     play: float
+    noise: float
+    hiccups: tuple[float, float]
     seed: int
 
     @staticmethod
-    def draw(seed: int) -> Hidden:
+    def draw(seed: int, wear: Wear = Wear()) -> Hidden:
         """Draw a robot: within 30 % of the data sheet, 10 to 60 ms late, a third each with losses, play, a payload."""
         rng = np.random.default_rng([20261123, seed])
         own = {n: v * rng.uniform(1 - SPREAD, 1 + SPREAD) for n, v in SHEET.items()}
@@ -68,9 +95,11 @@ class Hidden:
             **own,
             sensing=share * total,
             acting=(1 - share) * total,
-            jitter=rng.uniform(0.0, 0.003),
-            lost=0.02 * losses,
-            play=0.008 * play,
+            jitter=rng.uniform(0.0, wear.jitter_s),
+            lost=wear.lost * losses,
+            play=wear.play_rad * play,
+            noise=wear.noise_rad * rng.uniform(0.3, 1.0),
+            hiccups=(wear.hiccups_hz, wear.hiccup_s),
             seed=seed,
         )
 
@@ -111,15 +140,16 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
     count, steps = int(seconds * RATE_HZ), int(seconds / STEP_S) + 1
     angle, speed, encoder = np.zeros(steps), np.zeros(steps), np.zeros(steps)
     angle[0] = encoder[0] = math.pi
-    t_step = np.arange(count) / RATE_HZ
     took = {n: 1e-4 + rng.gamma(4.0, s, count) for n, s in (("sensor", 2e-4), ("agent", 3e-5), ("actuator", 1.5e-4))}
     took["sensor"] += _RETRY_S * (rng.random(count) < robot.lost)
     took["actuator"] += _RETRY_S * (rng.random(count) < robot.lost)
     ages = np.maximum(rng.normal(robot.sensing, robot.jitter, count), 0.0)
     lags = np.maximum(rng.normal(robot.acting, robot.jitter, count), 0.0)
-    begin_agent = t_step + took["sensor"]
-    begin_actuator = begin_agent + took["agent"]
-    sent = begin_actuator + took["actuator"]
+    if robot.hiccups[0]:
+        paused = rng.random(count) < robot.hiccups[0] / RATE_HZ
+        took["agent"] += np.where(paused, rng.gamma(4.0, robot.hiccups[1] / 4.0, count), 0.0)
+    noise = robot.noise * np.array([1.0, _SPEED_NOISE]) * rng.standard_normal((count, 2)) if robot.noise else None
+    t_step, begin_agent, begin_actuator, sent = _one_after_another(count, took)
     acts = np.maximum.accumulate(sent + lags)
     measured, volts = np.zeros((count, 2)), np.zeros(count)
     now, done = 0, -1
@@ -130,15 +160,31 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
             _advance(robot, angle, speed, encoder, now, volts[done] if done >= 0 else 0.0)
             now += 1
         at = max(0, min(now, round((t_step[k] - ages[k]) / STEP_S)))
+        angle_now, speed_now = (encoder[at], speed[at]) if noise is None else (encoder[at], speed[at]) + noise[k]
         measured[k] = (
-            round(encoder[at] / COUNT_RAD) * COUNT_RAD,
-            round(speed[at] / SPEED_COUNT_RAD_S) * SPEED_COUNT_RAD_S,
+            round(angle_now / COUNT_RAD) * COUNT_RAD,
+            round(speed_now / SPEED_COUNT_RAD_S) * SPEED_COUNT_RAD_S,
         )
         volts[k] = controller(*measured[k])
     starts = {"sensor": t_step, "agent": begin_agent, "actuator": begin_actuator}
-    ends = {"sensor": begin_agent, "agent": begin_actuator, "actuator": sent}
+    ends = {n: starts[n] + took[n] for n in starts}
     times = np.arange(now + 1) * STEP_S
     return Played(times, angle[: now + 1], speed[: now + 1], starts, ends, measured, volts)
+
+
+def _one_after_another(count: int, took: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return when each step of sensor, agent and actuator starts, and when the last ends, all ``(N,)`` [s].
+
+    A node waits for its input, and for its own last step to end.
+    """
+    starts = {n: np.zeros(count) for n in took}
+    ends = {n: np.zeros(count) for n in took}
+    for k in range(count):
+        ready = k / RATE_HZ
+        for node in ("sensor", "agent", "actuator"):
+            starts[node][k] = max(ready, ends[node][k - 1]) if k else ready
+            ready = ends[node][k] = starts[node][k] + took[node][k]
+    return starts["sensor"], starts["agent"], starts["actuator"], ends["actuator"]
 
 
 def _advance(robot: Hidden, angle: np.ndarray, speed: np.ndarray, encoder: np.ndarray, i: int, volts: float) -> None:
@@ -150,13 +196,19 @@ def _advance(robot: Hidden, angle: np.ndarray, speed: np.ndarray, encoder: np.nd
     encoder[i + 1] = min(max(encoder[i], angle[i + 1] - robot.play), angle[i + 1] + robot.play)
 
 
-def excited(seconds: float, seed: int) -> Controller:
-    """Return a multisine of at most 1.8 V."""
+def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
+    """Return a multisine.
+
+    Args:
+        seconds: How long.
+        seed: Of its phases.
+        volts: Its largest value [V].
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
     tones, phases = np.linspace(0.2, 3.0, 24), rng.uniform(0, 2 * np.pi, 24)
     signal = np.sin(2 * np.pi * tones * t[:, None] + phases).sum(axis=1)
-    rows = iter(1.8 * signal / np.abs(signal).max())
+    rows = iter(volts * signal / np.abs(signal).max())
     return lambda angle, speed: float(next(rows))
 
 

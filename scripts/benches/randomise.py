@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trials", type=int, default=10, help="deployments of each policy")
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a deployment")
     parser.add_argument("--record-s", type=float, default=RECORD_S, help="length of the recording")
+    parser.add_argument("--record-volts", type=float, default=1.8, help="largest voltage of the recording")
+    for field in fields(hidden.Wear):
+        flag = f"--{field.name.replace('_', '-')}"
+        parser.add_argument(flag, type=float, default=field.default, help="of robots, see hidden_robots.Wear")
     parser.add_argument("--volts", type=float, default=2.0, help="most that a policy may command")
     parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps of a training")
     parser.add_argument("--envs", type=int, default=256, help="copies of a training")
@@ -89,8 +93,10 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     from sim2real.artifacts.recording import Recording
     from sim2real.stages.pipeline import load_pipeline
 
-    robot, pipeline = hidden.Hidden.draw(number), load_pipeline("pendulum")
-    session = hidden.play(robot, hidden.excited(options.record_s, number), options.record_s, 0)
+    wear = hidden.Wear(**{f.name: getattr(options, f.name) for f in fields(hidden.Wear)})
+    robot, pipeline = hidden.Hidden.draw(number, wear), load_pipeline("pendulum")
+    excited = hidden.excited(options.record_s, number, options.record_volts)
+    session = hidden.play(robot, excited, options.record_s, 0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.mcap"
         hidden.write(path, session)
