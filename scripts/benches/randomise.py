@@ -91,6 +91,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
+    from sim2real.errors import Sim2RealError
     from sim2real.stages.pipeline import load_pipeline
 
     wear = hidden.Wear(**{f.name: getattr(options, f.name) for f in fields(hidden.Wear)})
@@ -105,7 +106,12 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     ways = {}
     for way in options.ways:
         begin = time.perf_counter()
-        bundle, about = sim2real.train(pipeline, train_config(pipeline, way, number, options), identified)
+        try:
+            bundle, about = sim2real.train(pipeline, train_config(pipeline, way, number, options), identified)
+        except Sim2RealError as error:  # what is not trained succeeds never
+            ways[way] = {"success": [0.0] * options.trials, "refused": str(error)}
+            print(f"robot {number}, {way}: {error}", flush=True)
+            continue
         ways[way] = {
             "success": [deployed(robot, bundle, options, 1 + trial) for trial in range(options.trials)],
             "in simulation": about["success in simulation"],
