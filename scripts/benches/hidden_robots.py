@@ -23,7 +23,7 @@ SHEET = {"gain": 26.96, "gravity": 129.5, "damping": 0.99, "friction": 6.1}
 """About the pendulum's data sheet, around which robots are drawn: [rad/s^2/V], [rad/s^2], [1/s], [rad/s^2]."""
 SPREAD = 0.3
 _RETRY_S = 0.004
-_SPEED_NOISE = 15.0
+SPEED_NOISE = 15.0
 """A speed is this many times as noisy as an angle [1/s]."""
 Controller = Callable[[float, float], float]
 """Angle [rad] and angular velocity [rad/s], as measured -> voltage [V]."""
@@ -148,7 +148,7 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
     if robot.hiccups[0]:
         paused = rng.random(count) < robot.hiccups[0] / RATE_HZ
         took["agent"] += np.where(paused, rng.gamma(4.0, robot.hiccups[1] / 4.0, count), 0.0)
-    noise = robot.noise * np.array([1.0, _SPEED_NOISE]) * rng.standard_normal((count, 2)) if robot.noise else None
+    noise = robot.noise * np.array([1.0, SPEED_NOISE]) * rng.standard_normal((count, 2)) if robot.noise else None
     t_step, begin_agent, begin_actuator, sent = _one_after_another(count, took)
     acts = np.maximum.accumulate(sent + lags)
     measured, volts = np.zeros((count, 2)), np.zeros(count)
