@@ -5,6 +5,7 @@ import gc
 import os
 import re
 import signal
+import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -37,6 +38,11 @@ os.environ["XLA_FLAGS"] = " ".join(
 # Programs compiled by an earlier run are read from disk, those of subprocesses too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+# Where Python may leave no bytecode beside its sources, it goes there, too: without any, each of hundreds of processes
+# spends 2 s on reading JAX's sources again.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(REPOSITORY / ".cache" / "bytecode")
+    sys.dont_write_bytecode = False
 
 # A machine with two busy cores misses hypothesis's deadlines without anything being wrong.
 settings.register_profile("sim2real", deadline=None)
