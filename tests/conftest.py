@@ -5,6 +5,7 @@ import gc
 import os
 import re
 import signal
+import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -25,18 +26,24 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Compiling takes most of the suite's time: without XLA's own effort an identification with a tiny budget takes 18 s of
 # processor time instead of 27. Last bits differ then, on which no test may hang anyway. Two workers share two cores:
 # one program does not take both.
+OF_JAXLIB_0_10 = ("--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1")
 os.environ["XLA_FLAGS"] = " ".join(
     [
         *os.environ.get("XLA_FLAGS", "").split(),
         "--xla_backend_optimization_level=0",
         # jaxlib 0.11.2 and later end the process at a flag that they do not know any more.
-        *(["--xla_cpu_use_fusion_emitters=false"] if metadata.version("jaxlib").startswith("0.10.") else []),
+        *(OF_JAXLIB_0_10 if metadata.version("jaxlib").startswith("0.10.") else []),
         *(["--xla_cpu_multi_thread_eigen=false"] if "PYTEST_XDIST_WORKER" in os.environ else []),
     ]
 )
 # Programs compiled by an earlier run are read from disk, those of subprocesses too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+# Where Python may leave no bytecode beside its sources, it goes there, too: without any, each of hundreds of processes
+# spends 2 s on reading JAX's sources again.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(REPOSITORY / ".cache" / "bytecode")
+    sys.dont_write_bytecode = False
 
 # A machine with two busy cores misses hypothesis's deadlines without anything being wrong.
 settings.register_profile("sim2real", deadline=None)
@@ -58,7 +65,8 @@ def room(path):
 class RoomScheduling(LoadScopeScheduling):
     """Give each room to one worker, which so builds its fixtures and compiles its programs once.
 
-    All tests in real time go to the same one: two at a time would keep each other from their deadlines.
+    All tests in real time go to the same one: two at a time would keep each other from their deadlines. The others step
+    back for it.
     """
 
     def _split_scope(self, nodeid):
@@ -74,6 +82,11 @@ def pytest_collection_modifyitems(items):
     if "PYTEST_XDIST_WORKER" in os.environ:
         rank = {name: i for i, name in enumerate(LONGEST)}
         items.sort(key=lambda item: rank.get(room(item.nodeid.split("::")[0]), len(rank)))
+
+
+def pytest_runtest_setup(item):
+    if "PYTEST_XDIST_WORKER" in os.environ and room(item.nodeid.split("::")[0]) != "real time":
+        os.setpriority(os.PRIO_PROCESS, 0, 10)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import multiprocessing
 import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -29,7 +31,8 @@ import numpy as np
 
 from benches.figures import row
 from sim2real import cli
-from sim2real.errors import HARDWARE_LOST, SAFETY_STOP, Sim2RealError
+from sim2real.errors import ERROR, HARDWARE_LOST, SAFETY_STOP, Sim2RealError
+from sim2real.hardware import emulator
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind, Truth, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
@@ -117,26 +120,40 @@ def swinging_bundle(folder: Path) -> Path:
     return save_bundle(folder, {**weights, "layers.0.kernel": kernel, "layers.0.bias": bias}, contract)
 
 
+@functools.cache
+def _server() -> Any:
+    """Return what processes are forked from: it has imported what takes as long as a run, and computed nothing."""
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["sim2real.stages.deploy", "sim2real.hardware.dynamixel.emulation", "mujoco"])
+    return server
+
+
 @contextlib.contextmanager
 def emulated(config: Any, plant: str, truth: Path) -> Iterator[tuple[str, int]]:
     """Run an emulator that outlives the host; return its port and its process id."""
     kind = f"{type(config).__module__}:{type(config).__qualname__}"
-    command = [sys.executable, "-P", "-m", "sim2real.hardware.emulator", "--plant", plant, "--truth", str(truth)]
-    command += ["--emulation", kind]
-    command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(config).items() if v is not None]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdout is not None
+    flags = ["--plant", plant, "--truth", str(truth), "--emulation", kind]
+    flags += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(config).items() if v is not None]
+    ready, said = _server().Pipe(duplex=False)
+    process = _server().Process(target=_emulate, args=(flags, said))
+    process.start()
+    said.close()
     try:
-        yield json.loads(process.stdout.readline())["port"], process.pid
+        with os.fdopen(os.dup(ready.fileno())) as lines:
+            yield json.loads(lines.readline())["port"], process.pid
     finally:
         process.terminate()
-        process.communicate(timeout=_END_S)
+        process.join(timeout=_END_S)
+
+
+def _emulate(flags: list[str], said: Connection) -> None:
+    os.setsid()
+    os.dup2(said.fileno(), 1)
+    sys.exit(emulator.main(flags))
 
 
 def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float, *more: str) -> BaseProcess:
     """Start a deployment in a process of its own; SIGUSR1 makes its sensor's readings NaN from then on.
-
-    It is forked from a process that has imported everything and computed nothing: an import takes as long as a run.
 
     Args:
         port: The emulator's.
@@ -146,10 +163,9 @@ def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float,
         watchdog_s: The gate's longest silence [s].
         *more: Further flags.
     """
-    server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["sim2real.stages.deploy", "sim2real.stages.gap", "sim2real.view.page"])
     flags = ["--port", port, "--bundle", str(bundle), "--runs", str(runs), "--duration-s", "8", "--episodes", "1"]
-    process = server.Process(target=_deploy, args=([*flags, f"--gate.servo-watchdog-s={watchdog_s}", *more], said))
+    flags += ["--no-measure-delay", f"--gate.servo-watchdog-s={watchdog_s}", *more]
+    process = _server().Process(target=_deploy, args=(flags, said))
     process.start()
     return process
 
@@ -185,14 +201,14 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     robot = load_pipeline("pendulum").load()
     config = replace(robot.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
     truth, said = folder / "truth.bin", folder / "said.txt"
-    with emulated(config, robot.embedded.plant, truth) as (port, emulator):
+    with emulated(config, robot.embedded.plant, truth) as (port, emulator_pid):
         child = deployed(port, bundle, folder / "runs", said, watchdog_s)
         try:
             wait_until_moving(truth, said, child)
             time.sleep(draw.uniform(*_SWINGS_S))
             number = {KILLED: signal.SIGKILL, STOPPED: signal.SIGSTOP, NAN: signal.SIGUSR1}.get(fault.name)
             began_ns = time.monotonic_ns()
-            os.kill(emulator if number is None else child.pid, number or signal.SIGUSR1)
+            os.kill(emulator_pid if number is None else child.pid, number or signal.SIGUSR1)
             if fault.name == STOPPED:
                 time.sleep(0.5)
                 os.kill(child.pid, signal.SIGCONT)
@@ -225,6 +241,30 @@ def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) 
         with contextlib.suppress(NotBegun):
             return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
     return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+
+
+def outcomes(names: Sequence[str], seeds: Sequence[int], watchdog_s: float, jobs: int, root: Path) -> Iterator[Outcome]:
+    """Let each fault happen in some runs, several at a time, each on an emulated robot of its own.
+
+    Args:
+        names: The faults.
+        seeds: One for each run of each fault.
+        watchdog_s: The gate's longest silence [s].
+        jobs: Runs at a time.
+        root: Folder of the runs.
+
+    Yields:
+        What came of each, in order; of a run that failed, that nothing was safe, with what it said.
+    """
+    bundle = swinging_bundle(root / "bundle")
+    runs = [(FAULTS[name], seed) for name in names for seed in seeds]
+    with ProcessPoolExecutor(jobs, mp_context=_server()) as pool:
+        begun_runs = [pool.submit(begun, fault, seed, bundle, root, watchdog_s) for fault, seed in runs]
+        for (fault, seed), one in zip(runs, begun_runs, strict=True):
+            try:
+                yield one.result()
+            except ValueError as error:  # as all of ours are
+                yield Outcome(fault.name, seed, float("inf"), ERROR, str(error)[-300:], False, False)
 
 
 def _new(folder: Path) -> Path:
@@ -292,25 +332,24 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--servo-watchdog-s", type=float, default=0.1, help="the gate's limit; more where others compute"
     )
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; each takes most of a core as it begins")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Let each fault happen in some runs."""
-    rows, outcomes = [], []
+    rows, found = [], {name: [] for name in options.faults}
+    seeds = range(options.first_seed, options.first_seed + options.runs)
     with tempfile.TemporaryDirectory(prefix="sim2real-faults-") as name:
-        bundle = swinging_bundle(Path(name) / "bundle")
-        for kind in options.faults:
-            found = []
-            for seed in range(options.first_seed, options.first_seed + options.runs):
-                found.append(begun(FAULTS[kind], seed, bundle, Path(name), options.servo_watchdog_s))
-                print(f"{kind} {seed}: {found[-1].safe_s:.3f} s, exit {found[-1].code}", file=sys.stderr)
-            outcomes += found
-            safe = np.array([o.safe_s for o in found])
-            what, of = f"faults/{kind}", f"of {len(found)}"
-            rows.append(row(f"{what}/safe", int((safe < SAFE_S).sum()), of, goal="all within 0.2 s"))
-            spread = [round(float(s), 3) for s in np.sort(safe)[[len(safe) // 2, -1]]]
-            rows.append(row(f"{what}/safe_s", spread, "s", "p50, max", "< 0.2"))
-            rows.append(row(f"{what}/log_readable", sum(o.readable for o in found), of, goal="all"))
-            rows.append(row(f"{what}/code_and_reason", sum(o.right for o in found), of, goal="all"))
-    wrong = [asdict(o) for o in outcomes if not (o.safe_s < SAFE_S and o.readable and o.right)]
+        for one in outcomes(options.faults, seeds, options.servo_watchdog_s, options.jobs, Path(name)):
+            found[one.fault].append(one)
+            print(f"{one.fault} {one.seed}: {one.safe_s:.3f} s, exit {one.code}", file=sys.stderr)
+    for kind, runs in found.items():
+        safe = np.array([o.safe_s for o in runs])
+        what, of = f"faults/{kind}", f"of {len(runs)}"
+        rows.append(row(f"{what}/safe", int((safe < SAFE_S).sum()), of, goal="all within 0.2 s"))
+        spread = [round(float(s), 3) for s in np.sort(safe)[[len(safe) // 2, -1]]]
+        rows.append(row(f"{what}/safe_s", spread, "s", "p50, max", "< 0.2"))
+        rows.append(row(f"{what}/log_readable", sum(o.readable for o in runs), of, goal="all"))
+        rows.append(row(f"{what}/code_and_reason", sum(o.right for o in runs), of, goal="all"))
+    wrong = [asdict(o) for runs in found.values() for o in runs if not (o.safe_s < SAFE_S and o.readable and o.right)]
     return {"rows": rows, "wrong": wrong}

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from sim2real.artifacts.recording import Recording
 from sim2real.log import read_log
-from sim2real.stages import identify
+from sim2real.stages.identify import identify
 from sim2real.stages.pipeline import load_pipeline
 
 DATASETS = Path(__file__).parents[2] / "datasets"
@@ -32,17 +33,16 @@ def test_the_log_is_complete(name):
 
 
 @pytest.mark.parametrize("name", MANIFEST)
-def test_identification_finds_the_true_parameters(name, tmp_path):
+def test_identification_finds_the_true_parameters(name):
     entry = MANIFEST[name]
     pipeline = load_pipeline(entry["pipeline"])
-    log = str(DATASETS / entry["pipeline"] / name)
-    config = replace(pipeline.identify, log=(log,), seed=1, folds=0, free_run_s=0.0)  # estimates are what is looked at
-    stage = identify.run(pipeline, config, tmp_path, None)
-    rows = {p["name"]: p for p in json.loads(stage.output("parameters").read_text())["parameters"]}
+    recording = Recording.load(DATASETS / entry["pipeline"] / name)
+    config = replace(pipeline.identify, seed=1, folds=0, free_run_s=0.0)  # estimates are what is looked at
+    rows = {p.name: p for p in identify(recording, pipeline, config).parameters}
     for parameter, truth in entry["truth"].items():
-        error = rows[parameter]["estimate"] - truth
+        error = rows[parameter].estimate - truth
         scale = 1.0 if parameter == "round_trip_delay" else truth
-        assert abs(error / scale) < entry["tolerance"][parameter], (parameter, rows[parameter]["estimate"], truth)
-        assert rows[parameter]["verdict"] == "accepted"
+        assert abs(error / scale) < entry["tolerance"][parameter], (parameter, rows[parameter].estimate, truth)
+        assert rows[parameter].verdict == "accepted"
     # Only the sum of the two delays can be told from a log, and the report has to say so.
-    assert rows["sensor_delay"]["verdict"] == rows["actuator_delay"]["verdict"] == "not identifiable"
+    assert rows["sensor_delay"].verdict == rows["actuator_delay"].verdict == "not identifiable"
