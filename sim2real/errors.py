@@ -45,6 +45,10 @@ class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the 
     exit_code = SAFETY_STOP
 
 
+class DelayChanged(SafetyStop):
+    """The robot's delay is not what its policy was trained with, and nothing was moved by it (exit code 3)."""
+
+
 class HardwareLost(Sim2RealError):  # noqa: N818
     """A port or a device does not answer (exit code 4)."""
 

@@ -212,6 +212,26 @@ def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
     return lambda angle, speed: float(next(rows))
 
 
+def probed(volts: float = 1.5, steps: int = 8) -> Controller:
+    """Return what a deployment does first, to measure the delay: small steps to both sides, each from rest.
+
+    Args:
+        volts: Size of a step [V].
+        steps: How many.
+    """
+    made, left, still = 0, 0, 0
+
+    def act(angle: float, speed: float) -> float:
+        nonlocal made, left, still
+        del angle
+        left, still = max(left - 1, 0), 0 if left or abs(speed) > 0.05 else still + 1
+        if still >= 5 and made < steps:
+            made, left, still = made + 1, 8, 0
+        return volts * (-1) ** made if left else 0.0
+
+    return act
+
+
 def write(path: Path, session: Played) -> None:
     """Write a session's log."""
     nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}

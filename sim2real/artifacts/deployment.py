@@ -17,6 +17,8 @@ from sim2real.errors import Sim2RealError
 
 FORMAT = 2
 RESULT, SIMULATION = "result.json", "simulation.npz"
+PROBE = "probe.mcap"
+"""Log of the small steps by which the delay was measured."""
 _AGAIN = "run `sim2real deploy` again"
 _RUN = "{run}"
 """Stands in the file for the run's folder, which may move, in the command to type next."""
@@ -94,6 +96,7 @@ class Deployment:
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; times of its own as
             ``t_FIELD``. Empty where nothing was simulated.
         recordings: The robot's sessions.
+        probe: The small steps by which the delay was measured; None where it was not.
         trained: Times on the robot beside those that the policy was trained with.
         replay: The recorded commands, played to the identified and to the nominal model.
         drift: Which parameters are no longer what was identified; None where that was not tested.
@@ -107,6 +110,7 @@ class Deployment:
     units: Mapping[str, str] = field(default_factory=dict)
     simulated: tuple[Mapping[str, np.ndarray], ...] = ()
     recordings: tuple[Recording, ...] = ()
+    probe: Recording | None = None
     trained: tuple[Gap, ...] = ()
     replay: tuple[Replay, ...] = ()
     drift: Drift | None = None
@@ -124,7 +128,7 @@ class Deployment:
         Returns:
             Output -> name of the file in the folder.
         """
-        arrays, advice = ("simulated", "recordings"), self.advice
+        arrays, advice = ("simulated", "recordings", "probe"), self.advice
         if advice is not None:
             advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
@@ -134,6 +138,11 @@ class Deployment:
         columns = {f"{n}_{i}": v for i, own in enumerate(self.simulated) for n, v in own.items()}
         write_arrays(folder / SIMULATION, columns)
         return {"result": RESULT, "simulation": SIMULATION}
+
+    @property
+    def logs(self) -> tuple[Recording, ...]:
+        """What says how the robot is now: its sessions, and the small steps before them."""
+        return self.recordings if self.probe is None else (*self.recordings, self.probe)
 
     @staticmethod
     def read(folder: Path) -> Deployment:
@@ -167,7 +176,9 @@ class Deployment:
         # An embedded robot that runs on from one episode to the next writes a single file of true states.
         truths = [p if (p := folder / f"truth_{i}.bin").is_file() else folder / TRUTH for i in numbers]
         recordings = tuple(Recording.load(log_of(folder, i), truths[i]) for i in numbers)
-        return replace(found, simulated=tuple(_of_episode(arrays, i) for i in numbers), recordings=recordings)
+        probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
+        simulated = tuple(_of_episode(arrays, i) for i in numbers)
+        return replace(found, simulated=simulated, recordings=recordings, probe=probe)
 
 
 def log_of(folder: Path, number: int) -> Path:

@@ -19,18 +19,18 @@ class Iteration:
         stages: Folder of each stage that ran, in order, relative to the run.
         real: Success on the robot, a mean over episodes; None where the task knows none.
         simulation: The same in simulation.
-        verdict: What the deployment said.
+        verdict: What the deployment said, or that it was refused asks for.
         why: The first reason.
         then: What followed, in words.
     """
 
     number: int
     stages: tuple[str, ...]
-    real: float | None
-    simulation: float | None
-    verdict: str
-    why: str
-    then: str
+    real: float | None = None
+    simulation: float | None = None
+    verdict: str = "not judged"
+    why: str = ""
+    then: str = ""
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError
+from sim2real.hardware.device import Reading
 from sim2real.hardware.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
@@ -64,24 +65,52 @@ class Probe:
     steps: int = 8
 
 
-def measure_delay(rig: Rig, probe: Probe) -> StepAnswers:
+@dataclass
+class Witness:
+    """Who makes the steps, and keeps what was measured and sent: that is a recording, too.
+
+    Attributes:
+        rig: The robot.
+        measured: When each measurement was asked for, when it was there, CLOCK_MONOTONIC [ns], and what it was.
+        sent: When each command was on its way, when it had left [ns], and what the gate let through ``(n,)``.
+    """
+
+    rig: Rig
+    measured: list[tuple[int, int, Reading]] = field(default_factory=list)
+    sent: list[tuple[int, int, np.ndarray]] = field(default_factory=list)
+
+    def measure(self) -> Reading:
+        """Measure all joints; see `Rig.measure`."""
+        reading = self.rig.measure()
+        self.measured.append((reading.transaction.t_sent_ns, time.monotonic_ns(), reading))
+        return reading
+
+    def command(self, command: np.ndarray) -> None:
+        """Send a command through the gate; see `Rig.command`."""
+        begin_ns = time.monotonic_ns()
+        allowed = self.rig.command(command, 0.0, 1e-9 * begin_ns)
+        self.sent.append((begin_ns, time.monotonic_ns(), allowed))
+
+
+def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
     """Step one joint to and fro, through the gate, and see when it answers; torque is off before and afterwards.
 
     Args:
-        rig: The robot, at rest.
+        witness: Has the robot, at rest; what it kept of earlier steps goes.
         probe: The steps.
 
     Raises:
         Sim2RealError: The joint does not answer.
         SafetyStop: This machine is too busy to measure, or what the gate stopped.
     """
-    rig.start()
+    witness.measured, witness.sent = [], []
+    witness.rig.start()
     try:
-        answers = _answers(rig, probe)
+        answers = _answers(witness, probe)
     except BaseException:
-        rig.stop_quietly()  # the reason must not be lost to what else fails
+        witness.rig.stop_quietly()  # the reason must not be lost to what else fails
         raise
-    rig.stop()
+    witness.rig.stop()
     found = delays_of(answers)
     return StepAnswers(found.delays_s - probe.lag_s)
 
@@ -112,11 +141,11 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     return StepAnswers(np.array([min(grid, key=lambda d: _misfit(a, d, curve)) for a in answers]))
 
 
-def _answers(rig: Rig, probe: Probe) -> list[np.ndarray]:
+def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
     """Return the answers to some steps; those during which this machine was busy are made again."""
     answers: list[np.ndarray] = []
-    for before, goal in itertools.islice(itertools.cycle(_steps(rig, probe)), _TRIES * probe.steps):
-        found = _answer(rig, probe.joint, before, goal)
+    for before, goal in itertools.islice(itertools.cycle(_steps(witness.rig, probe)), _TRIES * probe.steps):
+        found = _answer(witness, probe.joint, before, goal)
         answers += [] if found is None else [found]
         if len(answers) == probe.steps:
             return answers
@@ -140,31 +169,31 @@ def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(rest, away), (away, rest)]
 
 
-def _answer(rig: Rig, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+def _answer(witness: Witness, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
     """Return the answer to a step: times since the command [s], and motion in its direction [rad]; None: too few."""
-    _settle(rig, before)
-    begin, rows = rig.measure().position_rad[joint], []
+    _settle(witness, before)
+    begin, rows = witness.measure().position_rad[joint], []
     left_s = time.monotonic()
-    rig.command(goal, 0.0, left_s)
+    witness.command(goal)
     sent_s = time.monotonic() - left_s
     while (now := time.monotonic()) < left_s + _WATCHED_S:
-        reading = rig.measure()
+        reading = witness.measure()
         rows.append((1e-9 * reading.transaction.t_sent_ns - left_s, reading.position_rad[joint] - begin))
         if len(rows) % _AGAIN == 0:
-            rig.command(goal, 0.0, time.monotonic())
+            witness.command(goal)
         time.sleep(max(0.0, now + _PERIOD_S - time.monotonic()))
-    if rig.gate.config.stale == "zero":
-        rig.command(before, 0.0, time.monotonic())
+    if witness.rig.gate.config.stale == "zero":
+        witness.command(before)
     longest_s = max(sent_s, *np.diff([0.0, *(t_s for t_s, _ in rows)]))
     return np.array(rows) * [1.0, np.sign(goal[joint] - before[joint])] if longest_s < _BUSY_S else None
 
 
-def _settle(rig: Rig, command: np.ndarray) -> None:
+def _settle(witness: Witness, command: np.ndarray) -> None:
     begin = still = time.monotonic()
     while (now := time.monotonic()) - still < _STILL_S and now - begin < _REST_S:
-        if np.max(np.abs(rig.measure().velocity_rad_s)) > _STILL_RAD_S:
+        if np.max(np.abs(witness.measure().velocity_rad_s)) > _STILL_RAD_S:
             still = time.monotonic()
-        rig.command(command, 0.0, time.monotonic())
+        witness.command(command)
         time.sleep(0.01)
 
 

@@ -11,11 +11,10 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.run_folder import StageFolder
-from sim2real.errors import SafetyStop, Sim2RealError
-from sim2real.hardware.rig import Rig
+from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
 from sim2real.robots.base import Robot
-from sim2real.robots.probe import StepAnswers, measure_delay
+from sim2real.robots.probe import StepAnswers, Witness, measure_delay
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note
 
@@ -77,12 +76,12 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
             )
 
 
-def check_delay(robot: Robot, rig: Rig, contract: PolicyContract, config: DeployConfig) -> dict[str, Any]:
+def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, Any]:
     """Measure the robot's delay with small steps, and stop where the policy was not trained with it.
 
     Args:
         robot: The robot, whose steps they are.
-        rig: The robot, open and at rest, without torque; so it is left.
+        witness: Has the robot, open and at rest, without torque, and leaves it so; keeps what is measured and sent.
         contract: What the policy was trained with.
         config: What is tolerated.
 
@@ -90,7 +89,7 @@ def check_delay(robot: Robot, rig: Rig, contract: PolicyContract, config: Deploy
         Lines for the summary.
 
     Raises:
-        SafetyStop: The delay, or by how much it varies, lies outside of what the policy was trained with.
+        DelayChanged: The delay, or by how much it varies, lies outside of what the policy was trained with.
         Sim2RealError: The robot does not answer.
     """
     if not config.measure_delay or config.dry_run or robot.probe is None:
@@ -98,15 +97,15 @@ def check_delay(robot: Robot, rig: Rig, contract: PolicyContract, config: Deploy
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
         note("warning: the policy does not say with which delays it was trained, so the robot's is not measured")
         return {}
-    found = measure_delay(rig, robot.probe)
+    found = measure_delay(witness, robot.probe)
     if misfit(found, trained, config.delay_tolerance_s):  # a busy machine delays one step or another: look once more
-        rig.wait_until_still(config.settle_s)
-        found = StepAnswers(np.append(found.delays_s, measure_delay(rig, robot.probe).delays_s))
+        witness.rig.wait_until_still(config.settle_s)
+        found = StepAnswers(np.append(found.delays_s, measure_delay(witness, robot.probe).delays_s))
     said = f"{1e3 * found.delay_s:.0f} ms, the middle half within {1e3 * found.jitter_s:.0f} ms"
     if reason := misfit(found, trained, config.delay_tolerance_s):
         what = f"the delay is {said}: {reason}"
         if not config.force:
-            raise SafetyStop(
+            raise DelayChanged(
                 what,
                 hint="record, identify and train again, or see where the delay is: sim2real latency; to deploy all "
                 "the same: --force",

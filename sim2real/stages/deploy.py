@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import Deployment, Scores, log_of
+from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, finished, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.policy.blended import BlendedRunner
 from sim2real.robots.base import Robot, Session
+from sim2real.robots.probe import Witness
 from sim2real.stages.admission import check_delay, require_fit, require_untouched
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.parameters import check_parameters, open_identification
 from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.probed import write_probe
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
@@ -58,7 +61,7 @@ def deploy(
     with opened(robot, config, folder / TRUTH) as session:
         if config.hold and session.rig.gate.config.stale != "hold":
             raise UsageError("this robot's motors hold no position", hint="leave out --hold")
-        delay = _measured_delay(robot, session, bundle, config)
+        delay = _measured_delay(pipeline, robot, session, bundle, config, folder)
         sessions = [_episode(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]
     recordings = [Recording.load(log, folder / TRUTH) for log in logs]
     if config.dry_run:  # nothing was moved: there is nothing to judge or to compare
@@ -73,6 +76,8 @@ def deploy(
     world, values = (None, None) if identification is None else (identification.world, identification.values)
     trained = Policy.from_weights(bundle.weights, bundle.spec)
     gap = compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s)
+    probe = folder / PROBE
+    gap = replace(gap, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
     return judged(gap, pipeline, bundle, identification, folder), sessions
 
 
@@ -103,6 +108,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
             note("dry run: there is no gap report, for nothing was moved that a simulation could be compared with")
         for name, file in found.save(stage.folder).items():
             stage.output(name, file)
+        if found.probe is not None:
+            stage.output("probe", PROBE)
         for i, recording in enumerate(found.recordings):
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
@@ -122,13 +129,19 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
-def _measured_delay(robot: Robot, session: Session, bundle: Bundle, config: DeployConfig) -> dict[str, Any]:
-    """Return what was found of the delay, for the summary; the robot is brought to rest before."""
+def _measured_delay(
+    pipeline: Pipeline, robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
+) -> dict[str, Any]:
+    """Return what was found of the delay, for the summary; the robot is brought to rest before, its answers logged."""
     if config.dry_run or not config.measure_delay or robot.probe is None:
         return {}
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
     robot.prepare(session, config.settle_s)
-    return check_delay(robot, session.rig, bundle.contract, config)
+    witness = Witness(session.rig)
+    try:
+        return check_delay(robot, witness, bundle.contract, config)
+    finally:
+        write_probe(folder, pipeline, robot, witness)
 
 
 def _summary(found: Deployment, sessions: list[dict[str, Any]]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def judged(
         return replace(deployed, advice=commands(Advice("not judged", (why,)), pipeline, None, folder, deployed))
     try:
         with progress(None, "test the model on the deployment"):
-            rows, drifted = patiently(lambda: tested(pipeline, found, [r.episode for r in deployed.recordings]))
+            rows, drifted = patiently(lambda: tested(pipeline, found, [r.episode for r in deployed.logs]))
     except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:  # what the robot did must not be lost
         told, why = _of_policy(deployed, bundle), str(error.args[0])
         advice = Advice("not judged", (why,)) if told is None else replace(told, reasons=(*told.reasons, why))

@@ -40,7 +40,7 @@ def commands(
     train = shlex.join(["sim2real", "train", *pipeline.words, *run])
     if found is None:
         return replace(told, next=shlex.join(["sim2real", "identify", *pipeline.words, *run]))
-    logs = logs_to_identify([r.path for r in deployed.recordings], deployed.drift, found, folder)
+    logs = logs_to_identify([r.path for r in deployed.logs], deployed.drift, found, folder)
     if told.status == "not judged" or not logs:
         return replace(told, next=shlex.join(["sim2real", "record", *pipeline.words]))
     again = advice.command(pipeline, replace(pipeline.identify, log=logs), Path("runs"), home)

@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sim2real.artifacts.run_folder import STAGES, StageFolder, finished
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.stages import console, targets
 
 if TYPE_CHECKING:
     from sim2real.artifacts.deployment import Deployment
+    from sim2real.artifacts.iterations import Iteration
     from sim2real.stages.flags import RunFlags
     from sim2real.stages.pipeline import Pipeline
 
 Call = Callable[[str, Any, Path | None], StageFolder]
 """Runs a stage: its name, its configuration, the run folder; returns what it left."""
+ALL = ", ".join(STAGES)
+"""What is done again where nothing that was recorded is true any more."""
 
 
 @dataclass(frozen=True)
@@ -53,43 +56,64 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
             continue
         redo = True  # what comes after a stage that ran again is out of date
         console.note(f"{stage} ({number}/{len(STAGES)})")
-        ran.append(call(stage, getattr(flags, stage), run_dir))
+        try:
+            ran.append(call(stage, getattr(flags, stage), run_dir))
+        except DelayChanged as error:
+            if flags.iterations == 1 or run_dir is None:
+                raise
+            _go_around(pipeline, flags, call, run_dir, ran, error)
+            return
         run_dir = ran[-1].run_dir
     if flags.iterations > 1 and run_dir is not None:
         _go_around(pipeline, flags, call, run_dir, ran)
 
 
-def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path, ran: list[StageFolder]) -> None:
-    """Do again what each verdict asks for, until nothing is left to do; say after each what it did."""
+def _go_around(
+    pipeline: Pipeline,
+    flags: RunFlags,
+    call: Call,
+    run_dir: Path,
+    ran: list[StageFolder],
+    refused: DelayChanged | None = None,
+) -> None:
+    """Do again what each verdict asks for, until nothing is left to do; say after each what it did.
+
+    Args:
+        pipeline: The robot.
+        flags: Of the run.
+        call: Runs a stage.
+        run_dir: Its folder.
+        ran: What the first iteration ran.
+        refused: Why its deployment was refused before the policy moved anything; None: it was not.
+
+    Raises:
+        DelayChanged: In the last iteration, too.
+    """
     from sim2real.artifacts.iterations import Iteration, Iterations
 
     rows = Iterations.load(run_dir).rows
     for left in reversed(range(flags.iterations)):
-        deployed = finished(run_dir, "deploy")
-        if deployed is None:
-            raise UsageError("there is no deployment to judge", hint="deploy --dry-run moves nothing: leave it out")
-        result = _result(deployed)
-        plan = next_plan(pipeline, flags, run_dir, deployed, result)
+        row = Iteration(len(rows) + 1, tuple(stage.folder.name for stage in ran))
+        if refused is None:
+            row, plan = _judged(row, pipeline, flags, run_dir)
+        else:  # nothing else of this robot is recorded yet
+            row = replace(row, verdict="re-identify", why=str(refused.args[0]))
+            plan = Plan(_anew(flags, run_dir), ALL)
         if plan.configs and not left:
             plan = Plan({}, f"the last iteration: it would {plan.words}")
-        success = next((g for g in result.gap if g.quantity == "success"), None)
-        advice = result.advice
-        row = Iteration(
-            number=len(rows) + 1,
-            stages=tuple(stage.folder.name for stage in ran),
-            real=success.real if success else None,
-            simulation=success.simulation if success else None,
-            verdict=advice.status if advice else "not judged",
-            why=advice.reasons[0] if advice and advice.reasons else "",
-            then=plan.words,
-        )
+        row = replace(row, then=plan.words)
         rows = (*rows, row)
         console.wrote(Iterations(rows).save(run_dir))
         console.note(f"iteration {row.number}: {row.verdict}; {plan.words}")
-        ran = []
+        if refused is not None and not left:
+            raise refused
+        ran, refused = [], None
         for stage, config in plan.configs.items():
             console.note(f"{stage} (iteration {row.number + 1})")
-            ran.append(call(stage, config, run_dir))
+            try:
+                ran.append(call(stage, config, run_dir))
+            except DelayChanged as error:
+                refused = error
         if not ran:
             break
     from sim2real.view.page import report  # matplotlib and jinja2 take 0.5 s to import
@@ -97,6 +121,38 @@ def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path, r
     cells = [[r.number, ", ".join(r.stages), r.real, r.simulation, r.verdict, r.then] for r in rows]
     print(console.table(cells, ["iteration", "ran", "success", "in simulation", "verdict", "then"]))
     console.wrote(report(run_dir))
+
+
+def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:
+    """Return an iteration's row with what its deployment found, and what that asks for.
+
+    Args:
+        row: Of the iteration.
+        pipeline: The robot.
+        flags: Of the run.
+        run_dir: Its folder.
+    """
+    deployed = finished(run_dir, "deploy")
+    if deployed is None:
+        raise UsageError("there is no deployment to judge", hint="deploy --dry-run moves nothing: leave it out")
+    result = _result(deployed)
+    if success := next((g for g in result.gap if g.quantity == "success"), None):
+        row = replace(row, real=success.real, simulation=success.simulation)
+    if advice := result.advice:
+        row = replace(row, verdict=advice.status, why=next(iter(advice.reasons), ""))
+    return row, next_plan(pipeline, flags, run_dir, deployed, result)
+
+
+def _anew(flags: RunFlags, run_dir: Path) -> dict[str, Any]:
+    """Return the configurations of all stages, for a robot of which nothing recorded is true any more."""
+    return {"record": flags.record, "identify": replace(flags.identify, log=()), **_trained_again(flags, run_dir)}
+
+
+def _trained_again(flags: RunFlags, run_dir: Path) -> dict[str, Any]:
+    """Return the configurations of training, with the next seed, and of deploying."""
+    before = finished(run_dir, "train")
+    seed = int(before.manifest["config"]["seed"]) if before is not None else flags.train.seed
+    return {"train": replace(flags.train, seed=seed + 1), "deploy": flags.deploy}
 
 
 def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: StageFolder, result: Deployment) -> Plan:
@@ -119,20 +175,17 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
         return Plan({}, "stop: " + (advice.reasons[0] if advice and advice.reasons else "nothing was judged"))
     if advice.status == "fine" and not flags.goal:
         return Plan({}, "stop: nothing is left to do")
-    before = finished(run_dir, "train")
-    seed = int(before.manifest["config"]["seed"]) if before is not None else flags.train.seed
-    train = {"train": replace(flags.train, seed=seed + 1), "deploy": flags.deploy}
+    train = _trained_again(flags, run_dir)
     if advice.status != "re-identify" and not needs_timing(advice):
         return Plan(train, "train with another seed, deploy")
     identified = finished(run_dir, "identify")
     if identified is None:
         raise Sim2RealError("this run has no identification", hint=f"sim2real identify {pipeline.name}")
-    own = [path for name, path in sorted(deployed.outputs.items()) if name.startswith("log_")]
+    own = [path for name, path in sorted(deployed.outputs.items()) if name.startswith("log_") or name == "probe"]
     found = Identification.load(identified.output("parameters"))
     logs = logs_to_identify(own, result.drift, found, deployed.folder)
     if not logs:
-        new = {"record": flags.record, "identify": replace(flags.identify, log=())}
-        return Plan({**new, **train}, "record, identify, train, deploy")
+        return Plan(_anew(flags, run_dir), ALL)
     words = f"identify from {len(logs)} logs, the deployment's among them, train, deploy"
     return Plan({"identify": replace(flags.identify, log=logs), **train}, words)
 

@@ -43,11 +43,27 @@ def deploy(name, bundle, root, *flags):
     return code, folder
 
 
+def assert_steps_are_a_log(folder):
+    """What was sent and measured while the delay was measured: 8 steps to both sides, at the robot's rate."""
+    log = read_log(folder / "probe.mcap")
+    volts = log.outputs["actuator"]["action"][:, 0]
+    up = np.flatnonzero((np.diff(np.abs(volts)) > 1.0))
+    assert up.size >= 8
+    assert np.sign(volts[up + 1])[:8].tolist() == [1.0, -1.0] * 4
+    t_s, moved = log.steps["sensor"].begun_s, np.unwrap(log.outputs["sensor"]["th"]) - np.pi
+    assert np.diff(t_s).min() >= 1 / 50
+    assert np.median(np.diff(t_s)) < 1.4 / 50
+    left_s = log.steps["actuator"].end[up + 1] * 1e-6
+    after = np.interp(left_s + 0.13, t_s, moved)
+    assert np.all(after * np.sign(volts[up + 1]) > 0.05), "each step is answered, in its direction"
+
+
 def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resting):
     code, folder = deploy("pendulum", resting, tmp_path)
     assert code == errors.OK
     said = manifest_of(folder)["summary"]["measured delay"]
     assert 37 <= float(said.partition(" ms")[0]) <= 53
+    assert_steps_are_a_log(folder)
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
@@ -60,6 +76,7 @@ def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsy
     assert "the policy was trained with 43 to 47 ms" in said
     assert "--force" in said
     assert not (folder / "episode_0.mcap").exists(), "the policy never ran"
+    assert_steps_are_a_log(folder)
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 

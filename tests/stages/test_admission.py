@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ import pytest
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.run_folder import StageFolder
-from sim2real.errors import SafetyStop, Sim2RealError
+from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy import PolicyContract, save_bundle
-from sim2real.robots.probe import StepAnswers
+from sim2real.robots.probe import StepAnswers, Witness
 from sim2real.stages import admission
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.pipeline import load_pipeline
@@ -120,14 +121,14 @@ def test_delay_and_jitter_must_be_those_of_the_training(delay_s, varies_s, said)
 
 @pytest.mark.parametrize("force", [False, True])
 def test_a_delay_that_was_not_trained_is_refused_or_with_force_told(arm, monkeypatch, capsys, force):
-    monkeypatch.setattr(admission, "measure_delay", lambda rig, probe: StepAnswers(np.full(8, 0.060)))
-    rig = type("Rig", (), {"wait_until_still": lambda self, timeout_s: None})()
+    monkeypatch.setattr(admission, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
+    witness = Witness(SimpleNamespace(wait_until_still=lambda timeout_s: None))
     pendulum = load_pipeline("pendulum").load()
     contract = contract_of(pendulum, trained_s={"round_trip_delay": TRAINED})
     if force:
-        found = admission.check_delay(pendulum, rig, contract, DeployConfig(force=True))
+        found = admission.check_delay(pendulum, witness, contract, DeployConfig(force=True))
         assert found["measured delay"].startswith("60 ms")
         assert "warning: the delay is 60 ms" in capsys.readouterr().err
     else:
-        with pytest.raises(SafetyStop, match=r"(?s)the delay is 60 ms.*hint: .*--force"):
-            admission.check_delay(pendulum, rig, contract, DeployConfig())
+        with pytest.raises(DelayChanged, match=r"(?s)the delay is 60 ms.*hint: .*--force"):
+            admission.check_delay(pendulum, witness, contract, DeployConfig())

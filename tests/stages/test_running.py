@@ -10,7 +10,7 @@ from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.iterations import Iterations
 from sim2real.artifacts.run_folder import STAGES, Source, open_stage
-from sim2real.errors import UsageError
+from sim2real.errors import DelayChanged, UsageError
 from sim2real.stages import running
 from sim2real.stages.flags import RunFlags
 from sim2real.stages.pipeline import load_pipeline
@@ -44,6 +44,8 @@ def world(tmp_path, monkeypatch):
             if stage == "deploy":
                 opened.output("log_0", "episode_0.mcap").touch()
                 found = seen.verdicts.pop(0)
+                if isinstance(found, DelayChanged):
+                    raise found
                 found.save(opened.folder)
                 opened.output("result", "result.json")
         return opened.result
@@ -100,6 +102,27 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
     assert again == stages
     (config,) = (c for s, c in world.calls[4:] if s == "identify")
     assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
+
+
+LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")
+
+
+def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
+    """Its policy was refused before it moved anything, so nothing is known of the robot as it is now."""
+    again, rows = world.go(LATER, verdict("fine", 1.0))
+    assert again == ["record", "identify", "train", "deploy"]
+    assert [(r.verdict, r.why, r.stages) for r in rows] == [
+        ("re-identify", "the delay is 60 ms", ("record", "identify", "train")),
+        ("fine", "why", ("record.2", "identify.2", "train.2", "deploy.2")),
+    ]
+    assert dict(world.calls[4:])["identify"].log == ()
+
+
+def test_the_loop_ends_as_a_deployment_does_that_is_refused_to_the_end(world):
+    with pytest.raises(DelayChanged):
+        world.go(LATER, iterations=1)
+    with pytest.raises(DelayChanged):
+        world.go(verdict("re-train"), LATER, iterations=2)
 
 
 @pytest.mark.parametrize("status", ["look at this joint", "not judged"])
