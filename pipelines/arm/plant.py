@@ -45,12 +45,16 @@ _MODEL = """
           <joint name="elbow" axis="0 -1 0" range="-1.9 1.9"/>
           <inertial pos="0 0 -0.07" mass="0.055" diaginertia="9e-5 9e-5 8e-6"/>
           <site name="tip" pos="0 0 -0.12"/>
+          {carried}
         </body>
       </body>
     </body>
   </worldbody>
 </mujoco>
 """
+
+
+_CARRIED = '<body name="carried" pos="0 0 -0.12"><inertial pos="0 0 0" mass="{}" diaginertia="1e-8 1e-8 1e-8"/></body>'
 
 
 class _Firmware:
@@ -102,6 +106,7 @@ class ArmPlant:
         armature: Factor on the rotors' reflected inertia.
         coulomb: Factors on dry friction: pan, shoulder, elbow.
         bump: Stribeck: by what share friction at standstill exceeds that at speed.
+        carried_kg: What it holds at its tip.
         step_s: MuJoCo's time step [s].
     """
 
@@ -114,13 +119,16 @@ class ArmPlant:
         armature: float = 1.25,
         coulomb: tuple[float, float, float] = (1.5, 1.9, 1.2),
         bump: float = 0.2,
+        carried_kg: float = 0.0,
         step_s: float = 0.0005,
     ) -> None:
         self._stall, self._back_emf, self._armature = stall * _STALL, back_emf * _BACK_EMF, armature * _ARMATURE
         self._coulomb = [factor * _COULOMB for factor in coulomb]
         self._bump = bump
         # As stiff as the solver bears: at the default impedance an arm that friction should hold crawls.
-        text = _MODEL.format(step_s=step_s, armature=self._armature, viscous=_VISCOUS, time_constant=4 * step_s)
+        carried = _CARRIED.format(carried_kg) if carried_kg else ""
+        sizes = {"armature": self._armature, "viscous": _VISCOUS, "carried": carried}
+        text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)
         self.model = MjModel.from_xml_string(text)
         self.data = MjData(self.model)
         self._servos = [_Firmware() for _ in self.servo_ids]

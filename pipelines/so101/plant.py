@@ -72,6 +72,7 @@ _MODEL = """
               <geom name="hand" pos="0.03 0 0" size="0.025"/>
               <geom name="finger" type="capsule" fromto="0.03 0 0 0.0981 0 0" size="0.008"/>
               <site name="tip" pos="0.0981 0 0"/>
+              {carried}
               <body name="jaw" pos="0.0234 0.0178 0.0211">
                 <joint name="gripper" axis="0 -1 0" range="-0.96 0.96"/>
                 <inertial pos="0.0224 -0.0202 0.0191" mass="0.012" fullinertia="3.9e-6 5.3e-6 4.6e-6 0 -2.4e-6 0"/>
@@ -86,6 +87,9 @@ _MODEL = """
 """
 
 
+_CARRIED = '<body name="carried" pos="0.0981 0 0"><inertial pos="0 0 0" mass="{}" diaginertia="1e-8 1e-8 1e-8"/></body>'
+
+
 class SO101Plant:
     """An SO-101 on a table: six STS3215 in position mode; any other mode is torque off.
 
@@ -95,13 +99,26 @@ class SO101Plant:
     Args:
         start: Joint angles at the beginning [rad]; default: folded, as it was put away.
         step_s: MuJoCo's time step [s].
+        gain: Factor on the servos' gain.
+        friction: Factor on dry friction.
+        carried_kg: What it holds between its jaws.
     """
 
     servo_ids = (1, 2, 3, 4, 5, 6)
 
-    def __init__(self, start: tuple[float, ...] = (0.0, -1.74, 1.68, -1.4, 0.0, -0.8), step_s: float = 0.0005) -> None:
+    def __init__(
+        self,
+        start: tuple[float, ...] = (0.0, -1.74, 1.68, -1.4, 0.0, -0.8),
+        step_s: float = 0.0005,
+        gain: float = 1.0,
+        friction: float = 1.0,
+        carried_kg: float = 0.0,
+    ) -> None:
         # Friction as stiff as the solver bears: at the default impedance a joint that it should hold creeps.
-        text = _MODEL.format(step_s=step_s, armature=_ARMATURE, damping=_OFF_DAMPING, time_constant=4 * step_s)
+        carried = _CARRIED.format(carried_kg) if carried_kg else ""
+        sizes = {"armature": _ARMATURE, "damping": _OFF_DAMPING, "carried": carried}
+        text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)
+        self._gain, self._levels = gain * _GAIN, [friction * level for level in _FRICTION]
         self.model = MjModel.from_xml_string(text)
         self.data = MjData(self.model)
         self.data.qpos[:] = start
@@ -122,7 +139,7 @@ class SO101Plant:
             self._applied[:] = self._torques = [self._torque(i, angle) for i, angle in enumerate(angles)]
             self._friction[:] = [
                 level * math.exp(-abs(speed) / width)
-                for level, speed, width in zip(_FRICTION, speeds, _STRIBECK_RAD_S, strict=True)
+                for level, speed, width in zip(self._levels, speeds, _STRIBECK_RAD_S, strict=True)
             ]
             mj_step(model, data)
 
@@ -148,7 +165,7 @@ class SO101Plant:
     def measure(self, servo_id: int) -> tuple[float, float, float]:
         """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
         joint = self.servo_ids.index(servo_id)
-        load = self._torques[joint] / (_GAIN * _SATURATION_RAD[0])
+        load = self._torques[joint] / (self._gain * _SATURATION_RAD[0])
         return float(self._qpos[joint]) + self._zero_rad[joint], float(self._qvel[joint]), load
 
     def state(self) -> dict[str, float]:
@@ -161,10 +178,10 @@ class SO101Plant:
         """Return what a log can tell, named as the stages do; friction at standstill."""
         joints = [self.model.joint(i).name for i in range(self.model.njnt)]
         return {
-            "gain": _GAIN,
+            "gain": self._gain,
             "armature": _ARMATURE,
             **{f"damping_{j}": d for j, d in zip(joints, _DAMPING, strict=True)},
-            **{f"friction_{j}": f for j, f in zip(joints, _FRICTION, strict=True)},
+            **{f"friction_{j}": f for j, f in zip(joints, self._levels, strict=True)},
             **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},
         }
 
@@ -175,4 +192,4 @@ class SO101Plant:
             return 0.0
         share, most = self._p_gain[joint] / NOMINAL_P_GAIN, _SATURATION_RAD[joint]
         error = (round(goal / RAD_PER_COUNT) - round(angle / RAD_PER_COUNT)) * RAD_PER_COUNT + _BIAS_RAD[joint]
-        return _GAIN * min(max(share * error, -most), most)
+        return self._gain * min(max(share * error, -most), most)

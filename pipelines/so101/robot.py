@@ -21,14 +21,16 @@ from sim2real.hardware.device import Device
 from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.registry import load_device
+from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.messages import JointReading
+from sim2real.robots.payload import Hand, with_payload
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
-from .parts import JOINTS, SHEET, Arm
+from .parts import JOINTS, SHEET, TIP_M, Arm
 from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
 LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
@@ -37,6 +39,9 @@ CALIBRATION = "SO101_CALIBRATION"
 """Environment variable that names the calibration of the arm on the port."""
 SATURATES = ("wrist_roll", "gripper")
 """Joints whose servos may push no harder from a smaller error on than the data sheet says."""
+
+HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5)
+"""Between the jaws."""
 
 
 class SO101Robot(ServoRobot):
@@ -59,6 +64,7 @@ class SO101Robot(ServoRobot):
         device="feetech",
     )
     probe = Probe(step=0.12, lag_s=-0.004)
+    causes = standard.causes(JOINTS)
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
         ("position", ("rad",) * 6, 5.0),
@@ -100,6 +106,10 @@ class SO101Robot(ServoRobot):
             return load_device(s.device)(port, s.ids, drive, baud_rate=s.baud_rate, silence_s=limits.servo_watchdog_s)
 
         return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
+
+    def watched(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model with what may change between deployments, a payload at the tip among it."""
+        return with_payload(self, HAND, max_delay_s)
 
     def make_task(self) -> Reach:
         """Return the task; where the target is, the graph's parameters say."""

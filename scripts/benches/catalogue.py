@@ -45,13 +45,19 @@ BENCHES = {
     ),
     "drift": Bench(
         "drift",
-        "whether a deployment's log tells that a hidden robot has changed, and what",
+        "whether a deployment's log tells that a hidden robot has changed, and what; what one iteration makes of it",
         (
             *_GRAPH,
             "sim2real/identify",
+            "sim2real/train",
             "sim2real/stages/judging.py",
+            "sim2real/stages/next_step.py",
             "sim2real/stages/replaying.py",
             "scripts/benches/hidden_robots.py",
+            "scripts/benches/drift_pendulum.py",
+            "scripts/benches/drift_arms.py",
+            "pipelines/arm",
+            "pipelines/so101",
         ),
     ),
     "faults": Bench(

@@ -8,7 +8,7 @@ robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -234,23 +234,43 @@ def probed(volts: float = 1.5, steps: int = 8) -> Controller:
 
 def write(path: Path, session: Played) -> None:
     """Write a session's log."""
+    readings = [{"th": np.float32(th), "thdot": np.float32(thdot)} for th, thdot in session.measured]
+    commands = [{"action": np.array([volts], np.float32)} for volts in session.volts]
+    units = {"th": "rad", "thdot": "rad/s", "action": "V"}
+    write_log(path, "pendulum", (session.starts, session.ends), readings, commands, units)
+
+
+def write_log(
+    path: Path,
+    pipeline: str,
+    times: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
+    readings: Sequence[Mapping[str, np.ndarray]],
+    commands: Sequence[Mapping[str, np.ndarray]],
+    units: Mapping[str, str],
+) -> None:
+    """Write the log of a loop of sensor, agent and actuator.
+
+    Args:
+        path: The log.
+        pipeline: Whose it is.
+        times: Node -> starts, and ends, of its steps ``(N,)`` [s].
+        readings: What the sensor sent in each step.
+        commands: What the agent sent, and the actuator let through.
+        units: Field -> unit.
+    """
     nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}
     graph = {
         n: {"rate_hz": RATE_HZ, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
         for n, s in nodes.items()
     }
-    zero, none = np.float32(0), np.zeros(1, np.float32)
-    outputs = {"sensor": {"th": zero, "thdot": zero}, "agent": {"action": none}, "actuator": {"action": none}}
-    units = {"th": "rad", "thdot": "rad/s", "action": "V"}
-    metadata = {"pipeline": "pendulum", "graph": graph, "units": units}
+    outputs = {n: readings[0] if n == "sensor" else commands[0] for n in nodes}
+    metadata = {"pipeline": pipeline, "graph": graph, "units": dict(units)}
     recorder = McapRecorder(path, metadata, {}, outputs, [(n, s) for n, s in nodes.items() if s], {})
     recorder.start(1_790_000_000_000_000_000, 0)
     ticks = lambda seconds: round(1e6 * seconds)  # noqa: E731
-    for k, (measured, volts) in enumerate(zip(session.measured, session.volts, strict=True)):
-        sensed = {"th": np.float32(measured[0]), "thdot": np.float32(measured[1])}
-        sent = {"action": np.array([volts], np.float32)}
+    for k, (sensed, sent) in enumerate(zip(readings, commands, strict=True)):
         for node, sender in nodes.items():
-            start, end = ticks(session.starts[node][k]), ticks(session.ends[node][k])
+            start, end = (ticks(of[node][k]) for of in times)
             recorder.step(StepRecord(node, k, start, start, start, -1, end, 0), sensed if node == "sensor" else sent)
             if sender:
                 recorder.message(MessageRecord(node, sender, k, k, start, start))

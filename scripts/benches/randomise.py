@@ -7,11 +7,9 @@ have play. A deployment succeeds that stays up: within 18 degrees of upright for
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from scipy.stats import binomtest
 from benches import hidden_robots as hidden
 from benches import hidden_wall
 from benches.figures import row
+from benches.jobs import each
 
 RECORD_S, UPRIGHT = 40.0, 0.8
 """Length of the recording [s]; share of the second half in which a deployment that succeeds is upright."""
@@ -65,13 +64,10 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     """Record, identify, train and deploy for each robot."""
     numbers = list(range(options.first, options.first + options.robots))
     begin = time.perf_counter()
-    if options.jobs == 1:
-        found = [one_robot(n, options) for n in numbers]
-    else:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
-            found = list(pool.map(one_robot, numbers, [options] * len(numbers)))
-    return {"rows": rows(found, options, time.perf_counter() - begin), "robots": found}
+    found, failed = each(one_robot, numbers, options)
+    lines = rows(found, options, time.perf_counter() - begin)
+    lines.append(row("randomise/failed", len(failed), f"of {len(numbers)}", "", "0"))
+    return {"rows": lines, "robots": found, "failed": failed}
 
 
 def rows(found: list[dict[str, Any]], options: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from scipy.special import stdtr, stdtrit
 
 from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP
-from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
@@ -96,7 +96,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
 
     Args:
         problem: The log, all of its segments fitted.
-        posterior: What was identified.
+        posterior: What was identified; other parameters of the problem are known to have had their nominal values.
         widening: Factor on the posterior's deviations that covers the errors of the model: a robot that is not of its
             form acts, from motion to motion, like one with other parameters, and a policy moves otherwise than an
             excitation.
@@ -106,13 +106,11 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
         The tests, and the point ``(P,)`` on the parameters' scales of the change that explains most.
 
     Raises:
-        UsageError: When the parameters are others than the posterior's.
+        UsageError: When parameters of the posterior are not tested.
         Sim2RealError: When the log says nothing about any of them.
     """
     table = problem.table
-    if table.names != posterior.names:
-        tested, known = ", ".join(table.names), ", ".join(posterior.names)
-        raise UsageError(f"the log is tested for {tested}, identified were {known}")
+    posterior = _with_known(posterior, table)
     tried = [_alone(problem, posterior, widening, way) for way in ways(table, causes)]
     found = [one for one in tried if one is not None]
     if not found:
@@ -122,6 +120,18 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     found = _ordered(found, now, table)
     seconds = problem.segment_s * len(problem.train)
     return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
+
+
+def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
+    """Return the posterior of all parameters of a table: those that were not identified are sure to be nominal."""
+    if lacking := [name for name in posterior.names if name not in table.names]:
+        raise UsageError(f"the log is tested for {', '.join(table.names)}, identified were {', '.join(lacking)}, too")
+    at = [table.names.index(name) for name in posterior.names]
+    mean = np.array([c.parameter.to_scale(c.parameter.nominal) for c in table.columns])
+    covariance = np.zeros((len(mean), len(mean)))
+    mean[at], covariance[np.ix_(at, at)] = posterior.mean, posterior.covariance
+    transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in table.columns)
+    return Posterior(table.names, transform, mean, covariance, table.low, table.high)
 
 
 def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Fitted | None:
@@ -204,10 +214,10 @@ def _ordered(found: Sequence[Fitted], loss: float, table: ParameterTable) -> lis
         loss: Of the log, without any change.
         table: The parameters.
     """
-    friction = {c.label for c in table.columns if c.parameter.vanishes}
+    friction = np.array([c.parameter.vanishes for c in table.columns])
     ordered = sorted(found, key=lambda one: one.loss)
     alike = [one for one in ordered if one.loss - ordered[0].loss <= _ALIKE * loss]
-    first = next((one for one in alike if one.way.name in friction), ordered[0])
+    first = next((one for one in alike if not np.any(one.way.along[~friction])), ordered[0])
     return [first, *(one for one in ordered if one is not first)]
 
 

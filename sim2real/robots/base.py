@@ -97,6 +97,14 @@ class RecordedRobot(ABC):
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
 
+    def watched(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model with all that may change between deployments; default: what is identified.
+
+        Parameters beyond those, such as what a hand holds, count as known when the robot was identified: their nominal
+        values are what they were then.
+        """
+        return self.identifiable(max_delay_s)
+
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
         """Return the robot's model with identified values, as MJCF; None: it has none."""
         del values

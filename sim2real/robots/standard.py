@@ -43,6 +43,11 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
     return found
 
 
+def causes(joints: Sequence[Joint | str]) -> dict[str, dict[str, float]]:
+    """Return what moves parameters of all joints at once: friction, with the temperature of grease and gears."""
+    return {"friction": {f"friction_{joint.name}": 1.0 for joint in map(Joint.of, joints)}}
+
+
 def of_joints(
     values: Mapping[str, Any], name: str, joints: Sequence[Joint | str], otherwise: float | None = None
 ) -> list[Any]:

@@ -64,7 +64,7 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
     z = refine(problem, problem.table.at_scale(x)[None], _STEPS, 2).z
     here = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
-    models = {"identified": {n: found.values[n] for n in nominal}, AS_HERE: here, "nominal": nominal}
+    models = {"identified": {n: found.values.get(n, v) for n, v in nominal.items()}, AS_HERE: here, "nominal": nominal}
     every = np.ones(problem.segments, bool)
     columns = prediction.samples(problem, models, config.settle_s, every)
     errors = prediction.errors(problem, columns, list(models), config.settle_s, [ahead_s])
@@ -94,7 +94,7 @@ def segments(
     Raises:
         Sim2RealError: When there is too little to test.
     """
-    model = robot.identifiable(config.max_delay_s)
+    model = robot.watched(config.max_delay_s)
     if own := [p.name for p in model.parameters if p.free and p.per_recording]:
         raise Sim2RealError(f"{', '.join(own)} differ from recording to recording: of a new log they are not known")
     horizons = sorted({p.horizon_s for p in found.prediction})

@@ -134,5 +134,15 @@ def test_what_a_log_does_not_feel_is_not_tested():
 
 
 def test_parameters_of_another_model_are_refused():
-    with pytest.raises(UsageError, match="tested for gain, friction, identified were gain, friction, sensor_delay"):
+    with pytest.raises(
+        UsageError, match="tested for gain, friction, identified were sensor_delay, actuator_delay, too"
+    ):
         drift(Robot(np.array([20.0, 6.0])), POSTERIOR, 1.0, {})
+
+
+def test_what_was_not_identified_may_change_all_the_same():
+    """As what a hand holds: it was what the model says then, and that is known."""
+    gain = Posterior(("gain",), ("log",), MEAN[:1], np.eye(1) * 1e-4, TABLE.low[:1], TABLE.high[:1])
+    found, _ = drift(Robot(np.array([20.0, 12.0])), gain, 1.0, {})
+    assert (found.named.name, found.named.before) == ("friction", pytest.approx(6.0))
+    assert not drift(Robot(np.array([20.0, 6.0])), gain, 1.0, {})[0].alarms

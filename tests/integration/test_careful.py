@@ -47,7 +47,7 @@ def assert_steps_are_a_log(folder):
     """What was sent and measured while the delay was measured: 8 steps to both sides, at the robot's rate."""
     log = read_log(folder / "probe.mcap")
     volts = log.outputs["actuator"]["action"][:, 0]
-    up = np.flatnonzero((np.diff(np.abs(volts)) > 1.0))
+    up = np.flatnonzero(np.diff(np.abs(volts)) > 1.0)
     assert up.size >= 8
     assert np.sign(volts[up + 1])[:8].tolist() == [1.0, -1.0] * 4
     t_s, moved = log.steps["sensor"].begun_s, np.unwrap(log.outputs["sensor"]["th"]) - np.pi

@@ -1,0 +1,197 @@
+"""The arm and the SO-101 inside the computer for the bench of drift: their pipelines' plants on a simulated clock.
+
+Plants, latencies and the gate are those of the wall clock; in the place of bus and threads stand the times that they
+take. Robots differ in what their servos are like and in how late they are. The policy is written by hand: it moves the
+goals to one target after the other, as fast as a trained one may.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from benches import hidden_robots as hidden
+from benches.drift_pendulum import DELAY_S, FRICTION
+from sim2real.hardware.gate import SafetyGate
+from sim2real.hardware.plant import OperatingMode, PlantClock, load_plant
+from sim2real.hardware.truth import TruthLog
+from sim2real.stages.excitation import excitation
+from sim2real.stages.pipeline import load_pipeline
+
+RATE_HZ = 50.0
+COUNT_RAD = 2 * np.pi / 4096
+TARGET_S, APPROACH_HZ = 4.0, 4.0
+"""How long each target stands; how fast a goal nears it."""
+STEP_RAD, STEP_S, STEPS = 0.12, 0.5, 8
+"""Small steps by which the delay is measured."""
+CARRIED = 0.3
+"""Payload, as a share of the mass of all links."""
+_STEP_NS = 500_000
+Policy = Callable[[int, np.ndarray], np.ndarray]
+"""Number of a step and goals of the one before [rad] -> goals [rad]."""
+
+
+@dataclass(frozen=True)
+class ReachingArm:
+    """An arm of position-controlled servos.
+
+    Attributes:
+        number: Its number.
+        plant: Arguments of its plant.
+        sensing_s: Mean age of a measurement [s].
+        acting_s: Mean time from a command to the motor [s].
+    """
+
+    number: int
+    plant: dict[str, Any]
+    sensing_s: float
+    acting_s: float
+    pipeline: ClassVar[str] = "arm"
+    links_kg: ClassVar[float] = 0.234
+    defaults: ClassVar[dict[str, float]] = {"record_s": 30.0, "seconds": 16.0, "episodes": 2, "generations": 30}
+    causes: ClassVar[dict[str, str]] = {"friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
+
+    @classmethod
+    def draw(cls, number: int) -> ReachingArm:
+        """Draw a robot: within 20 % of the pipeline's, 10 to 28 ms late."""
+        rng = np.random.default_rng([20261124, number])
+        return cls(number, cls.servos(rng), rng.uniform(0.003, 0.010), rng.uniform(0.007, 0.018))
+
+    @classmethod
+    def servos(cls, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw what the servos are like: arguments of the plant."""
+        off = lambda: rng.uniform(0.8, 1.2)  # noqa: E731
+        coulomb = [off() * factor for factor in (1.5, 1.9, 1.2)]
+        return {"stall": 0.87 * off(), "back_emf": 1.1 * off(), "armature": 1.25 * off(), "coulomb": coulomb}
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """What it is, for the report."""
+        return {name: value for name, value in asdict(self).items() if name != "number"}
+
+    def changed(self, change: str) -> ReachingArm:
+        """Return the robot after something has changed; ``none``: as it is."""
+        if change == "friction":
+            return replace(self, plant=self.rubbing(FRICTION))
+        if change == "delay":
+            return replace(self, acting_s=self.acting_s + DELAY_S)
+        if change == "payload":
+            return replace(self, plant={**self.plant, "carried_kg": CARRIED * self.links_kg})
+        return self
+
+    def rubbing(self, factor: float) -> dict[str, Any]:
+        """Return the plant's arguments with more friction in all joints."""
+        return {**self.plant, "coulomb": [factor * level for level in self.plant["coulomb"]]}
+
+    def record(self, path: Path, seconds: float, session: int) -> None:
+        """Write the log of the pipeline's excitation, with goals that come to it slowly from where the arm rests.
+
+        Args:
+            path: The log.
+            seconds: Its length.
+            session: Its number: jitter differs from one to the next, and the excitation.
+        """
+        robot, config = self._robot, load_pipeline(self.pipeline).record
+        config = replace(config, duration_s=seconds, seed=1000 * self.number + session)
+        signal = robot.around(excitation(config, RATE_HZ, len(robot.servos.joints)))
+        away = np.asarray(robot.servos.at_rest) - signal[0]
+        left = np.abs(away) - np.arange(len(signal))[:, None] / RATE_HZ
+        signal = signal + np.sign(away) * np.maximum(left, 0.0)
+        self._play(path, lambda k, _: signal[k], seconds, session)
+
+    def probe(self, path: Path, session: int) -> None:
+        """Write the log of the small steps before a deployment: away from rest and back."""
+        robot = self._robot
+        rest, probe = np.asarray(robot.servos.at_rest, float), robot.probe
+        away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
+        each = round(STEP_S * RATE_HZ)
+        self._play(path, lambda k, _: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
+
+    def deploy(self, path: Path, seconds: float, session: int) -> float:
+        """Write the log of an episode of the policy written by hand; nobody judges it: it does not succeed or fail.
+
+        Args:
+            path: The log.
+            seconds: Its length.
+            session: Its number: it says which targets.
+        """
+        robot, rng = self._robot, np.random.default_rng([self.number, session])
+        low, high = self.targets()
+        targets = rng.uniform(low, high, (int(seconds / TARGET_S) + 1, len(low)))
+        fastest = robot.servos.speed
+
+        def policy(k: int, goal: np.ndarray) -> np.ndarray:
+            way = targets[int(k / RATE_HZ / TARGET_S)] - goal
+            return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / RATE_HZ
+
+        self._play(path, policy, seconds, session)
+        return float("nan")
+
+    def targets(self) -> tuple[Any, Any]:
+        """Return between which joint angles targets are [rad]."""
+        module = sys.modules[type(self._robot).__module__]
+        return module.LOW, module.HIGH
+
+    @property
+    def _robot(self) -> Any:
+        return load_pipeline(self.pipeline).load()
+
+    def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> None:
+        """Run the loop on a simulated clock, from rest, and write its log."""
+        robot, rng = self._robot, np.random.default_rng([self.number, session, 1])
+        plant, sheet, rest = load_plant(robot.embedded.plant, self.plant), robot.servos.sheet, robot.servos.at_rest
+        plant.data.qpos[:] = rest
+        truth = TruthLog(Path(os.devnull), {"state_names": list(plant.state())})
+        clock = PlantClock(plant, _STEP_NS, 0, round(2e9 * self.sensing_s), truth)
+        zero = [plant.measure(i)[0] - angle for i, angle in zip(plant.servo_ids, rest, strict=True)]
+        for servo_id in plant.servo_ids:
+            clock.configure(servo_id, sheet.p_gain, 0, sheet.profile_rad_s)
+        gate = SafetyGate(robot.gate(load_pipeline(self.pipeline).deploy.gate))
+        gate.reset(rest)
+        goal, count, acts_ns = np.asarray(rest, float), int(seconds * RATE_HZ), 0
+        starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
+        readings, commands = [], []
+        for k in range(count):
+            at = k / RATE_HZ
+            for node, took in (("sensor", 1.2e-3), ("agent", 1e-4), ("actuator", 6e-4)):
+                starts[node][k], at = at, at + took * rng.uniform(0.8, 1.2)
+                ends[node][k] = at
+            asked_ns = round(1e9 * starts["sensor"][k])
+            clock.advance(asked_ns)
+            sampled_ns = asked_ns - round(1e9 * self.sensing_s * rng.uniform(0.85, 1.15))
+            rows = np.array([clock.sample(i, sampled_ns)[:2] for i in plant.servo_ids])
+            angle = np.round(rows[:, 0] / COUNT_RAD) * COUNT_RAD - zero
+            speed = np.round(rows[:, 1] / hidden.SPEED_COUNT_RAD_S) * hidden.SPEED_COUNT_RAD_S
+            readings.append({"position": np.float32(angle), "velocity": np.float32(speed)})
+            goal = gate.apply(policy(k, goal), 0.0, float(ends["agent"][k]), speed)
+            commands.append({"goal": np.float32(goal)})
+            sent_ns = round(1e9 * (ends["actuator"][k] + self.acting_s * rng.uniform(0.85, 1.15)))
+            acts_ns = max(acts_ns, sent_ns)
+            for servo_id, own, offset in zip(plant.servo_ids, goal, zero, strict=True):
+                wanted = round((own + offset) / COUNT_RAD) * COUNT_RAD
+                clock.schedule(acts_ns, 0, servo_id, OperatingMode.POSITION, wanted)
+        truth.close()
+        hidden.write_log(path, self.pipeline, (starts, ends), readings, commands, robot.units)
+
+
+class ReachingSO101(ReachingArm):
+    """The SO-101: what it holds is between its jaws."""
+
+    pipeline = "so101"
+    links_kg = 0.485
+    defaults: ClassVar[dict[str, float]] = {"record_s": 30.0, "seconds": 16.0, "episodes": 2, "generations": 40}
+
+    @classmethod
+    def servos(cls, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw what the servos are like: arguments of the plant."""
+        return {"gain": rng.uniform(0.8, 1.2), "friction": rng.uniform(0.8, 1.2)}
+
+    def rubbing(self, factor: float) -> dict[str, Any]:
+        """Return the plant's arguments with more friction in all joints."""
+        return {**self.plant, "friction": factor * self.plant["friction"]}
