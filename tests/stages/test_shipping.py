@@ -19,9 +19,9 @@ SAME = """
 import json, sys
 import numpy as np
 from pathlib import Path
-from run_policy import load
+from run_policy import BarePolicy
 
-policy = load(Path("."))
+policy = BarePolicy(Path("."))
 observations = np.array(json.loads(sys.argv[1]), np.float32)
 print(json.dumps([policy(o).tolist() for o in observations]))
 print(sorted({name.partition(".")[0] for name in sys.modules} & {"jax", "sim2real", "safetensors", "flax"}))
@@ -72,6 +72,7 @@ def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
     expected = [load_bundle(bundle).act(o).tolist() for o in observations]
     np.testing.assert_allclose(json.loads(actions), expected, atol=1e-6)
     assert imported == "[]"
+    assert len((out / "run_policy.py").read_text().splitlines()) <= 30
     said = subprocess.run([bare, "-I", out / "run_policy.py"], capture_output=True, text=True, check=True).stdout
     assert -2.0 <= json.loads(said)[0] <= 1.0
 
@@ -100,7 +101,7 @@ def test_a_policy_with_other_layers_is_not_run_as_if_it_had_none(trained, bare, 
     weights = safetensors.numpy.load((out / "policy.safetensors").read_bytes())
     more = {**weights, "memory.kernel": np.zeros((2, 2), np.float32), "memory.bias": np.zeros(2, np.float32)}
     (out / "policy.safetensors").write_bytes(safetensors.numpy.save(more))
-    code = f"import sys; sys.path.insert(0, {str(out)!r})\nimport run_policy; run_policy.load(run_policy.Path('.'))"
+    code = f"import sys; sys.path.insert(0, {str(out)!r})\nimport run_policy as r; r.BarePolicy(r.Path('.'))"
     done = subprocess.run([bare, "-I", "-c", code], cwd=out, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "memory" in done.stderr
@@ -118,7 +119,7 @@ def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_pa
     assert sorted(path.name for path in out.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
     assert "run policy.onnx with onnxruntime" in capsys.readouterr().err
     with pytest.raises(ValueError, match="clipped tanh layers"):
-        standalone.load(squashed)
+        standalone.BarePolicy(squashed)
 
 
 def test_a_folder_that_holds_something_is_left_alone(trained, tmp_path):
