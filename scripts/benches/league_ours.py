@@ -111,7 +111,7 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     table = left_out.widest(model.parameters, c.terms)
     spans = identify.windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table)
-    terms = left_out.chosen(every, c, list(fitted))
+    terms = left_out.chosen(every, c, list(fitted)).names(table)
     fewer = table.with_terms(terms)
     fewer = fewer.with_nominal({p.name: every.values[p.name] for p in fewer if p.free})
     return fit_model(model, episodes, spans, length, c, fewer)

@@ -14,13 +14,17 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
-from sim2real.identify.refine import Refined, refine
+from sim2real.identify.refine import Refined, effort, refine
 from sim2real.identify.search import SearchResult, search
-from sim2real.identify.segments import Data, Span
+from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of the bounds."""
+_ROUNDS = 3
+"""Most rounds of a refinement."""
+_COARSE = 1e-2
+"""A baseline is compared with by percents: a round that gains less is its last."""
 Told = Callable[[str, float, float, np.ndarray], None]
 """Called with the phase (``search`` or ``refine``; ``compiling`` in between), the share of it done since the last call,
 and the best loss and point so far."""
@@ -127,7 +131,8 @@ def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any
     if not kept.any():
         return as_numbers(table, near, kept)
     starts = np.stack([table.encode(as_numbers(table, near)), table.start()])
-    return as_numbers(table, _refine(problem, starts, None, problem.part(kept=kept)).z, kept)
+    ended = refine(problem, starts, *effort(problem, _ROUNDS), data=problem.part(kept=kept), gain=_COARSE)
+    return as_numbers(table, ended.z, kept)
 
 
 def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
@@ -152,8 +157,8 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
     return search(problem.losses, start, problem.config, every, advance, programs, compiling, loss)
 
 
-def _refine(problem: Problem, starts: np.ndarray, told: Told | None, data: Data | None = None) -> Refined:
-    rounds = 3
+def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
+    steps, rounds = effort(problem, _ROUNDS)
     total = rounds + len(starts) - 1
 
     def advance(best: float, z: np.ndarray) -> None:
@@ -161,7 +166,7 @@ def _refine(problem: Problem, starts: np.ndarray, told: Told | None, data: Data 
             told("refine", 1 / total, best, z)
 
     compiling = _compiling(told, "refine", starts[0])
-    return refine(problem, starts, problem.config.refine_steps, rounds, advance, data, compiling)
+    return refine(problem, starts, steps, rounds, advance, None, compiling)
 
 
 def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:

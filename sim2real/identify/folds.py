@@ -15,7 +15,7 @@ from sim2real.identify import terms
 from sim2real.identify.fit import Fit
 from sim2real.identify.prediction import labels, simulated
 from sim2real.identify.problem import Problem
-from sim2real.identify.refine import refine
+from sim2real.identify.refine import effort, refine
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import linearise
 
@@ -107,7 +107,7 @@ def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
 
 
 def leave_out(
-    found: Fit, parts: Sequence[Fold], settle_s: float, choose: bool, steps: int = 25, free_run_s: float = 0.0
+    found: Fit, parts: Sequence[Fold], settle_s: float, choose: bool, free_run_s: float = 0.0
 ) -> list[LeftOut]:
     """Identify without each part, from the estimate of all, and predict it.
 
@@ -116,7 +116,6 @@ def leave_out(
         parts: What is left out, one at a time.
         settle_s: First part of what is predicted, to which its initial state is fitted [s].
         choose: Whether the data that is left chooses the optional terms of the model; else all are kept.
-        steps: Most steps of Levenberg-Marquardt for each.
         free_run_s: Longest stretch that is simulated in one go [s]; 0 leaves it out.
     """
     problem, table = found.problem, found.problem.table
@@ -128,7 +127,7 @@ def leave_out(
         own = table.of_terms(chosen)
         # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
         start = table.at_scale(stats.x + stats.step(table, chosen, k))
-        z = refine(problem, start[None], steps, 1, data=problem.part(problem.train[mask], own)).z
+        z = refine(problem, start[None], *effort(problem), data=problem.part(problem.train[mask], own)).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}

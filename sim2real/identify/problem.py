@@ -331,14 +331,6 @@ class Problem:
         return tamed(residuals, self.config.loss, self.config.reach)
 
     @property
-    def tolerance(self) -> tuple[float, float]:
-        """Relative and absolute change of point and loss at which a refinement ends.
-
-        Finer steps are lost in the noise of finite differences: an arm on C took twice the steps to the same point.
-        """
-        return (1e-5, 1e-6) if self._outside is None else (1e-4, 1e-4)
-
-    @property
     def measurements(self) -> int:
         """Measured numbers in the fitted segments."""
         return int((np.asarray(self._ts)[self.train] >= self._from_s).sum()) * len(self.fields)

@@ -15,6 +15,11 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.uncertainty import Linearised
 
+_RESAMPLED = 1000
+"""How often recordings are drawn anew."""
+_RARE = 0.02
+"""A model that is chosen less often is no alternative."""
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -60,7 +65,13 @@ class Statistics:
 
     def without(self, part: int) -> Statistics:
         """Return the same without one part."""
-        rows = np.delete(np.arange(len(self.value)), part)
+        return self._of(np.delete(np.arange(len(self.value)), part))
+
+    def only(self, part: int) -> Statistics:
+        """Return the same of one part alone."""
+        return self._of(np.array([part]))
+
+    def _of(self, rows: np.ndarray) -> Statistics:
         return Statistics(
             self.x, self.value[rows], self.gradient[rows], self.information[rows], self.prior, self.count[rows]
         )
@@ -76,12 +87,21 @@ class Selection:
         excess: Shape ``(T + 1,)``: mean square on what was left out, over that of the best of these models, as terms
             are left out one after the other; the first entry is the widest model's.
         error: Shape ``(T + 1,)``: standard error of ``excess``.
+        near: Shape ``(M, T)``, bool: all models that were tried and are within a standard error of the best, the chosen
+            one first; which terms they have.
+        weight: Shape ``(M,)``: how often each of them would be chosen; adds up to 1.
     """
 
     kept: np.ndarray
     order: tuple[str, ...]
     excess: np.ndarray
     error: np.ndarray
+    near: np.ndarray
+    weight: np.ndarray
+
+    def names(self, table: ParameterTable) -> tuple[str, ...]:
+        """Return the names of the terms that were chosen."""
+        return tuple(n for n, kept in zip(table.terms, self.kept, strict=True) if kept)
 
 
 def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistics:
@@ -110,7 +130,8 @@ def choose(stats: Statistics, table: ParameterTable) -> Selection:
 
     Chosen is the smallest model that is worse than the best one by no more than one standard error of the difference
     between parts (Breiman et al., Classification and Regression Trees, 1984): a term that helps in a single part has a
-    standard error as large as its gain, and is left out.
+    standard error as large as its gain, and is left out. With other recordings like these the same rule would choose
+    now this model, now that: see ``votes``.
 
     Args:
         stats: The loss of at least two parts.
@@ -119,23 +140,59 @@ def choose(stats: Statistics, table: ParameterTable) -> Selection:
     names = table.terms
     kept = np.ones(len(names), bool)
     path, scores, order = [kept.copy()], [_left_out(stats, table, kept)], []
+    aside: list[tuple[np.ndarray, np.ndarray]] = []
     while kept.any():
         trials = {}
         for t in np.flatnonzero(kept):
             fewer = kept.copy()
             fewer[t] = False
-            trials[int(t)] = _left_out(stats, table, fewer)
-        least = min(trials, key=lambda t: float(trials[t].mean()))
-        kept[least] = False
+            trials[int(t)] = (_left_out(stats, table, fewer), fewer)
+        least = min(trials, key=lambda t: float(trials[t][0].mean()))
+        aside += [one for t, one in trials.items() if t != least]
+        score, kept = trials[least][0], trials[least][1].copy()
         path.append(kept.copy())
-        scores.append(trials[least])
+        scores.append(score)
         order.append(names[least])
     means = np.array([s.mean() for s in scores])
     best = scores[int(np.argmin(means))]
-    excess = np.array([(s - best).mean() for s in scores])
-    error = np.array([(s - best).std(ddof=1) / np.sqrt(len(best)) for s in scores])
+    excess, error = _excess(np.array(scores), best)
     smallest = int(np.flatnonzero(excess <= error)[-1])
-    return Selection(path[smallest], tuple(order), excess, error)
+    models = np.array([path[smallest], *path[:smallest], *path[smallest + 1 :], *(m for _, m in aside)])
+    every = np.array([scores[smallest], *scores[:smallest], *scores[smallest + 1 :], *(s for s, _ in aside)])
+    share = votes(every, models.sum(axis=1)) * np.less_equal(*_excess(every, best))
+    near = np.flatnonzero((share >= _RARE) | (np.arange(len(share)) == 0))
+    return Selection(path[smallest], tuple(order), excess, error, models[near], share[near] / share[near].sum())
+
+
+def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return in which share of recordings like these each model would be chosen, ``(M,)``.
+
+    Frequencies of selection over resampled data are weights that hold what choosing itself leaves open (Buckland,
+    Burnham and Augustin, Biometrics 53, 1997). Parts are few, so their shares are drawn (the Bayesian bootstrap of
+    Rubin, Annals of Statistics 9, 1981). Weights by likelihood would all go to one model: residuals are thousands, and
+    far from independent.
+
+    Args:
+        scores: Shape ``(M, K)``: mean square of each model on each part.
+        size: Shape ``(M,)``: how many terms each has; of models within a standard error of the best the smallest wins.
+    """
+    models, parts = scores.shape
+    rng = np.random.default_rng(0)
+    chosen = np.zeros(models)
+    for share in (np.full(parts, 1.0 / parts), *rng.dirichlet(np.ones(parts), _RESAMPLED)):
+        mean = scores @ share
+        off = scores - scores[np.argmin(mean)]
+        excess = off @ share
+        error = np.sqrt((off - excess[:, None]) ** 2 @ share / (parts - 1))
+        within = excess <= error
+        chosen[np.lexsort((mean, size, ~within))[0]] += 1.0
+    return chosen / chosen.sum()
+
+
+def _excess(scores: np.ndarray, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how much worse models ``(M, K)`` are than the best ``(K,)``, and the standard errors of that; ``(M,)``."""
+    off = scores - best
+    return off.mean(axis=1), off.std(axis=1, ddof=1) / np.sqrt(len(best))
 
 
 def _left_out(stats: Statistics, table: ParameterTable, kept: np.ndarray) -> np.ndarray:

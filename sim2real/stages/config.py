@@ -79,8 +79,8 @@ class IdentifyConfig(FitConfig):
     terms: str = "own"
     """Optional terms of the model: 'own' takes the pipeline's, 'auto' those without which what is left out is predicted
     worse, 'all' or 'none' say it, else names with commas between."""
-    each: bool = False
-    """Identify each log by itself as well, and report the spread between them."""
+    each: bool = True
+    """Where there are several logs, identify each by itself as well, and report the spread between them."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
@@ -116,8 +116,6 @@ class IdentifyConfig(FitConfig):
                 f"folds must be 0, or 2 and more, got {self.folds} with terms {self.terms!r}",
                 hint="terms are chosen by what is left out: --terms auto needs --folds",
             )
-        if self.each and len(self.log) < 2:
-            raise UsageError("each needs two logs at least", hint="name them with --log, one flag a log")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sim2real.artifacts.identification import (
     Search,
 )
 from sim2real.artifacts.links import Link
+from sim2real.artifacts.posterior import Posterior
 from sim2real.identify import identifiability, noise, uncertainty
 from sim2real.identify.fit import Fit
 from sim2real.identify.negligible import negligible
@@ -41,7 +42,7 @@ class Findings:
 
     Attributes:
         fit: The fit.
-        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        at: Its residuals.
         spread: Its uncertainty.
         check: What the data determines.
         trip: The sum of the delays; None where there are none.
@@ -49,11 +50,16 @@ class Findings:
     """
 
     fit: Fit
-    x: np.ndarray
+    at: uncertainty.Linearised
     spread: uncertainty.Uncertainty
     check: identifiability.Check
     trip: RoundTrip | None
     widening: float
+
+    @property
+    def x(self) -> np.ndarray:
+        """The estimate on the parameters' scales, ``(P,)``."""
+        return self.at.x
 
     @staticmethod
     def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
@@ -68,15 +74,18 @@ class Findings:
         check = identifiability.from_linearised(fit.problem, at)
         spread, check = negligible(fit.problem, fit.z, at, spread, check)
         trip = round_trip(fit.problem.table, at.x, spread)
-        return Findings(fit, at.x, spread, check, trip, noise.widening(fit.problem.table, at, spread))
+        return Findings(fit, at, spread, check, trip, noise.widening(fit.problem.table, at, spread))
 
 
-def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds: float) -> Identification:
+def document(
+    pipeline: str, found: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
+) -> Identification:
     """Return the estimates and their uncertainty; predictions and verdict are added later.
 
     Args:
         pipeline: Name of the robot's pipeline.
         found: The estimates.
+        posterior: What robots are drawn from.
         truth: The embedded robot's own values, those that are known.
         seconds: What the search took [s].
     """
@@ -102,7 +111,7 @@ def document(pipeline: str, found: Findings, truth: Mapping[str, float], seconds
         residual_inflation=spread.inflation,
         misfit=spread.misfit,
         check=Determined(check.condition, check.undetermined, check.messages, minute),
-        posterior=fit.problem.table.posterior(fit.z, spread.scale_covariance),
+        posterior=posterior,
         widening=found.widening,
     )
 
@@ -161,17 +170,6 @@ def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
     return rows + ([(ROUND_TRIP, "s", delays)] if len(delays) > 1 else [])
 
 
-def error_of(found: Fit, spread: uncertainty.Uncertainty, parts: Sequence[str]) -> float:
-    """Return the standard error of a sum of parameters.
-
-    Args:
-        found: The fit.
-        spread: Its uncertainty.
-        parts: Names of the parameters.
-    """
-    return uncertainty.sum_of(spread, [found.problem.table.names.index(n) for n in parts])
-
-
 def show(found: Identification) -> None:
     """Print the parameters, and what stands in the way of trusting them."""
     rows = []
@@ -185,6 +183,9 @@ def show(found: Identification) -> None:
             [a.name, a.mean, f"[{a.low95:.4g}, {a.high95:.4g}]", a.unit, a.between, a.agree] for a in found.aggregate
         ]
         print(table(each, ["over recordings", "mean", "95 % of the next", "unit", "spread", "agree"]))
+    if found.posterior is not None and found.posterior.others:
+        others = [[o.about, f"{100 * o.weight:.0f} %"] for o in found.posterior.others]
+        print(table(others, ["explains the recordings as well", "share of the draws"]))
     if found.held_out:
         models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
         errors = [[row.name, *(row.rmse.get(m) for m in models), row.unit] for row in found.held_out]

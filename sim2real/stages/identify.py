@@ -16,8 +16,9 @@ from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import Source, StageFolder, newest, open_stage
 from sim2real.graph.episode import Episode
-from sim2real.identify import prediction
+from sim2real.identify import ensemble, prediction
 from sim2real.identify.aggregate import aggregate
+from sim2real.identify.each import identify_each
 from sim2real.identify.fit import Fit, Told, as_numbers, fit, refit
 from sim2real.identify.links import links, measured
 from sim2real.identify.model import IdentifiableModel
@@ -25,6 +26,8 @@ from sim2real.identify.noise import noises
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, beyond
+from sim2real.identify.terms import Selection
+from sim2real.identify.uncertainty import sum_of
 from sim2real.identify.verdict import NO_DELAY
 from sim2real.robots.base import RecordedRobot
 from sim2real.robots.worlds import in_world
@@ -83,13 +86,16 @@ def identify(
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
-    all_terms, found, table, terms = _with_terms(model, episodes, windows, config, table, names, best)
+    every, found, choice = _with_terms(model, episodes, windows, config, table, names, best)
     with progress(None, "identify: errors, predictions and baselines"):
-        without = patiently(lambda: left_out.examined(all_terms, config, names)) if config.folds else ()
+        without = patiently(lambda: left_out.examined(every, config, names)) if config.folds else ()
         findings = patiently(lambda: identified.Findings.of(found, without))
+        terms = found.problem.table.terms if every.problem.table.terms else None
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
-        document = identified.document(pipeline.name, findings, truth, time.monotonic() - begin)
+        posterior = patiently(lambda: ensemble.posterior(found, findings.at, findings.spread, every, choice))
+        document = identified.document(pipeline.name, findings, posterior, truth, time.monotonic() - begin)
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, found))
+        each = patiently(lambda: _each(found)) if config.each and len(fitted) > 1 else ()
         own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
         document = replace(document, left_out=without, terms=terms, links=own)
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
@@ -99,7 +105,7 @@ def identify(
         units=units,
         world=config.world,
         noise=noises(document.samples, units),
-        aggregate=_each(model, episodes[: len(fitted)], config, table, found) if config.each else (),
+        aggregate=each,
         timing=fitted[0].timing,
     )
 
@@ -112,20 +118,21 @@ def _with_terms(
     table: ParameterTable,
     names: Sequence[str],
     best: Best | None,
-) -> tuple[Fit, Fit, ParameterTable, tuple[str, ...] | None]:
-    """Return the fit with all optional terms, that with those that are needed, the latter's table, and their names."""
+) -> tuple[Fit, Fit, Selection | None]:
+    """Return the fit with all optional terms, that with those that are needed, and how they were chosen."""
     with _told("identify", best) as told:
         found = patiently(lambda: _fit(model, episodes, len(names), windows, config, table, told, _begins))
     if config.terms != "auto":
-        return found, found, table, found.problem.table.terms or None
-    terms = left_out.chosen(found, config, names)
+        return found, found, None
+    choice = left_out.chosen(found, config, names)
+    terms = choice.names(found.problem.table)
     # What a flag holds stays held, whatever term it belongs to; what is left out is what it is without its term.
     fewer = table.with_terms(terms).with_fixed(config.fix)
     fewer = fewer.with_nominal({p.name: found.values[p.name] for p in fewer if p.free and not p.per_recording})
     again = replace(config, generations=0)
     with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
         narrow = patiently(lambda: _fit(model, episodes, len(names), windows, again, fewer, told))
-    return found, narrow, fewer, terms
+    return found, narrow, choice
 
 
 def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -265,26 +272,13 @@ def _free_runs(
     return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns
 
 
-def _each(
-    model: IdentifiableModel,
-    episodes: Sequence[Episode],
-    config: IdentifyConfig,
-    table: ParameterTable,
-    found: Fit,
-) -> tuple[Quantity, ...]:
+def _each(found: Fit) -> tuple[Quantity, ...]:
     """Identify each log by itself, and combine."""
-    single = []
-    shared = [p.name for p in table if not p.per_recording and p.kind != "delay"]
-    start = table.with_nominal({n: float(found.values[n]) for n in shared})
-    for r, episode in enumerate(episodes):
-        windows = spans([episode], 1, config, config.settle_s + config.horizon_s)
-        with _told(f"log {r + 1} of {len(episodes)}") as told:
-            one = _fit(model, [episode], 1, windows, config, start, told)
-        single.append((one, one.uncertainty()))
+    single, table = identify_each(found), found.problem.table
     rows = []
     for name, unit, parts in identified.quantities(table):
-        values = np.array([sum(np.ravel(f.values[n])[0] for n in parts) for f, _ in single])
-        errors = np.array([identified.error_of(f, u, parts) for f, u in single])
+        values = np.array([sum(np.ravel(own[n])[0] for n in parts) for own, _ in single])
+        errors = np.array([sum_of(spread, [table.names.index(n) for n in parts]) for _, spread in single])
         all_of = aggregate(values, errors)
         numbers = (all_of.mean, all_of.standard_error, all_of.between, all_of.low, all_of.high)
         rows.append(Quantity(name, unit, values, errors, *numbers, all_of.agree))

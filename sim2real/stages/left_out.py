@@ -24,8 +24,6 @@ _LEAST_PARTS = 2
 """Errors of which a mean and a worst are worth saying."""
 _LEAST = 4
 """Segments of which parts can be left out."""
-_STEPS = 8
-"""Most steps of a refinement without a part, on C: of a quadruped the loss is within 0.01 % of its end after four."""
 _LEAST_TO_CHOOSE = 3
 """Parts of which one is left out, and terms chosen by how the others predict each other."""
 _ANY_DELAY_S = 0.1
@@ -76,18 +74,17 @@ def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
     return offered if offered is not robot and terms & set(names) else robot
 
 
-def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the optional terms without which parts that are left out are predicted worse.
+def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> terms.Selection:
+    """Return which optional terms are needed: without them parts that are left out are predicted worse.
 
     Args:
         found: The fit with all of them.
         config: How many parts.
         names: Of the recordings; each is left out by itself.
     """
-    problem, table = found.problem, found.problem.table
+    problem = found.problem
     parts = masks(problem, folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE))
-    choice = terms.choose(terms.statistics(problem, linearise(problem, found.z), parts), table)
-    return tuple(n for n, kept in zip(table.terms, choice.kept, strict=True) if kept)
+    return terms.choose(terms.statistics(problem, linearise(problem, found.z), parts), problem.table)
 
 
 def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[Left, ...]:
@@ -104,10 +101,7 @@ def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[
         return ()
     least = _LEAST_TO_CHOOSE if config.terms == "auto" else 2
     parts = folds_of(found.problem, min(config.folds, segments // 2), names, least)
-    # From the solution of the linearised problem few steps are left to go. On C they take seconds each, and a program
-    # of fewer compiles in as long as two; else the one that refined before is taken.
-    few = min(config.refine_steps, _STEPS) if found.problem.engine.name == "c" else config.refine_steps
-    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", few, config.free_run_s)
+    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", config.free_run_s)
     return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
 
 

@@ -55,8 +55,8 @@ def draw_robots(
 def widened(found: Identification, factor: float) -> Posterior:
     """Return the posterior with what differs from recording to recording, and with deviations times a factor.
 
-    A log tells only the sum of all delays. How they share it is left as it is: it changes nothing that a policy sees,
-    and bounds on each delay would bend the sum.
+    So do its alternatives. A log tells only the sum of all delays. How they share it is left as it is: it changes
+    nothing that a policy sees, and bounds on each delay would bend the sum.
 
     Args:
         found: What was identified, with a posterior.
@@ -64,6 +64,11 @@ def widened(found: Identification, factor: float) -> Posterior:
     """
     posterior = found.posterior
     assert posterior is not None
+    others = tuple(replace(o, posterior=_widened(o.posterior, found, factor)) for o in posterior.others)
+    return replace(_widened(posterior, found, factor), others=others)
+
+
+def _widened(posterior: Posterior, found: Identification, factor: float) -> Posterior:
     covariance = posterior.covariance * factor**2
     names = list(posterior.names)
     delays = [i for i, n in enumerate(names) if any(p.name == n and p.kind == "delay" for p in found.parameters)]

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Quantity
+from sim2real.artifacts.posterior import from_scale
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.log.schema import unit_of
 from sim2real.view import identify_figures, intervals, residuals
@@ -45,6 +46,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
         *_parameters(found),
         *_aggregate(found),
         *_parts(found),
+        *_alternatives(found),
         *_predictions(found),
         *_residuals(found),
         *_correlation(found),
@@ -191,6 +193,24 @@ def _parts(found: Identification) -> list[Block]:
     caption = "Identified without this part, and off on it by (root mean square)"
     columns = ["left out", *(["terms"] if with_terms else []), *heads]
     return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
+
+
+def _alternatives(found: Identification) -> list[Block]:
+    """Return the models that explain the recordings as well as the estimate, with their parameters and shares."""
+    if found.posterior is None or not found.posterior.others:
+        return []
+    named = [("estimate", found.posterior), *((o.about, o.posterior) for o in found.posterior.others)]
+    left = 1.0 - sum(o.weight for o in found.posterior.others)
+    shares = [left, *(o.weight for o in found.posterior.others)]
+    values = [
+        {n: float(from_scale(t, x)) for n, t, x in zip(p.names, p.transform, p.mean, strict=True)} for _, p in named
+    ]
+    rows = [
+        [name, *(number(own.get(name), 3) for own in values)] for name in dict.fromkeys(n for v in values for n in v)
+    ]
+    rows.insert(0, ["share of the draws", *(f"{100 * s:.0f} %" for s in shares)])
+    caption = "Models that explain the recordings as well: training draws robots of all"
+    return [TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
 
 
 def _predictions(found: Identification) -> list[Block]:

@@ -1,13 +1,13 @@
 """The posterior: what is drawn from it, and what its file takes."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from sim2real.artifacts.files import read_json, write_json
-from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.identify.parameters import Parameter, ParameterTable
 
 
@@ -94,3 +94,24 @@ def test_damaged_files(posterior, tmp_path, damage, message):
     (tmp_path / "a.json").write_text(json.dumps(document))
     with pytest.raises(ValueError, match=message):
         read_json(tmp_path / "a.json", Document)
+
+
+def test_draws_are_of_all_alternatives_and_survive_a_file(posterior, tmp_path):
+    fewer = Posterior(("gain",), ("log",), np.array([2.0]), np.eye(1) * 1e-6, np.array([-9.0]), np.array([9.0]))
+    fewer = replace(fewer, without={"offset": 0.7, "share": 0.5})
+    both = replace(posterior, others=(Alternative("fewer", 0.25, fewer),))
+    write_json(tmp_path / "posterior.json", both)
+    drawn = read_json(tmp_path / "posterior.json", Posterior).sample(np.random.default_rng(0), 4000)
+    few = drawn["offset"] == 0.7
+    assert few.mean() == pytest.approx(0.25, abs=0.02)
+    assert set(drawn["share"][few]) == {0.5}
+    np.testing.assert_allclose(np.log(drawn["gain"][few]), 2.0, atol=0.01)
+    rest = on_scales({n: v[~few] for n, v in drawn.items()})
+    np.testing.assert_allclose(np.cov(rest), posterior.covariance, atol=0.006)
+
+
+def test_alternatives_of_other_parameters_or_beyond_all_draws_are_refused(posterior):
+    with pytest.raises(ValueError, match="of other parameters"):
+        replace(posterior, others=(Alternative("more", 0.5, replace(posterior, without={"drag": 0.0})),))
+    with pytest.raises(ValueError, match="beyond all draws"):
+        replace(posterior, others=(Alternative("a", 0.6, posterior), Alternative("b", 0.6, posterior)))

@@ -22,7 +22,7 @@ def stub(residuals, count=3):
     return SimpleNamespace(
         measurements=count,
         programs={},
-        tolerance=(1e-5, 1e-6),
+        engine=SimpleNamespace(name="compiled"),
         table=SimpleNamespace(prior_residuals=lambda z: jnp.zeros(0)),
         part=lambda: None,
         stacked=lambda z, columns, data: residuals(z),

@@ -1,5 +1,6 @@
 """Terms chosen by what is left out, on a linear model: there the statistics are exact, and numpy can do it all over."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.terms import Statistics, choose
+from sim2real.identify.terms import Statistics, choose, votes
 
 PARTS, ROWS, NOISE = 6, 200, 0.1
 
@@ -108,3 +109,32 @@ def test_a_table_knows_its_terms():
     assert float(values["c"]) == pytest.approx(float(TABLE.decode(np.ones(6))["c"])) != 0.0
     with pytest.raises(UsageError, match="where its term"):
         row("g", off=1.0)
+
+
+def test_a_model_that_other_recordings_would_choose_is_kept_with_how_often(linear):
+    found = choose(linear.stats, TABLE)
+    np.testing.assert_array_equal(found.near[0], found.kept)
+    assert found.weight.sum() == pytest.approx(1.0)
+    assert found.weight[0] > 0.5, "what all parts need"
+    assert found.near[:, 0].all(), "without it all parts are worse"
+    assert len(np.unique(found.near, axis=0)) == len(found.near)
+
+
+def test_a_term_that_half_of_the_parts_need_is_open(linear):
+    X, rng = linear.X, np.random.default_rng(0)
+    y = X @ np.array([1.0, -2.0, 0.0, 0.0, 0.0, 0.5]) + NOISE * rng.normal(size=(PARTS, ROWS))
+    y[:3] += 0.05 * X[:3, :, 2]
+    r = np.einsum("krp,p->kr", X, linear.stats.x) - y
+    stats = replace(linear.stats, value=np.sum(r**2, axis=1), gradient=np.einsum("krp,kr->kp", X, r))
+    found = choose(stats, TABLE)
+    with_it = found.weight[found.near[:, 0]].sum()
+    assert 0.1 < with_it < 0.9
+
+
+def test_votes_are_those_of_scores_that_differ_by_part():
+    scores = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 2.0, 0.0, 2.0], [3.0, 3.0, 3.0, 3.0]])
+    share = votes(scores, np.array([2, 2, 1]))
+    assert share[:2] == pytest.approx([0.5, 0.5], abs=0.05), "either is better in half of all weightings"
+    assert share[2] == 0.0, "worse everywhere"
+    smaller = votes(scores, np.array([2, 1, 1]))
+    assert smaller[1] > 0.7, "the smaller of two that cannot be told apart"

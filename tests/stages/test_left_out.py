@@ -138,10 +138,11 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
     monkeypatch.setattr(identify, "_fit", fit)
-    monkeypatch.setattr(identify.left_out, "chosen", lambda *_: ("cogging",))
+    monkeypatch.setattr(identify.left_out, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    _, _, fewer, terms = identify._with_terms(None, [], [], config, table, ["log"], None)
-    assert terms == ("cogging",)
+    identify._with_terms(None, [], [], config, table, ["log"], None)
+    fewer = tables[1][1]
+    assert fewer.terms == ("cogging",)
     assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]
     assert {p.name: (p.nominal, p.free) for p in fewer} == {
         "gain": (1.5, True), "cogging": (0.4, True), "swing": (0.3, False), "bias": (0.2, False),

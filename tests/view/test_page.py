@@ -14,9 +14,10 @@ import pytest
 import synthetic_run
 
 from sim2real.artifacts.identification import Identification, Judgement, Left
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, decimals_for, fixed, number, spoken
-from sim2real.view.identify_section import _parts
+from sim2real.view.identify_section import _alternatives, _parts
 from sim2real.view.page import deploy_page, identify_page, report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
@@ -327,3 +328,18 @@ def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
         ["0 to 9 s", "drag", "0.100"], ["9 to 18 s", "none", "0.300"], ["mean", "", "0.200"], ["worst", "", "0.300"],
     ]  # fmt: skip
     assert _parts(replace(found, left_out=())) == []
+
+
+def test_models_that_explain_the_recordings_as_well_stand_beside_the_estimate():
+    def normal(names, mean, **more):
+        size = len(names)
+        ends = np.full(size, -9.0), np.full(size, 9.0)
+        return Posterior(names, ("linear",) * size, np.array(mean), np.eye(size), *ends, **more)
+
+    other = Alternative("with drag", 0.3, normal(("gain", "drag"), [2.5, 0.1]))
+    own = normal(("gain",), [2.0], without={"drag": 0.0}, others=(other,))
+    found = Identification("robot", (), Judgement("", ()), (), posterior=own)
+    (table,) = _alternatives(found)
+    assert table.columns == ("parameter", "estimate", "with drag")
+    assert table.rows == [["share of the draws", "70 %", "30 %"], ["gain", "2.00", "2.50"], ["drag", MISSING, "0.100"]]
+    assert _alternatives(replace(found, posterior=replace(own, others=()))) == []
