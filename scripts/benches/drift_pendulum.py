@@ -89,7 +89,8 @@ class Pendulum:
 
     def success(self, bundle: Any, options: Any) -> list[float]:
         """Return the success of each deployment of a trained policy: see ``randomise``."""
-        return [randomise.deployed(self.robot, bundle, options, 100 + trial) for trial in range(options.trials)]
+        motions = [randomise.played(self.robot, bundle, options, 100 + trial) for trial in range(options.trials)]
+        return [randomise.upright(*motion, randomise.STILL_RAD_S) for motion in motions]
 
 
 def swing_up(robot: hidden.Hidden) -> hidden.Controller:

@@ -113,14 +113,14 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
             begin = time.perf_counter()
             try:
                 bundle, about = sim2real.train(pipeline, train_config(pipeline, way, number, options), identified)
-                played = deployed(robot, pipeline, bundle, options, Path(folder) / way)
+                motions = deployed(robot, pipeline, bundle, options, Path(folder) / way)
             except Sim2RealError as error:  # what is not trained, or is stopped by the gate, succeeds never
                 ways[way] = {"success": [0.0] * options.trials, "refused": str(error)}
                 print(f"robot {number}, {way}: {error}", flush=True)
                 continue
             ways[way] = {
-                "success": [upright(*motion, np.inf) for motion in played],
-                "still": [upright(*motion, STILL_RAD_S) for motion in played],
+                "success": [upright(*motion, np.inf) for motion in motions],
+                "still": [upright(*motion, STILL_RAD_S) for motion in motions],
                 "in simulation": about["success in simulation"],
                 "seconds": time.perf_counter() - begin,
             }
@@ -156,11 +156,20 @@ def deployed(
     """Return times [s], true angles [rad] and speeds [rad/s] of each deployment of a policy."""
     if options.clock == "wall":
         return hidden_wall.deploy(pipeline, bundle, folder, options.seconds, options.trials)
-    played = [
-        hidden.play(robot, controller(bundle, options.volts), options.seconds, 1 + trial)
-        for trial in range(options.trials)
-    ]
-    return [(p.t, p.angle, p.speed) for p in played]
+    return [played(robot, bundle, options, 1 + trial) for trial in range(options.trials)]
+
+
+def played(robot: hidden.Hidden, bundle: Any, options: argparse.Namespace, session: int) -> tuple[np.ndarray, ...]:
+    """Return times [s], true angles [rad] and speeds [rad/s] of a session on the simulated clock.
+
+    Args:
+        robot: The robot.
+        bundle: The policy.
+        options: Length and largest voltage.
+        session: Its number.
+    """
+    found = hidden.play(robot, controller(bundle, options.volts), options.seconds, session)
+    return found.t, found.angle, found.speed
 
 
 def upright(t_s: np.ndarray, angle: np.ndarray, speed: np.ndarray, fastest: float) -> float:
