@@ -149,7 +149,7 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
         paused = rng.random(count) < robot.hiccups[0] / RATE_HZ
         took["agent"] += np.where(paused, rng.gamma(4.0, robot.hiccups[1] / 4.0, count), 0.0)
     noise = robot.noise * np.array([1.0, SPEED_NOISE]) * rng.standard_normal((count, 2)) if robot.noise else None
-    t_step, begin_agent, begin_actuator, sent = _one_after_another(count, took)
+    t_step, begin_agent, begin_actuator, sent = one_after_another(count, took)
     acts = np.maximum.accumulate(sent + lags)
     measured, volts = np.zeros((count, 2)), np.zeros(count)
     now, done = 0, -1
@@ -172,15 +172,20 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
     return Played(times, angle[: now + 1], speed[: now + 1], starts, ends, measured, volts)
 
 
-def _one_after_another(count: int, took: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+def one_after_another(count: int, took: dict[str, np.ndarray], rate_hz: float = RATE_HZ) -> tuple[np.ndarray, ...]:
     """Return when each step of sensor, agent and actuator starts, and when the last ends, all ``(N,)`` [s].
 
     A node waits for its input, and for its own last step to end.
+
+    Args:
+        count: Steps of each.
+        took: Node -> how long its steps take ``(N,)`` [s].
+        rate_hz: Steps per second [Hz].
     """
     starts = {n: np.zeros(count) for n in took}
     ends = {n: np.zeros(count) for n in took}
     for k in range(count):
-        ready = k / RATE_HZ
+        ready = k / rate_hz
         for node in ("sensor", "agent", "actuator"):
             starts[node][k] = max(ready, ends[node][k - 1]) if k else ready
             ready = ends[node][k] = starts[node][k] + took[node][k]

@@ -23,7 +23,7 @@ from sim2real.artifacts.manifest import git_state, plain, read_manifest, reserve
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
-TESTS = ("latency", "explain")
+TESTS = ("latency", "explain", "design")
 """What has a folder in a run as stages have, but no other stage takes up."""
 DRY = "dry run"
 """Status of a stage that ended well but moved nothing: later stages do not use it."""
@@ -316,9 +316,10 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     own = finished(run_dir, stage) if run_dir else None
     if own is not None:
         return own
-    candidates = [done for folder in run_folders(root, pipeline) if (done := finished(folder, stage)) is not None]
+    folders = sorted((Path(root) / pipeline).glob("*"))
+    candidates = [done for folder in folders if (done := finished(folder, stage)) is not None]
     if not candidates:
-        others = [attempt for folder in run_folders(root, pipeline) for attempt in attempts(folder, stage)]
+        others = [attempt for folder in folders for attempt in attempts(folder, stage)]
         dry = sum(attempt.dry for attempt in others)
         kinds = [(len(others) - dry, "unfinished"), (dry, "dry run" if dry == 1 else "dry runs")]
         also = ", ".join(f"{count} {kind}" for count, kind in kinds if count)

@@ -9,17 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.manifest import plain
 from sim2real.artifacts.run_folder import newest
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.episode import Episode, Steps, named_leaves
-from sim2real.graph.node import TICKS_PER_S, to_ticks
-from sim2real.graph.schedule import draw
-from sim2real.graph.times import Vertex
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify import excitation, identifiability, uncertainty
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
@@ -28,13 +25,13 @@ from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
 from sim2real.robots.base import Robot
 from sim2real.robots.worlds import in_world
-from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages import advice
-from sim2real.stages.config import CheckConfig, IdentifyConfig, RecordConfig
+from sim2real.stages.config import CheckConfig, IdentifyConfig
 from sim2real.stages.console import note, pairs, shown, table
 from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
 from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.planned import simulate
 from sim2real.stages.recordings import open_recording
 from sim2real.stages.robot import moving_robot
 
@@ -121,7 +118,12 @@ def find_source(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
             hint="name a log with --log FILE",
         )
-    return JudgedLogs([PLANNED], [simulate(model, moving_robot(pipeline), config.record, parameters, fitting)], True)
+    moving = moving_robot(pipeline)
+    commands = len(moving.action)
+    signal = moving.around(command_signal(config.record, moving.rate_hz, commands).reshape(-1, commands))
+    table = parameters.for_recordings(1)
+    values = table.of_recording(table.decode(table.start()), 0)
+    return JudgedLogs([PLANNED], [simulate(model, moving, signal, values, fitting, config.record.seed)], True)
 
 
 def judge(
@@ -238,53 +240,6 @@ def cut(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span]
     return spans, length_s
 
 
-def simulate(
-    model: IdentifiableModel, robot: Robot, record: RecordConfig, parameters: ParameterTable, config: IdentifyConfig
-) -> Episode:
-    """Return the log that the planned excitation would give if the robot were the nominal model.
-
-    Args:
-        model: The model.
-        robot: Says which command is excited, and at which rate.
-        record: The excitation.
-        parameters: The model's parameters.
-        config: For which delays the model is made.
-    """
-    nodes = model.nodes(config.max_delay_s)
-    node, field = robot.roles.actuator, robot.command
-    signal = command_signal(record, robot.rate_hz, len(robot.action)).reshape(-1, len(robot.action))
-    signal = robot.around(signal)
-    timeline = draw(nodes, record.duration_s, rng=record.seed)
-    given, outputs = {}, {}
-    for name in model.given:
-        message = nodes[name].init_output(jax.random.key(0), None)
-        count = timeline.vertices[name].start.shape[1]
-        rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
-        if name == node:
-            played = signal[np.minimum(np.arange(count), len(signal) - 1)]
-            rows[field] = played.reshape(rows[field].shape)
-        leaves, kind = jax.tree_util.tree_flatten(message)
-        given[name] = kind.unflatten(
-            [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
-        )
-        outputs[name] = rows
-    graph = CompiledGraph(nodes, model.sensor, timeline, given)
-    parameters = parameters.for_recordings(1)
-    values = parameters.of_recording(parameters.decode(parameters.start()), 0)
-    rest = named_leaves(nodes[model.sensor].init_output(jax.random.key(0), None))
-    start = [float(c.of(np.asarray(rest[c.position]))) for c in model.channels]
-    params = model.params(values, jnp.array([*start, *[0.0] * len(start)], jnp.float32))
-    gs = graph.init(jax.random.key(0), params=params, eps=0)
-    _, records = jax.jit(lambda state: graph.rollout(state, record=(model.sensor,)))(gs)
-    found = records[model.sensor]
-    seq = np.asarray(found.seq)
-    made = np.flatnonzero(seq >= 0)[np.argsort(seq[seq >= 0], kind="stable")]
-    outputs[model.sensor] = {n: np.asarray(v)[made] for n, v in named_leaves(found.output).items()}
-    early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
-    steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
-    return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
-
-
 def show(found: dict[str, Any]) -> None:
     """Print what was found, for people."""
     for r in found["recordings"]:
@@ -392,9 +347,3 @@ def _motion_rows(joints: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
 
 def _as_json(found: excitation.Histogram) -> dict[str, Any]:
     return {**asdict(found), "covered": found.covered}
-
-
-def _steps(vertex: Vertex, count: int, early: int) -> Steps:
-    """Return the steps of one drawn node as a log has them, ``early`` ticks before."""
-    start, end = (np.maximum(times[0, :count] - early, 0) for times in (vertex.start, vertex.end))
-    return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))

@@ -15,6 +15,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify import drift, prediction
 from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
@@ -109,15 +110,25 @@ def segments(
     if len(spans) < _LEAST or seconds < _LEAST_S:
         moving = f", {length_s * len(spans):.1f} s of them in motion,"
         raise Sim2RealError(f"{seconds:.1f} s of deployment{moving} are too little to test the model on")
+    return Problem(model, list(episodes), spans, length_s, config, known_table(model.parameters, found)), ahead_s
+
+
+def known_table(parameters: ParameterTable, found: Identification) -> ParameterTable:
+    """Return parameters with what was fixed when they were identified, and with bounds that hold all of the search's.
+
+    Args:
+        parameters: The model's.
+        found: What was identified.
+    """
     fixed = {p.name: p.estimate for p in found.parameters if p.verdict == "fixed"}
-    table = model.parameters.with_fixed({n: v for n, v in fixed.items() if n in {p.name for p in model.parameters}})
+    table = parameters.with_fixed({n: v for n, v in fixed.items() if n in {p.name for p in parameters}})
     free = {p.name for p in table if p.free}
     wider = {
         p.name: (min(p.lower, table[p.name].low), max(p.upper, table[p.name].high))
         for p in found.parameters
         if p.name in free and p.kind != "delay" and p.lower is not None and p.upper is not None
     }
-    return Problem(model, list(episodes), spans, length_s, config, table.with_bounds(wider)), ahead_s
+    return table.with_bounds(wider)
 
 
 def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s: float) -> bool:

@@ -14,7 +14,9 @@ from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.stages import advice, check
 from sim2real.stages.config import CheckConfig, RecordConfig
+from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.planned import simulate
 
 COMMANDS = ("sim2real identify pendulum", "sim2real record pendulum")
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"
@@ -124,7 +126,9 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
     robot = pipeline.load()
     model = robot.identifiable(0.06)
     record = RecordConfig(duration_s=2.0, amplitude=1.0, low_hz=0.7, high_hz=2.0)
-    episode = check.simulate(model, robot, record, model.parameters, replace(pipeline.identify, max_delay_s=0.06))
+    table, fitting = model.parameters, replace(pipeline.identify, max_delay_s=0.06)
+    signal = excitation(record, robot.rate_hz).reshape(-1, 1)
+    episode = simulate(model, robot, signal, table.decode(table.start()), fitting)
     th = episode.outputs["sensor"]["th"]
     assert len(th) == len(episode.steps["sensor"])
     assert th[0] == pytest.approx(np.pi, abs=1e-3)
