@@ -26,6 +26,8 @@ _ALIKE = 0.02
 """Changes whose shares of the error that they take away differ by less explain as much."""
 _POLISH = 12
 """Most simulations of the log between the best of these and its neighbours."""
+_MOTION_S = 1.0
+"""Within so long [s] a model that is not of the robot's form errs alike: a swing or a reach is one motion."""
 _FELT = 1e-3
 """A change over all of the bounds moves residuals by at least so many of their variances where a log feels it."""
 Causes = Mapping[str, Mapping[str, float]]
@@ -141,7 +143,8 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
 
     The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
     sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
-    errors, in whatever direction, move the size.
+    errors, in whatever direction, move the size; what the model's own errors add to them differs from motion to motion,
+    so that the more motions a log has, the less it is.
     """
     table = problem.table
 
@@ -167,14 +170,14 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
     segments = information**2 / float(np.sum(said**2))
     pulls = np.sum(J * at.residuals, axis=(1, 2))
     spread = float(np.sum(pulls**2)) / information**2 * segments / max(segments - 1.0, 0.5)
-    open_before = widening**2 * posterior.covariance
     # Residuals are large where much moves, and there the log says most: each segment counts with its own.
     squares, counted = np.sum(at.residuals**2, axis=(1, 2)), np.count_nonzero(at.residuals, axis=(1, 2))
     uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)
     own = max(variance * float(said @ uneven) / information**2, spread)
     carried = np.einsum("scf,scfp->p", J, at.jacobian) / information
-    before = float(carried @ open_before @ carried)
-    return Fitted(way, size, own, before, segments, _with_the_rest(at, open_before, variance))
+    motions = max(segments * problem.segment_s / _MOTION_S, 1.0)
+    before = float(carried @ posterior.covariance @ carried) * (1.0 + (widening**2 - 1.0) / motions)
+    return Fitted(way, size, own, before, segments, _with_the_rest(at, widening**2 * posterior.covariance, variance))
 
 
 def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> float:

@@ -1,0 +1,99 @@
+"""A robot that changes between two iterations of a run: the verdict says so, and the run mends it by itself.
+
+Stages and verdicts are real; the robot is a hidden pendulum on a simulated clock, so that no busy machine disturbs it.
+"""
+
+import importlib
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.deployment import PROBE, Deployment, Gap, Scores, log_of
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.iterations import Iterations
+from sim2real.artifacts.recording import LOG, Recording
+from sim2real.artifacts.run_folder import STAGES, attempts, finished, open_stage
+from sim2real.robots.loop import DELAYS
+from sim2real.stages import running
+from sim2real.stages.flags import RunFlags
+from sim2real.stages.judging import judged
+from sim2real.stages.pipeline import load_pipeline
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+from benches import hidden_robots as hidden
+from benches import randomise
+
+pytestmark = pytest.mark.slow
+MORE_S = 0.030
+IDEAL = hidden.Wear(jitter_s=0.001, lost=0.0, play_rad=0.0)
+
+
+def tiny(pipeline):
+    """Return each stage's configuration, with budgets of seconds."""
+    ppo = replace(pipeline.train.ppo, total_steps=512, num_envs=16, minibatches=2, evaluations=1)
+    train = {"episode_s": 2.0, "timelines": 4, "force": True, "sensitivity": False, "ppo": ppo}
+    return {
+        "record": replace(pipeline.record, duration_s=12.0),
+        "identify": replace(pipeline.identify, generations=10, population=8, refine=1, folds=0, free_run_s=0.0),
+        "train": replace(pipeline.train, **train),
+        "deploy": replace(pipeline.deploy, episodes=1, duration_s=4.0),
+    }
+
+
+@pytest.fixture
+def world(tmp_path):
+    """A robot, and what runs its stages: it becomes later when the first policy was trained."""
+    pipeline, root = load_pipeline("pendulum"), tmp_path / "runs"
+    robot = hidden.Hidden.draw(1, IDEAL)
+    later = replace(robot, acting=robot.acting + MORE_S)
+
+    def record(stage, config, run_dir):
+        now = later if run_dir else robot
+        session = hidden.play(now, hidden.excited(config.duration_s, 0), config.duration_s, 0)
+        hidden.write(stage.output("log", LOG), session)
+
+    def deploy(stage, config, run_dir):
+        bundle = Bundle.load(finished(run_dir, "train").output("bundle"))
+        policy = randomise.controller(bundle, 2.0)
+        stage.output("log_0", log_of(stage.folder, 0).name)
+        hidden.write(log_of(stage.folder, 0), hidden.play(later, policy, config.duration_s, 1))
+        hidden.write(stage.output("probe", PROBE), hidden.play(later, hidden.probed(), 8.0, 2))
+        logs = (Recording.load(log_of(stage.folder, 0)),)
+        gap = (Gap("success", 0.0, None, None),)
+        found = Deployment(
+            (Scores({"success": 0.0}),), gap, recordings=logs, probe=Recording.load(stage.folder / PROBE)
+        )
+        known = Identification.load(finished(run_dir, "identify").output("parameters"))
+        for name, file in judged(found, pipeline, bundle, known, stage.folder).save(stage.folder).items():
+            stage.output(name, file)
+
+    def call(name, config, run_dir):
+        if name in ("identify", "train"):
+            return importlib.import_module(f"sim2real.stages.{name}").run(pipeline, config, root, run_dir)
+        with open_stage(root, pipeline.name, name, config, run_dir=run_dir) as stage:
+            {"record": record, "deploy": deploy}[name](stage, config, run_dir)
+        return stage.result
+
+    return pipeline, root, call
+
+
+def test_a_robot_that_became_later_is_identified_anew_and_deployed_again(world):
+    pipeline, root, call = world
+    running.run_all(pipeline, RunFlags(iterations=2, runs=root, **tiny(pipeline)), call)
+    (run_dir,) = (root / "pendulum").iterdir()
+    first, second = Iterations.load(run_dir).rows
+    assert (first.stages, first.verdict) == (STAGES, "re-identify")
+    assert first.why.startswith("the robot has changed: round_trip_delay is ")
+    assert first.then == "record, identify, train, deploy"
+    assert second.stages == tuple(f"{stage}.2" for stage in STAGES)
+    assert second.verdict != "re-identify", "what was identified anew is the robot as it is"
+    folders = {a.folder.name: a for a in (*attempts(run_dir, "deploy"), *attempts(run_dir, "identify"))}
+    named = Deployment.read(folders["deploy"].folder).drift.named
+    assert named.now - named.before == pytest.approx(MORE_S, abs=0.006)
+    values = [Identification.load(folders[n].output("parameters")).values for n in ("identify", "identify.2")]
+    before, after = (sum(own[name] for name in DELAYS) for own in values)
+    assert after - before == pytest.approx(MORE_S, abs=0.006)
+    assert "the robot has changed: round_trip_delay" in (run_dir / "report.html").read_text()
