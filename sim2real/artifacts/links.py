@@ -49,3 +49,19 @@ class Link:
     def told_apart(self) -> bool:
         """Whether the mean is this link's alone."""
         return len(self.parts) == 1
+
+    def rows(self) -> list[tuple[str, Ranged, float, str]]:
+        """Return what is known of it: what it is, the number, the factor to the unit that people read, and that unit.
+
+        Of a sum, its parts are named.
+        """
+        whole, own = " + ".join(self.parts), self.name
+        shown = [
+            (f"{whole}, mean", self.mean, 1e3, "ms"),
+            (f"{whole}, 95 % of the messages", self.p95, 1e3, "ms"),
+            (f"{own}, deviation", self.deviation, 1e3, "ms"),
+            (f"{own}, lost", self.lost, 100.0, "%"),
+            (f"{own}, lost in a row", self.burst, 1.0, ""),
+            (f"{own}, drift of the clock", self.drift, 1e6, "us/s"),
+        ]
+        return [row for row in shown if row[1].value is not None]

@@ -191,9 +191,7 @@ def show(found: Identification) -> None:
         errors = [[row.name, *(row.rmse.get(m) for m in models), row.unit] for row in found.held_out]
         print(table(errors, [f"off {found.held_out[0].horizon_s:g} s ahead, held out", *models, "unit"]))
     if found.links:
-        print(
-            table([r for link in found.links for r in _link_rows(link)], ["link", "estimate", "95 % interval", "unit"])
-        )
+        print(link_table(found.links))
     note(f"verdict: {found.verdict.status}")
     for reason in found.verdict.reasons:
         note(f"  {reason}")
@@ -201,22 +199,14 @@ def show(found: Identification) -> None:
         note(f"next: {found.verdict.next}")
 
 
-def _link_rows(link: Link) -> list[list[Any]]:
-    """Return a link's numbers for a table: of a sum, its parts are named."""
-    whole, own = " + ".join(link.parts), link.name
-    shown = [
-        (f"{whole}, mean", link.mean, 1e3, "ms"),
-        (f"{whole}, 95 % of the messages", link.p95, 1e3, "ms"),
-        (f"{own}, deviation", link.deviation, 1e3, "ms"),
-        (f"{own}, lost", link.lost, 100.0, "%"),
-        (f"{own}, lost in a row", link.burst, 1.0, ""),
-        (f"{own}, drift of the clock", link.drift, 1e6, "us/s"),
+def link_table(links: Sequence[Link]) -> str:
+    """Return what was found of links, as a table with a 95 % interval a number."""
+    rows = [
+        [name, factor * number(r.value), f"[{factor * number(r.low95):.4g}, {factor * number(r.high95):.4g}]", unit]
+        for link in links
+        for name, r, factor, unit in link.rows()
     ]
-    return [
-        [name, factor * r.value, f"[{factor * number(r.low95):.4g}, {factor * number(r.high95):.4g}]", unit]
-        for name, r, factor, unit in shown
-        if r.value is not None
-    ]
+    return table(rows, ["link", "estimate", "95 % interval", "unit"])
 
 
 def summary(found: Identification) -> dict[str, Any]:

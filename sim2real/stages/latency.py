@@ -13,6 +13,7 @@ from sim2real.robots.base import Robot
 from sim2real.stages.config import LatencyConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.excitation import excitation
+from sim2real.stages.identified import link_table
 from sim2real.stages.identify import identify
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.record import record
@@ -49,8 +50,10 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
         with progress(None, "latency: picture"):
             from sim2real.view.latency import picture  # matplotlib takes 0.5 s to import
 
-            picture(stage.output("picture", _PICTURE), latency, recording, chain)
+            picture(stage.output("picture", _PICTURE), latency, recording, chain, found.links if found else ())
         print(table(*rows(latency)))
+        if found is not None and found.links:
+            print(link_table(found.links))
         stage.summary(_summary(latency, found, recording))
     return stage.result
 

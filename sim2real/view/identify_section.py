@@ -28,6 +28,7 @@ from sim2real.view.blocks import (
     number,
     pretty_unit,
 )
+from sim2real.view.links import link_blocks
 from sim2real.view.readable import in_readable_unit
 
 _TITLES: dict[str, tuple[Tone, str]] = {
@@ -47,6 +48,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
         *_aggregate(found),
         *_parts(found),
         *_alternatives(found),
+        *link_blocks(found.links),
         *_predictions(found),
         *_residuals(found),
         *_correlation(found),

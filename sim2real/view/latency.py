@@ -9,31 +9,39 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.latency import Latency, measured
+from sim2real.artifacts.links import Link
 from sim2real.artifacts.recording import Recording
+from sim2real.view.links import draw_link
 from sim2real.view.style import BLUE, MUTED, ORANGE, PURPLE, new_figure, styled
 
 _COLORS = {"host": BLUE, "bus": ORANGE, "device": PURPLE}
 _BINS = 60
 
 
-def picture(path: Path, latency: Latency, recording: Recording, chain: Sequence[str]) -> None:
-    """Draw a bar of the medians, and a histogram of each part that the clocks saw, into a PNG file.
+def picture(
+    path: Path, latency: Latency, recording: Recording, chain: Sequence[str], links: Sequence[Link] = ()
+) -> None:
+    """Draw a bar of the medians, and how each part that the clocks saw, or the motion, scatters, into a PNG file.
 
     Args:
         path: The file.
         latency: What is drawn.
         recording: The session behind it.
         chain: The nodes, as in `Latency.of`.
+        links: What the motion tells of how the device's delays are distributed.
     """
     parts = list(measured(recording, chain))
     with styled():
-        figure = new_figure(1.6 + 1.1 * len(parts))
-        axes = figure.subplots(1 + len(parts), 1, height_ratios=[1.4, *[1.0] * len(parts)])
+        count = len(parts) + len(links)
+        figure = new_figure(1.6 + 1.1 * count)
+        axes = figure.subplots(1 + count, 1, height_ratios=[1.4, *[1.0] * count])
         _budget(axes[0], latency)
-        for ax, (name, where, took, _) in zip(axes[1:], parts, strict=True):
+        for ax, (name, where, took, _) in zip(axes[1 : 1 + len(parts)], parts, strict=True):
             _histogram(ax, 1e3 * took, _COLORS[where])
             ax.set_title(f"{name}: {where}, {took.size} times")
-        axes[-1].set_xlabel("ms; lines at the median and at 99 %")
+        axes[len(parts)].set_xlabel("ms; lines at the median and at 99 %")
+        for ax, link in zip(axes[1 + len(parts) :], links, strict=True):
+            draw_link(ax, link)
         figure.savefig(path, dpi=110, facecolor="white")
 
 

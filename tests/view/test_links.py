@@ -1,0 +1,51 @@
+"""What was found of links, on a page: a distribution, and numbers in the units that people read."""
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.links import Link, Ranged
+from sim2real.view.links import draw_link, link_blocks
+from sim2real.view.style import new_figure, styled
+
+
+@pytest.fixture
+def link():
+    """Two modes at 4 and 12 ms, of which a part of all messages is lost two in a row; no drift is known."""
+    delays = np.linspace(0.0, 0.02, 81)
+    share = np.exp(-0.5 * ((delays - 0.004) / 5e-4) ** 2) + 0.5 * np.exp(-0.5 * ((delays - 0.012) / 5e-4) ** 2)
+    return Link(
+        name="sensor_delay",
+        parts=("sensor_delay", "actuator_delay"),
+        mean=Ranged(0.0067, 0.0065, 0.0069),
+        deviation=Ranged(0.0038, 0.0036, 0.004),
+        p95=Ranged(0.0126, 0.0124, 0.0128),
+        lost=Ranged(0.03, 0.02, 0.04),
+        burst=Ranged(2.1, 1.8, 2.4),
+        drift=Ranged(None, None, None),
+        delays=delays,
+        share=share / share.sum(),
+    )
+
+
+def test_numbers_stand_with_their_intervals_and_what_is_not_known_is_left_out(link):
+    _, table = link_blocks([link])
+    assert [row[0] for row in table.rows] == [
+        "sensor_delay + actuator_delay, mean", "sensor_delay + actuator_delay, 95 % of the messages",
+        "sensor_delay, deviation", "sensor_delay, lost", "sensor_delay, lost in a row",
+    ]  # fmt: skip
+    assert table.rows[0][1:] == ["6.70", "6.50", "6.90", "ms"]
+    assert table.rows[3][1:] == ["3.00", "2.00", "4.00", "%"]
+    assert link_blocks([]) == []
+
+
+def test_the_distribution_is_drawn_where_messages_are_with_mean_and_95_percent(link):
+    with styled():
+        ax = new_figure(2.0).subplots()
+        draw_link(ax, link)
+    assert sorted(float(line.get_xdata()[0]) for line in ax.lines) == pytest.approx([6.7, 12.6])
+    (filled,) = ax.collections
+    x, y = filled.get_paths()[0].vertices.T
+    assert 1.0 < x.min() < 3.0
+    assert 13.0 < x.max() < 15.0
+    assert y.max() == pytest.approx(100.0 * link.share.max())
+    assert "3 % lost, 2.1 in a row" in ax.get_title("left")
