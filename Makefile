@@ -11,7 +11,7 @@ SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECO
 demo: $(READY)
 	$(BIN)/sim2real demo
 
-# Two workers compute; the third keeps time, so mostly waits. Types are checked beside them.
+# Three workers on two cores: those that keep time mostly wait. Types are checked beside them.
 test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check

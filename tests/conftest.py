@@ -50,23 +50,24 @@ settings.register_profile("sim2real", deadline=None)
 settings.load_profile("sim2real")
 
 
-# Rooms that take longest go to the workers first, so that neither is left with a long one at the end.
-LONGEST = ("real time", "identify", "composer", "train", "robots", "runtime", "integration", "pipelines")
+KEEP_TIME = ("whole runs", "real time")
+# Rooms that take longest go to the workers first, so that none is left with a long one at the end.
+LONGEST = (*KEEP_TIME, "identify", "composer", "train", "robots", "runtime", "integration", "pipelines")
 
 
 @functools.cache
 def room(path):
-    """The folder under tests/ that a module is in; of modules whose tests keep real time: "real time"."""
+    """The folder under tests/ that a module is in; modules whose tests keep real time have two rooms of their own."""
     if re.search(r"^pytestmark = .*\brealtime\b", (REPOSITORY / path).read_text(), re.MULTILINE):
-        return "real time"
+        return KEEP_TIME[Path(path).parts[1] != "integration"]
     return Path(path).parts[1]
 
 
 class RoomScheduling(LoadScopeScheduling):
     """Give each room to one worker, which so builds its fixtures and compiles its programs once.
 
-    All tests in real time go to the same one: two at a time would keep each other from their deadlines. The others step
-    back for it.
+    Tests in real time go to two of them: whole runs, which compile and then mostly wait, and the others. No two of a
+    room run at a time: they would keep each other from their deadlines. What only computes steps back for both.
     """
 
     def _split_scope(self, nodeid):
@@ -85,7 +86,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_runtest_setup(item):
-    if "PYTEST_XDIST_WORKER" in os.environ and room(item.nodeid.split("::")[0]) != "real time":
+    if "PYTEST_XDIST_WORKER" in os.environ and room(item.nodeid.split("::")[0]) not in KEEP_TIME:
         os.setpriority(os.PRIO_PROCESS, 0, 10)
 
 

@@ -195,7 +195,7 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     """Deploy, let the fault happen, and see what comes of it.
 
     Raises:
-        NotBegun: The deployment did not begin to move.
+        NotBegun: The deployment did not begin to move, or a busy machine stopped it before the fault.
     """
     draw = random.Random(f"{fault.name}/{seed}")
     robot = load_pipeline("pendulum").load()
@@ -219,7 +219,10 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
         time.sleep(0.3)  # the last commands take effect
     words = said.read_text(errors="replace")
     (log,) = (folder / "runs").glob("pendulum/*/deploy/episode_0.mcap")
-    safe_s = safe_after(read_truth(truth), began_ns)
+    account = read_truth(truth)
+    if stopped_before(account, began_ns):
+        raise NotBegun(f"the motor stopped before the fault: {words}")
+    safe_s = safe_after(account, began_ns)
     right = code in fault.codes and fault.said in words and (fault.name == KILLED or "error: " in words)
     return Outcome(fault.name, seed, safe_s, code, words.strip()[-300:], _readable(log), right)
 
@@ -280,6 +283,13 @@ def safe_after(truth: Truth, since_ns: int) -> float:
     if not turning.size or turning[-1] + 1 == len(off):
         return 0.0 if not turning.size else float("inf")
     return max(0.0, 1e-9 * float(effects["t_ns"][turning[-1] + 1] - since_ns))
+
+
+def stopped_before(truth: Truth, at_ns: int) -> bool:
+    """Return whether the motor's torque was off at a moment [ns]."""
+    effects = truth.of(Kind.EFFECT)
+    before = effects["values"][effects["t_ns"] < at_ns, 0]
+    return not len(before) or before[-1] == OperatingMode.OFF
 
 
 def wait_until_moving(truth: Path, said: Path, child: BaseProcess) -> None:
