@@ -114,10 +114,10 @@ LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train agai
 def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
     """Its policy was refused before it moved anything, so nothing is known of the robot as it is now."""
     again, rows = world.go(LATER, verdict("fine", 1.0))
-    assert again == ["record", "identify", "train", "deploy"]
+    assert again == ["design", "record", "identify", "train", "deploy"]
     assert [(r.verdict, r.why, r.stages) for r in rows] == [
         ("re-identify", "the delay is 60 ms", ("record", "identify", "train")),
-        ("fine", "why", ("record.2", "identify.2", "train.2", "deploy.2")),
+        ("fine", "why", ("design", "record.2", "identify.2", "train.2", "deploy.2")),
     ]
     assert dict(world.calls[4:])["identify"].log == ()
 
