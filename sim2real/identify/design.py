@@ -51,11 +51,12 @@ class Scatter:
         errors, rates = np.concatenate(rows, axis=1)
         size = float(np.mean(rates**2)) or 1.0  # both columns of one size
         causes, weight = np.stack([np.ones_like(rates), rates**2 / size], axis=1), np.ones_like(rates)
+        parts = np.zeros(2)
         for _ in range(_ROUNDS):  # squares scatter as their own mean: large ones say less
-            white, jitter = nnls(causes / weight[:, None], errors**2 / weight)[0]
-            weight = np.maximum(causes @ [white, jitter], 1.0)
+            parts = nnls(causes / weight[:, None], errors**2 / weight)[0]
+            weight = np.maximum(causes @ parts, 1.0)
         # A reading is no surer than its own deviation.
-        return Scatter(max(white, 1.0) * inflation, jitter / size * inflation)
+        return Scatter(max(float(parts[0]), 1.0) * inflation, float(parts[1]) / size * inflation)
 
 
 def _errors(found: Identification, field: str) -> list[np.ndarray]:

@@ -20,7 +20,6 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import linearise, time_shift
 from sim2real.robots.loop_robot import LoopRobot
-from sim2real.stages import left_out
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.cutting import reach
 from sim2real.stages.design_config import DesignConfig
@@ -130,7 +129,6 @@ class Planner:
             table = model.parameters.for_recordings(1)
             values = table.of_recording(table.decode(table.start()), 0)
             return Planner(robot, model, table, values, Knowledge.of(table, None), Scatter(), fitting, config)
-        robot = left_out.having(robot, [p.name for p in found.parameters])
         model = robot.identifiable(fitting.max_delay_s)
         table = known_table(model.parameters, found).for_recordings(1)
         if found.posterior is None or found.posterior.names != table.names:
@@ -182,9 +180,8 @@ class Planner:
         """Return positions [rad] and magnitudes of the speeds [rad/s] of the joints, each ``(T, joints)``."""
         read, channels = episode.outputs[self.model.sensor], self.model.channels
         position = np.stack([np.asarray(c.of(read[c.position]), np.float64) for c in channels], axis=-1)
-        measured = [c.velocity for c in channels]
-        if None not in measured:
-            rows = [np.asarray(c.of(read[c.velocity]), np.float64) for c in channels]
+        rows = [np.asarray(c.of(read[c.velocity]), np.float64) for c in channels if c.velocity is not None]
+        if len(rows) == len(channels):
             return position, np.abs(np.stack(rows, axis=-1))
         return position, np.abs(np.gradient(position, 1.0 / self.robot.rate_hz, axis=0))
 

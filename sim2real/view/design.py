@@ -22,9 +22,9 @@ def picture(path: Path, design: Design) -> None:
     t_s = np.arange(len(design.commands)) / design.rate_hz
     with styled():
         figure = new_figure(2.0 + 1.3 * rows + 0.3 * len(design.expected))
-        grid = figure.add_gridspec(rows + 1, 1, height_ratios=[1.0] * rows + [0.6 + 0.2 * len(design.expected)])
-        for i in range(rows):
-            ax = figure.add_subplot(grid[i])
+        heights = [1.0] * rows + [0.6 + 0.2 * len(design.expected)]
+        panels = list(np.ravel(figure.subplots(rows + 1, 1, height_ratios=heights)))
+        for i, ax in enumerate(panels[:-1]):
             if i < design.commands.shape[1]:
                 ax.plot(t_s, design.commands[:, i], color=BLUE, label="command")
                 for limit in (design.low[i], design.high[i]):
@@ -32,10 +32,9 @@ def picture(path: Path, design: Design) -> None:
             if i < len(names):
                 ax.plot(design.t_s, design.predicted[:, i], color=ORANGE, label="predicted position [rad]")
                 ax.set_title(names[i])
-            if not i:
-                ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        ax.set_xlabel("s; dashed: limits of commands")
-        ax = figure.add_subplot(grid[rows])
+        panels[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        panels[-2].set_xlabel("s; dashed: limits of commands")
+        ax = panels[-1]
         place = np.arange(len(design.expected))[::-1]
         kinds = (("now", "now"), ("after_other", f"after a {design.other}"), ("after", "after the design"))
         for k, ((field, label), color) in enumerate(zip(kinds, (MUTED, PURPLE, BLUE), strict=True)):
@@ -43,6 +42,7 @@ def picture(path: Path, design: Design) -> None:
             ax.barh(place + 0.25 * (1 - k), percent, 0.25, color=color, label=label)
         ax.set_yticks(place, [e.name for e in design.expected])
         ax.set_xscale("log")
+        ax.xaxis.set_major_formatter("{x:g}")
         ax.set_xlabel("half of the 95 % interval to expect [%]")
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
         figure.savefig(path, dpi=110, facecolor="white")
