@@ -28,6 +28,8 @@ _POLISH = 12
 """Most simulations of the log between the best of these and its neighbours."""
 _MOTION_S = 1.0
 """Within so long [s] a model that is not of the robot's form errs alike: a swing or a reach is one motion."""
+_SHARED = 0.5
+"""Share of what such errors add that is the same in all motions of a policy, which may be slower than an excitation."""
 _FELT = 1e-3
 """A change over all of the bounds moves residuals by at least so many of their variances where a log feels it."""
 Causes = Mapping[str, Mapping[str, float]]
@@ -143,8 +145,8 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
 
     The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
     sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
-    errors, in whatever direction, move the size; what the model's own errors add to them differs from motion to motion,
-    so that the more motions a log has, the less it is.
+    errors, in whatever direction, move the size; what the model's own errors add to them differs in part from
+    motion to motion, and that evens out.
     """
     table = problem.table
 
@@ -176,7 +178,8 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) ->
     own = max(variance * float(said @ uneven) / information**2, spread)
     carried = np.einsum("scf,scfp->p", J, at.jacobian) / information
     motions = max(segments * problem.segment_s / _MOTION_S, 1.0)
-    before = float(carried @ posterior.covariance @ carried) * (1.0 + (widening**2 - 1.0) / motions)
+    wider = 1.0 + (widening**2 - 1.0) * (_SHARED + (1.0 - _SHARED) / motions)
+    before = wider * float(carried @ posterior.covariance @ carried)
     return Fitted(way, size, own, before, segments, _with_the_rest(at, widening**2 * posterior.covariance, variance))
 
 

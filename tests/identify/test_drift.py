@@ -115,7 +115,7 @@ def test_what_a_log_shows_is_named(true, named):
 
 
 @pytest.mark.parametrize(
-    ("widening", "segments", "alarm"), [(1.0, 40, True), (10.0, 40, True), (10.0, 5, False), (40.0, 40, False)]
+    ("widening", "segments", "alarm"), [(1.0, 40, True), (5.0, 40, True), (5.0, 3, False), (20.0, 40, False)]
 )
 def test_errors_of_the_model_in_other_motions_are_no_change(widening, segments, alarm):
     """What the identification leaves open, widened by its misfit, is not drift; over many motions misfits even out."""
