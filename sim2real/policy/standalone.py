@@ -27,4 +27,4 @@ class BarePolicy:
 
 
 if __name__ == "__main__":
-    print(BarePolicy(Path(__file__).resolve().parent)(np.float32(0.0)).tolist())  # where all that is seen is 0
+    print(BarePolicy(Path(__file__).resolve().parent)(np.zeros(())).tolist())  # where all that is seen is 0
