@@ -35,6 +35,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-s", type=float, default=20.0, help="length of the first recording [s]")
     parser.add_argument("--seconds", type=float, default=40.0, help="length of those that are compared [s]")
     parser.add_argument("--motions", type=int, default=0, help="motions to choose from; 0: the stage's default")
+    parser.add_argument("--motion-s", type=float, default=0.0, help="length of a motion [s]; 0: the stage's default")
     parser.add_argument("--generations", type=int, default=0, help="generations of each identification's search")
 
 
@@ -75,7 +76,7 @@ def compared(name: str, seed: int, folder: Path, options: argparse.Namespace) ->
         identified[key] = sim2real.identify(Recording.load(log), pipeline, fitting)
 
     recorded("first", usual(pipeline, replace(pipeline.record, duration_s=options.first_s, seed=3 * seed)), 3 * seed)
-    asked = replace(asked, motions=options.motions or asked.motions)
+    asked = replace(asked, motions=options.motions or asked.motions, motion_s=options.motion_s or asked.motion_s)
     planned = design(pipeline, identified["first"], asked)
     other = replace(pipeline.record, duration_s=options.seconds, seed=3 * seed + 1)
     recorded("usual", usual(pipeline, other), 3 * seed + 1)
