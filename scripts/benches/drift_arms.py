@@ -145,7 +145,8 @@ class ReachingArm:
     def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> None:
         """Run the loop on a simulated clock, from rest, and write its log."""
         robot, rng = self._robot, np.random.default_rng([self.number, session, 1])
-        plant, sheet, rest = load_plant(robot.embedded.plant, self.plant), robot.servos.sheet, robot.servos.at_rest
+        plant: Any = load_plant(robot.embedded.plant, self.plant)
+        sheet, rest = robot.servos.sheet, robot.servos.at_rest
         plant.data.qpos[:] = rest
         truth = TruthLog(Path(os.devnull), {"state_names": list(plant.state())})
         clock = PlantClock(plant, _STEP_NS, 0, round(2e9 * self.sensing_s), truth)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -249,8 +250,8 @@ def write_log(
     path: Path,
     pipeline: str,
     times: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
-    readings: Sequence[Mapping[str, np.ndarray]],
-    commands: Sequence[Mapping[str, np.ndarray]],
+    readings: Sequence[Mapping[str, Any]],
+    commands: Sequence[Mapping[str, Any]],
     units: Mapping[str, str],
 ) -> None:
     """Write the log of a loop of sensor, agent and actuator.

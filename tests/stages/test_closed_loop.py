@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches import hidden_robots as hidden
 from benches import randomise
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 MORE_S = 0.030
 IDEAL = hidden.Wear(jitter_s=0.001, lost=0.0, play_rad=0.0)
 

@@ -1,0 +1,68 @@
+"""The bench of drift: robots on simulated clocks that change as they are told, and outcomes that are kept."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2real.log.reader import read_log
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+from benches.drift_arms import ReachingArm, ReachingSO101
+from benches.drift_pendulum import Pendulum
+from benches.jobs import each
+
+KINDS = pytest.mark.parametrize("kind", [ReachingArm, ReachingSO101])
+
+
+def probed(robot, path):
+    """Return when each measurement of the small steps was made [s], where the joints were, and their goals [rad]."""
+    robot.probe(path, 1)
+    log = read_log(path)
+    return log.steps["sensor"].begun_s, log.outputs["sensor"]["position"], log.outputs["actuator"]["goal"]
+
+
+@KINDS
+def test_15_ms_more_delay_are_seen_in_the_small_steps(kind, tmp_path):
+    answered = []
+    for change in ("none", "delay"):
+        t_s, position, goal = probed(kind.draw(0).changed(change), tmp_path / f"{change}.mcap")
+        up = np.flatnonzero(np.diff(goal[:, 0]) > 0.1) + 1
+        assert up.size == 4
+        after = [position[i : i + 12, 0] - position[i, 0] for i in up]
+        answered.append([np.interp(0.03, a, t_s[i : i + 12] - t_s[i]) for a, i in zip(after, up, strict=True)])
+    assert np.mean(answered[1]) - np.mean(answered[0]) == pytest.approx(0.015, abs=0.004)
+
+
+@KINDS
+def test_a_payload_weighs_and_friction_brakes(kind, tmp_path):
+    def off(change):
+        kind.draw(0).changed(change).deploy(tmp_path / f"{change}.mcap", 8.0, 1)
+        log = read_log(tmp_path / f"{change}.mcap")
+        return np.abs(log.outputs["actuator"]["goal"] - log.outputs["sensor"]["position"])
+
+    none, friction, payload = (off(change) for change in ("none", "friction", "payload"))
+    assert np.abs(payload - none)[:, 1:3].max() > 0.02, "it pulls at the joints that lift"
+    assert np.abs(friction - none).max() > 0.01
+
+
+def test_the_same_number_is_the_same_robot():
+    for kind in (Pendulum, ReachingArm, ReachingSO101):
+        assert kind.draw(3) == kind.draw(3)
+        assert kind.draw(3).truth != kind.draw(4).truth
+
+
+def odd(number, options):
+    """Fail for one of the robots."""
+    if number == options.bad:
+        raise RuntimeError("a loose cable")
+    return {"number": number}
+
+
+def test_one_robot_that_fails_loses_no_other(capsys):
+    found, failed = each(odd, range(3), Namespace(jobs=1, bad=1))
+    assert [robot["number"] for robot in found] == [0, 2]
+    assert failed == [{"number": 1, "failed": "RuntimeError: a loose cable"}]
+    assert "a loose cable" in capsys.readouterr().err
