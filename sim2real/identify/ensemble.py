@@ -16,7 +16,6 @@ from sim2real.identify.uncertainty import Linearised, Uncertainty, centred, from
 
 _WORSE = 0.1
 """A model whose loss is larger by this share explains the recordings less well, whatever an approximation said."""
-
 _ROUNDS = 3
 
 
@@ -54,10 +53,12 @@ def _optima(found: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative
     """
     problem, table = found.problem, found.problem.table
     near, score, kept = [at.x], _by_segment(at.residuals), []
-    precision = np.linalg.pinv(spread.scale_covariance)
+    # Of what may as well be absent, any small value is the same.
+    told = np.flatnonzero([v != NEGLIGIBLE for v in spread.verdict])
+    precision = np.linalg.pinv(spread.scale_covariance[np.ix_(told, told)])
 
     def apart(x: np.ndarray) -> bool:
-        return all(float(d @ precision @ d) > len(x) for d in (x - other for other in near))
+        return all(float(d @ precision @ d) > len(d) for d in ((x - other)[told] for other in near))
 
     def as_good(residuals: np.ndarray) -> bool:
         off = _by_segment(residuals) - score
