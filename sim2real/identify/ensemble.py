@@ -16,7 +16,6 @@ from sim2real.identify.uncertainty import Linearised, Uncertainty, centred, from
 
 _WORSE = 0.1
 """A model whose loss is larger by this share explains the recordings less well, whatever an approximation said."""
-
 _ROUNDS = 3
 
 
@@ -53,31 +52,38 @@ def _optima(found: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative
     difference between segments. Then nothing tells them apart, and all have the same share.
     """
     problem, table = found.problem, found.problem.table
-    near, score, kept = [at.x], _by_segment(at), []
-    precision = np.linalg.pinv(spread.scale_covariance)
+    near, score, kept = [at.x], _by_segment(at.residuals), []
+    # Of what may as well be absent, any small value is the same.
+    told = np.flatnonzero([v != NEGLIGIBLE for v in spread.verdict])
+    precision = np.linalg.pinv(spread.scale_covariance[np.ix_(told, told)])
 
     def apart(x: np.ndarray) -> bool:
-        return all(float(d @ precision @ d) > len(x) for d in (x - other for other in near))
+        return all(float(d @ precision @ d) > len(d) for d in ((x - other)[told] for other in near))
+
+    def as_good(residuals: np.ndarray) -> bool:
+        off = _by_segment(residuals) - score
+        return len(off) > 1 and bool(off.mean() <= off.std(ddof=1) / np.sqrt(len(off)))
 
     for z, loss in found.refined[-1].ends if found.refined else ():
         if not loss <= (1.0 + _WORSE) * found.loss or not apart(table.scale(centred(problem, z))[0]):
             continue
-        if not apart(_descended(linearise(problem, centred(problem, z)))):
+        x, residuals = _descended(linearise(problem, centred(problem, z)))
+        if not (apart(x) and as_good(residuals)):
             continue
         # The estimate went on after the first round; so must what is compared with it.
         z = centred(problem, refine(problem, z[None], *effort(problem, _ROUNDS)).z)
         there = linearise(problem, z)
-        off = _by_segment(there) - score
-        if apart(there.x) and off.mean() <= off.std(ddof=1) / np.sqrt(len(off)):
+        if apart(there.x) and as_good(there.residuals):
             near.append(there.x)
             kept.append(table.posterior(z, from_linearised(problem, there).scale_covariance))
     return [Alternative("another optimum", 1.0 / len(near), p) for p in kept]
 
 
-def _descended(at: Linearised) -> np.ndarray:
-    """Return where the next step of a descent leads, on the parameters' scales, ``(P,)``."""
+def _descended(at: Linearised) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the next step of a descent leads, on the parameters' scales ``(P,)``, and the residuals there."""
     J = at.jacobian.reshape(-1, len(at.x))
-    return at.x - np.linalg.solve(J.T @ J + at.prior, J.T @ at.residuals.reshape(-1))
+    step = -np.linalg.solve(J.T @ J + at.prior, J.T @ at.residuals.reshape(-1))
+    return at.x + step, at.residuals + at.jacobian @ step
 
 
 def _models(every: Fit, found: Fit, spread: Uncertainty, choice: Selection) -> list[Alternative]:
@@ -120,10 +126,10 @@ def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTabl
     return covariance * np.outer(factor, factor)
 
 
-def _by_segment(at: Linearised) -> np.ndarray:
-    """Return the mean square of the residuals of each segment, ``(S,)``."""
-    squares = at.residuals.reshape(len(at.residuals), -1)
-    return np.sum(squares**2, axis=1) / np.maximum(np.count_nonzero(squares, axis=1), 1)
+def _by_segment(residuals: np.ndarray) -> np.ndarray:
+    """Return the mean square of the residuals ``(S, C, F)`` of each segment, ``(S,)``."""
+    rows = residuals.reshape(len(residuals), -1)
+    return np.sum(rows**2, axis=1) / np.maximum(np.count_nonzero(rows, axis=1), 1)
 
 
 def _named(table: ParameterTable, kept: np.ndarray) -> list[str]:

@@ -9,7 +9,8 @@ import pytest
 from scipy import optimize
 
 from sim2real.errors import Sim2RealError
-from sim2real.identify.refine import refine
+from sim2real.identify.config import FitConfig
+from sim2real.identify.refine import effort, refine
 
 
 def valley(z):
@@ -130,3 +131,24 @@ def test_the_pendulum_is_where_scipy_finds_it(fitted, refined):
     theirs, ours = decode(jnp.asarray(found.x, jnp.float32)), decode(jnp.asarray(refined.z))
     for group in ("gain", "gravity", "damping", "friction"):
         assert float(theirs[group]) == pytest.approx(float(ours[group]), rel=0.01)
+
+
+def test_rounds_on_c_are_short_and_as_many_steps_are_left():
+    compiled, c = (SimpleNamespace(config=FitConfig(), engine=SimpleNamespace(name=n)) for n in ("compiled", "c"))
+    assert effort(compiled, 3) == (25, 3)
+    steps, rounds = effort(c, 3)
+    assert steps < 25
+    assert steps * rounds >= 75
+    assert effort(c) == (steps, 1)
+    few = SimpleNamespace(config=FitConfig(refine_steps=3), engine=c.engine)
+    assert effort(few, 3) == (3, 3)
+
+
+def test_a_round_that_gains_less_than_is_asked_for_is_the_last(minimum):
+    start = np.array([[-1.2, 1.0]])
+    fine, coarse = (refine(stub(valley), start, steps=4, rounds=20, gain=g) for g in (1e-4, 0.9))
+    assert fine.loss == pytest.approx(minimum.cost / 3, rel=1e-3)
+    assert coarse.steps < fine.steps
+    assert coarse.loss >= fine.loss
+    assert len(fine.ends) == 1
+    assert fine.ends[0][1] > fine.loss
