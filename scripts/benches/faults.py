@@ -45,8 +45,10 @@ QUICK = {"runs": 1, "faults": ["wild"]}
 _START_S, _END_S, _MOVING_V = 60.0, 30.0, 0.1
 _TRIES = 4
 """How often a deployment is begun that ends before its fault."""
-_SWINGS_S = (0.5, 1.5)
-"""The fault comes so long after the motor has begun to turn."""
+_ROUND_RAD_S = 15.0
+"""So fast the pendulum turns round and round. While it hardly moves nobody can tell that its encoder has frozen."""
+_SWINGS_S = (0.2, 1.2)
+"""The fault comes so long after it has been so fast."""
 
 
 class NotBegun(Sim2RealError):  # noqa: N818
@@ -204,7 +206,7 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     with emulated(config, robot.embedded.plant, truth) as (port, emulator_pid):
         child = deployed(port, bundle, folder / "runs", said, watchdog_s)
         try:
-            wait_until_moving(truth, said, child)
+            wait_until_moving(truth, said, child, _ROUND_RAD_S)
             time.sleep(draw.uniform(*_SWINGS_S))
             number = {KILLED: signal.SIGKILL, STOPPED: signal.SIGSTOP, NAN: signal.SIGUSR1}.get(fault.name)
             began_ns = time.monotonic_ns()
@@ -292,13 +294,14 @@ def stopped_before(truth: Truth, at_ns: int) -> bool:
     return not len(before) or before[-1] == OperatingMode.OFF
 
 
-def wait_until_moving(truth: Path, said: Path, child: BaseProcess) -> None:
-    """Wait until the emulator's motor has been driven.
+def wait_until_moving(truth: Path, said: Path, child: BaseProcess, speed_rad_s: float = 0.0) -> None:
+    """Wait until the emulator's motor has been driven, and was measured to be as fast as this.
 
     Args:
         truth: The emulator's account.
         said: What the deployment says.
         child: The deployment.
+        speed_rad_s: The motor's speed [rad/s].
 
     Raises:
         NotBegun: It ended before, or took a minute.
@@ -307,8 +310,10 @@ def wait_until_moving(truth: Path, said: Path, child: BaseProcess) -> None:
     while time.monotonic() < end and child.is_alive():
         time.sleep(0.1)
         if truth.is_file() and truth.stat().st_size > 0:
-            effects = read_truth(truth).of(Kind.EFFECT)
-            if len(effects) and np.any(np.abs(effects["values"][:, 1]) > 0.0):
+            account = read_truth(truth)
+            driven = np.abs(account.of(Kind.EFFECT)["values"][:, 1])
+            speeds = np.abs(account.of(Kind.SAMPLE)["values"][:, 1])
+            if driven.any() and speeds.max(initial=0.0) >= speed_rad_s:
                 return
     raise NotBegun(f"the deployment did not begin to move: {said.read_text(errors='replace')}")
 
