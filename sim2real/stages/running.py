@@ -132,27 +132,9 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
     logs = logs_to_identify(own, result.drift, found, deployed.folder)
     if not logs:
         new = {"record": flags.record, "identify": replace(flags.identify, log=())}
-        if not _can_design(pipeline):
-            return Plan({**new, **train}, "record, identify, train, deploy")
-        usual = flags.record if flags.record.excitation != "designed" else pipeline.record
-        own = {"duration_s": flags.record.duration_s, "record": usual, "seed": seed + 1}
-        # The robot has changed: what was identified is near, but nobody knows how near.
-        new = {"design": replace(pipeline.design, forget=True, **own), **new}
-        new["record"] = replace(flags.record, excitation="designed", design=None)
-        return Plan({**new, **train}, "design an excitation, record, identify, train, deploy")
+        return Plan({**new, **train}, "record, identify, train, deploy")
     words = f"identify from {len(logs)} logs, the deployment's among them, train, deploy"
     return Plan({"identify": replace(flags.identify, log=logs), **train}, words)
-
-
-def _can_design(pipeline: Pipeline) -> bool:
-    """Return whether commands can be designed for a robot; any other is recorded with its usual excitation."""
-    from sim2real.stages.planner import gated_robot  # imports JAX
-
-    try:
-        gated_robot(pipeline)
-    except UsageError:
-        return False
-    return True
 
 
 def _reached(result: Deployment, quantity: str, least: float) -> bool:

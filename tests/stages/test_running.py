@@ -89,7 +89,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
     [
         (verdict("re-identify"), ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
         (verdict("re-identify", drift=True), ["identify", "train", "deploy"], ["deploy/episode_0.mcap"]),
-        (verdict("re-identify", drift=True, seconds=6.0), ["design", "record", "identify", "train", "deploy"], []),
+        (verdict("re-identify", drift=True, seconds=6.0), ["record", "identify", "train", "deploy"], []),
         (verdict("re-train", reason="3% of the steps of agent take longer than 2 ms"),
          ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
     ],
@@ -100,10 +100,6 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
     assert again == stages
     (config,) = (c for s, c in world.calls[4:] if s == "identify")
     assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
-    asked = dict(world.calls[4:])
-    if "design" in asked:
-        assert asked["design"].forget, "what was certain of the robot before it changed is not any more"
-        assert asked["record"].excitation == "designed"
 
 
 @pytest.mark.parametrize("status", ["look at this joint", "not judged"])
