@@ -120,9 +120,11 @@ def rows(one: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of one robot and seed."""
     base, ratios = f"excitation/{one['robot']}/seed{one['seed']}", list(one["ratios"].values())
     usually, designed = one["usual"], one["designed"]
+    errors = float(np.median([v / max(usually["off"][n], 1e-9) * one["ratios"][n] for n, v in designed["off"].items()]))
     return [
         row(f"{base}/median_interval", float(np.median(ratios)), "of the usual excitation's", "", f"<= {GOAL}"),
         row(f"{base}/worst_interval", float(np.max(ratios)), "of the usual excitation's"),
+        row(f"{base}/median_error", errors, "of the usual excitation's"),
         row(f"{base}/expected_median", float(np.median(list(one["expected"].values()))), "of the usual excitation's"),
         row(f"{base}/median_off", float(np.median(list(designed["off"].values()))), "half-widths",
             f"{np.median(list(usually['off'].values())):.2f} of the usual excitation"),

@@ -29,7 +29,8 @@ class DesignConfig:
     motions: int = 100
     """Motions that are drawn by chance, and simulated; those are chosen that together tell most."""
     margin: float = 0.9
-    """Share of the gate's limits that commands and predicted motion may use."""
+    """Share of the gate's limits that goals of joints, slew and the predicted motion may use; other commands, such as
+    voltages, may use all."""
     seed: int = 0
     """Seed of the motions."""
     record: RecordConfig = field(default_factory=RecordConfig)

@@ -236,7 +236,11 @@ class Planner:
         config, rate_hz = self.config, self.robot.rate_hz
         rest = self.rest
         gate = self.gate
-        low, high = (config.margin * (np.broadcast_to(end, self.commands) - rest) for end in gate.range)
+        # A joint may go beyond the goal that it is told, a voltage is what it is.
+        goals = any(c.goal is not None for c in self.model.channels)
+        low, high = (
+            (config.margin if goals else 1.0) * (np.broadcast_to(end, self.commands) - rest) for end in gate.range
+        )
         band_hz = (config.record.low_hz / 2, min(2 * config.record.high_hz, rate_hz / 4))
         shape = config.motions, self.samples
         rng = np.random.default_rng([config.seed, 1])

@@ -98,7 +98,7 @@ def _go_around(
             row, plan = _judged(row, pipeline, flags, run_dir)
         else:  # nothing else of this robot is recorded yet
             row = replace(row, verdict="re-identify", why=str(refused.args[0]))
-            plan = _anew(pipeline, flags, run_dir)
+            plan = _anew(flags, run_dir)
         if plan.configs and not left:
             plan = Plan({}, f"the last iteration: it would {plan.words}")
         row = replace(row, then=plan.words)
@@ -143,18 +143,10 @@ def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) 
     return row, next_plan(pipeline, flags, run_dir, deployed, result)
 
 
-def _anew(pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> Plan:
-    """Return all stages, for a robot of which nothing recorded is true any more; what to record is designed for it."""
-    train = _trained_again(flags, run_dir)
-    new = {"record": flags.record, "identify": replace(flags.identify, log=())}
-    if not _can_design(pipeline):
-        return Plan({**new, **train}, ALL)
-    usual = flags.record if flags.record.excitation != "designed" else pipeline.record
-    own = {"duration_s": flags.record.duration_s, "record": usual, "seed": train["train"].seed}
-    # The robot has changed: what was identified is near, but nobody knows how near.
-    new = {"design": replace(pipeline.design, forget=True, **own), **new}
-    new["record"] = replace(flags.record, excitation="designed", design=None)
-    return Plan({**new, **train}, f"design an excitation, {ALL}")
+def _anew(flags: RunFlags, run_dir: Path) -> Plan:
+    """Return all stages, for a robot of which nothing recorded is true any more."""
+    new = {"record": flags.record, "identify": replace(flags.identify, log=()), **_trained_again(flags, run_dir)}
+    return Plan(new, ALL)
 
 
 def _trained_again(flags: RunFlags, run_dir: Path) -> dict[str, Any]:
@@ -194,20 +186,9 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
     found = Identification.load(identified.output("parameters"))
     logs = logs_to_identify(own, result.drift, found, deployed.folder)
     if not logs:
-        return _anew(pipeline, flags, run_dir)
+        return _anew(flags, run_dir)
     words = f"identify from {len(logs)} logs, the deployment's among them, train, deploy"
     return Plan({"identify": replace(flags.identify, log=logs), **train}, words)
-
-
-def _can_design(pipeline: Pipeline) -> bool:
-    """Return whether commands can be designed for a robot; any other is recorded with its usual excitation."""
-    from sim2real.stages.planner import gated_robot  # imports JAX
-
-    try:
-        gated_robot(pipeline)
-    except UsageError:
-        return False
-    return True
 
 
 def _reached(result: Deployment, quantity: str, least: float) -> bool:

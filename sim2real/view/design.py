@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def picture(path: Path, design: Design) -> None:
     with styled():
         figure = new_figure(2.0 + 1.3 * rows + 0.3 * len(design.expected))
         heights = [1.0] * rows + [0.6 + 0.2 * len(design.expected)]
-        panels = list(np.ravel(figure.subplots(rows + 1, 1, height_ratios=heights)))
+        panels: Any = figure.subplots(rows + 1, 1, height_ratios=heights)
         for i, ax in enumerate(panels[:-1]):
             if i < design.commands.shape[1]:
                 ax.plot(t_s, design.commands[:, i], color=BLUE, label="command")

@@ -91,7 +91,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
     [
         (verdict("re-identify"), ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
         (verdict("re-identify", drift=True), ["identify", "train", "deploy"], ["deploy/episode_0.mcap"]),
-        (verdict("re-identify", drift=True, seconds=6.0), ["design", "record", "identify", "train", "deploy"], []),
+        (verdict("re-identify", drift=True, seconds=6.0), ["record", "identify", "train", "deploy"], []),
         (verdict("re-train", reason="3% of the steps of agent take longer than 2 ms"),
          ["identify", "train", "deploy"], ["deploy/episode_0.mcap", "record/session.mcap"]),
     ],
@@ -102,10 +102,6 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
     assert again == stages
     (config,) = (c for s, c in world.calls[4:] if s == "identify")
     assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
-    asked = dict(world.calls[4:])
-    if "design" in asked:
-        assert asked["design"].forget, "what was certain of the robot before it changed is not any more"
-        assert asked["record"].excitation == "designed"
 
 
 LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")
@@ -114,10 +110,10 @@ LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train agai
 def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
     """Its policy was refused before it moved anything, so nothing is known of the robot as it is now."""
     again, rows = world.go(LATER, verdict("fine", 1.0))
-    assert again == ["design", "record", "identify", "train", "deploy"]
+    assert again == ["record", "identify", "train", "deploy"]
     assert [(r.verdict, r.why, r.stages) for r in rows] == [
         ("re-identify", "the delay is 60 ms", ("record", "identify", "train")),
-        ("fine", "why", ("design", "record.2", "identify.2", "train.2", "deploy.2")),
+        ("fine", "why", ("record.2", "identify.2", "train.2", "deploy.2")),
     ]
     assert dict(world.calls[4:])["identify"].log == ()
 
