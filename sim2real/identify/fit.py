@@ -158,15 +158,14 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
 
 
 def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
-    steps, rounds = effort(problem, _ROUNDS)
-    total = rounds + len(starts) - 1
+    total = _ROUNDS + len(starts) - 1
 
     def advance(best: float, z: np.ndarray) -> None:
         if told:
             told("refine", 1 / total, best, z)
 
     compiling = _compiling(told, "refine", starts[0])
-    return refine(problem, starts, steps, rounds, advance, None, compiling)
+    return refine(problem, starts, problem.config.refine_steps, _ROUNDS, advance, None, compiling)
 
 
 def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:
