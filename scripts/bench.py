@@ -43,7 +43,8 @@ def machine() -> dict[str, Any]:
 
 def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     """Return the bench's module, and its flags."""
-    listed = "\n".join(f"  {name:10}{about.summary}" for name, about in BENCHES.items())
+    wide = max(map(len, BENCHES)) + 1
+    listed = "\n".join(f"  {name:{wide}}{about.summary}" for name, about in BENCHES.items())
     raw = argparse.RawDescriptionHelpFormatter
     every = argparse.ArgumentParser(
         prog="bench.py", description=__doc__, epilog=f"benches:\n{listed}", formatter_class=raw
