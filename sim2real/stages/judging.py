@@ -28,6 +28,8 @@ _UNEXPLAINED = 0.5
 """Above this share of the error, parameters that are fitted to the log itself do not explain a joint's motion."""
 _LATE = 0.01
 """Share of the steps that may take longer than any in training."""
+_SLACK = 0.1
+"""Share of the policy's period by which they may do so: 2 ms more at 50 Hz delay a command by less than a servo does."""
 _GOOD, _WORSE = 0.9, 0.1
 """Success that needs no more training; by how much it may be below that in simulation."""
 
@@ -171,13 +173,13 @@ def _with_real(row: Gap, now: float | None) -> Gap:
 
 def _too_late(deployed: Deployment, bundle: Bundle) -> list[str]:
     """Return sentences about nodes whose steps take longer than the policy was trained with."""
-    said = []
+    said, slack_s = [], _SLACK / bundle.contract.rate_hz
     for node, taken in _steps(deployed).items():
         drawn = bundle.episodes.drawn_s.get(node) if bundle.episodes else None
         if drawn is None or not drawn.size or not taken.size:
             continue
         longest = float(drawn.max())
-        share = float(np.mean(taken > longest))
+        share = float(np.mean(taken > longest + slack_s))
         if share > _LATE:
             said.append(f"{share:.1%} of the steps of {node} {LATER} the {1e3 * longest:.1f} ms of training")
     return said

@@ -21,7 +21,7 @@ FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
 ALARM = Drift((FRICTION,), 0.05, ("friction",), 20.0)
 BUNDLE = SimpleNamespace(
-    contract=SimpleNamespace(delays_s={"sensor_delay": 0.02, "actuator_delay": 0.03}),
+    contract=SimpleNamespace(rate_hz=50.0, delays_s={"sensor_delay": 0.02, "actuator_delay": 0.03}),
     episodes=SimpleNamespace(drawn_s={"agent": np.full(100, 0.001)}),
 )
 
@@ -48,6 +48,7 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
         ({"identified": 0.02}, "fine", "is the one that was identified"),
         ({"identified": 0.04}, "re-identify", "promised were 0.01 rad"),
         ({"identified": None}, "re-identify", "it diverges"),
+        ({"took_s": 0.0025}, "fine", "as fast as in training"),
         ({"took_s": 0.004}, "re-train", "100.0% of the steps of agent take longer than the 1.0 ms of training"),
         ({"success": 0.7}, "re-train", "success is 0.70, in simulation 1.00"),
         ({"success": 0.85, "simulated": 0.9}, "re-train", "as in simulation"),
