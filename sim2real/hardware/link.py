@@ -278,6 +278,7 @@ class ServoLink(ABC):
                 try:
                     answers = self._attempt(packet, servo_ids, length)
                 except OSError as failure:
+                    self._require_watching()
                     raise HardwareLost(f"{self.config.port} failed during {to_whom}: {failure}") from failure
                 now_ns = time.monotonic_ns()
                 if answers is not None:
@@ -362,13 +363,17 @@ class ServoLink(ABC):
 
     def _judge(self, losses: int, silent_s: float, what: str) -> None:
         if losses >= _LEAST_LOSSES and silent_s > self.config.max_silence_s:
-            if self.guardian is not None:
-                self.guardian.require_watching()
+            self._require_watching()
             raise HardwareLost(
                 f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
                 hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "
                 "reply_timeout_s?",
             )
+
+    def _require_watching(self) -> None:
+        """Raise SafetyStop if the guardian has taken over: it reads answers off the port that are missed here."""
+        if self.guardian is not None:
+            self.guardian.require_watching()
 
     def _withholds(self, register: Register, values: Iterable[int]) -> bool:
         """Whether a write could move a motor, and nothing may."""

@@ -29,7 +29,7 @@ _UNEXPLAINED = 0.5
 _LATE = 0.01
 """Share of the steps that may take longer than any in training."""
 _SLACK = 0.1
-"""Share of the policy's period by which they may do so: 2 ms more at 50 Hz delay a command by less than a servo does."""
+"""Share of the policy's period by which they may do so: at 50 Hz, 2 ms, less than a servo's own delay varies by."""
 _GOOD, _WORSE = 0.9, 0.1
 """Success that needs no more training; by how much it may be below that in simulation."""
 

@@ -151,6 +151,21 @@ def test_a_bus_that_seems_lost_as_the_guardian_uses_it_is_a_safety_stop(start_ro
     assert len(attempts) >= 3
 
 
+def test_an_answer_that_the_guardian_has_read_is_no_lost_bus(start_robot, open_bus, monkeypatch):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.3)
+
+    def read_elsewhere(*_):
+        """This process is stopped between being told that there is an answer and reading it."""
+        time.sleep(0.5)
+        bus._link.guardian._beat_s = time.monotonic()
+        raise OSError("the port is ready to be read, but has no data")
+
+    monkeypatch.setattr(bus._link, "_attempt", read_elsewhere)
+    with pytest.raises(SafetyStop, match="the guardian has taken the torque off"):
+        bus.read(1, reg.TORQUE_ENABLE)
+
+
 def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
     robot, host, pid = start_host()
     assert os.getsid(int(pid)) != os.getsid(host.pid)
