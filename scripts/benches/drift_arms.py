@@ -24,8 +24,6 @@ from sim2real.hardware.truth import TruthLog
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
 
-RATE_HZ = 50.0
-COUNT_RAD = 2 * np.pi / 4096
 TARGET_S, APPROACH_HZ = 4.0, 4.0
 """How long each target stands; how fast a goal nears it."""
 STEP_RAD, STEP_S, STEPS = 0.12, 0.5, 8
@@ -99,9 +97,9 @@ class ReachingArm:
         """
         robot, config = self._robot, load_pipeline(self.pipeline).record
         config = replace(config, duration_s=seconds, seed=1000 * self.number + session)
-        signal = robot.around(excitation(config, RATE_HZ, len(robot.servos.joints)))
+        signal = robot.around(excitation(config, hidden.RATE_HZ, len(robot.servos.joints)))
         away = np.asarray(robot.servos.at_rest) - signal[0]
-        left = np.abs(away) - np.arange(len(signal))[:, None] / RATE_HZ
+        left = np.abs(away) - np.arange(len(signal))[:, None] / hidden.RATE_HZ
         signal = signal + np.sign(away) * np.maximum(left, 0.0)
         self._play(path, lambda k, _: signal[k], seconds, session)
 
@@ -110,7 +108,7 @@ class ReachingArm:
         robot = self._robot
         rest, probe = np.asarray(robot.servos.at_rest, float), robot.probe
         away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
-        each = round(STEP_S * RATE_HZ)
+        each = round(STEP_S * hidden.RATE_HZ)
         self._play(path, lambda k, _: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
 
     def deploy(self, path: Path, seconds: float, session: int) -> float:
@@ -127,8 +125,8 @@ class ReachingArm:
         fastest = robot.servos.speed
 
         def policy(k: int, goal: np.ndarray) -> np.ndarray:
-            way = targets[int(k / RATE_HZ / TARGET_S)] - goal
-            return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / RATE_HZ
+            way = targets[int(k / hidden.RATE_HZ / TARGET_S)] - goal
+            return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / hidden.RATE_HZ
 
         self._play(path, policy, seconds, session)
         return float("nan")
@@ -155,11 +153,11 @@ class ReachingArm:
             clock.configure(servo_id, sheet.p_gain, 0, sheet.profile_rad_s)
         gate = SafetyGate(robot.gate(load_pipeline(self.pipeline).deploy.gate))
         gate.reset(rest)
-        goal, count, acts_ns = np.asarray(rest, float), int(seconds * RATE_HZ), 0
+        goal, count, acts_ns = np.asarray(rest, float), int(seconds * hidden.RATE_HZ), 0
         starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
         readings, commands = [], []
         for k in range(count):
-            at = k / RATE_HZ
+            at = k / hidden.RATE_HZ
             for node, took in (("sensor", 1.2e-3), ("agent", 1e-4), ("actuator", 6e-4)):
                 starts[node][k], at = at, at + took * rng.uniform(0.8, 1.2)
                 ends[node][k] = at
@@ -167,7 +165,7 @@ class ReachingArm:
             clock.advance(asked_ns)
             sampled_ns = asked_ns - round(1e9 * self.sensing_s * rng.uniform(0.85, 1.15))
             rows = np.array([clock.sample(i, sampled_ns)[:2] for i in plant.servo_ids])
-            angle = np.round(rows[:, 0] / COUNT_RAD) * COUNT_RAD - zero
+            angle = np.round(rows[:, 0] / hidden.COUNT_RAD) * hidden.COUNT_RAD - zero
             speed = np.round(rows[:, 1] / hidden.SPEED_COUNT_RAD_S) * hidden.SPEED_COUNT_RAD_S
             readings.append({"position": np.float32(angle), "velocity": np.float32(speed)})
             goal = gate.apply(policy(k, goal), 0.0, float(ends["agent"][k]), speed)
@@ -175,7 +173,7 @@ class ReachingArm:
             sent_ns = round(1e9 * (ends["actuator"][k] + self.acting_s * rng.uniform(0.85, 1.15)))
             acts_ns = max(acts_ns, sent_ns)
             for servo_id, own, offset in zip(plant.servo_ids, goal, zero, strict=True):
-                wanted = round((own + offset) / COUNT_RAD) * COUNT_RAD
+                wanted = round((own + offset) / hidden.COUNT_RAD) * hidden.COUNT_RAD
                 clock.schedule(acts_ns, 0, servo_id, OperatingMode.POSITION, wanted)
         truth.close()
         hidden.write_log(path, self.pipeline, (starts, ends), readings, commands, robot.units)

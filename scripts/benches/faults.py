@@ -99,6 +99,7 @@ class Outcome:
         said: The last of what it said.
         readable: Whether the log could be read.
         right: Whether code and reason are those of the fault.
+        again: How often it was begun anew, because the deployment had ended before its fault.
     """
 
     fault: str
@@ -108,6 +109,7 @@ class Outcome:
     said: str
     readable: bool
     right: bool
+    again: int = 0
 
 
 def swinging_bundle(folder: Path) -> Path:
@@ -244,8 +246,10 @@ def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) 
     """
     for again in range(_TRIES - 1):
         with contextlib.suppress(NotBegun):
-            return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
-    return run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+            found = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
+            return replace(found, again=again)
+    found = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+    return replace(found, again=_TRIES - 1)
 
 
 def outcomes(names: Sequence[str], seeds: Sequence[int], watchdog_s: float, jobs: int, root: Path) -> Iterator[Outcome]:
@@ -366,5 +370,6 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         rows.append(row(f"{what}/safe_s", spread, "s", "p50, max", "< 0.2"))
         rows.append(row(f"{what}/log_readable", sum(o.readable for o in runs), of, goal="all"))
         rows.append(row(f"{what}/code_and_reason", sum(o.right for o in runs), of, goal="all"))
+        rows.append(row(f"{what}/begun_again", sum(o.again for o in runs), "times: it had ended before the fault"))
     wrong = [asdict(o) for runs in found.values() for o in runs if not (o.safe_s < SAFE_S and o.readable and o.right)]
     return {"rows": rows, "wrong": wrong}
