@@ -250,8 +250,8 @@ def write_log(
     path: Path,
     pipeline: str,
     times: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
-    readings: Sequence[Mapping[str, Any]],
-    commands: Sequence[Mapping[str, Any]],
+    readings: Sequence[Any],
+    commands: Sequence[Any],
     units: Mapping[str, str],
 ) -> None:
     """Write the log of a loop of sensor, agent and actuator.
@@ -260,8 +260,8 @@ def write_log(
         path: The log.
         pipeline: Whose it is.
         times: Node -> starts, and ends, of its steps ``(N,)`` [s].
-        readings: What the sensor sent in each step.
-        commands: What the agent sent, and the actuator let through.
+        readings: What the sensor sent in each step: a message, or a mapping of fields.
+        commands: What the agent sent, and the actuator let through, likewise.
         units: Field -> unit.
     """
     nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}

@@ -11,19 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benches.hidden_robots import SPEED_COUNT_RAD_S, one_after_another
-from sim2real.graph.episode import MessageRecord, StepRecord
+from benches.hidden_robots import COUNT_RAD, SPEED_COUNT_RAD_S, one_after_another, write_log
 from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Reading, Transaction
 from sim2real.hardware.gate import SafetyGate
 from sim2real.hardware.plant import OperatingMode, Plant, load_plant
 from sim2real.hardware.plausibility import Plausibility
-from sim2real.log.writer import McapRecorder
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.servo_robot import ServoRobot
 from sim2real.stages.pipeline import Pipeline
 
-_COUNTS = 4096
 _HISTORY_S = 0.1
 
 
@@ -91,8 +88,7 @@ class Mechanism:
     def seen(self, t_s: float) -> np.ndarray:
         """Return positions, speeds and loads as encoders say them at a time of the past, ``(joints, 3)``."""
         found = self._past[min(max(round(t_s / self.step_s), 0), self.done) % self._kept].copy()
-        count = 2 * np.pi / _COUNTS
-        found[:, 0] = np.round(found[:, 0] / count) * count - self._zero
+        found[:, 0] = np.round(found[:, 0] / COUNT_RAD) * COUNT_RAD - self._zero
         found[:, 1] = np.round(found[:, 1] / SPEED_COUNT_RAD_S) * SPEED_COUNT_RAD_S
         return found
 
@@ -145,43 +141,12 @@ def record(pipeline: Pipeline, limits: GateLimits, signal: np.ndarray, seed: int
         seen[k] = made.seen(starts["sensor"][k] - ages[k])
         plausible.check(seen[k, :, 0], starts["sensor"][k], 0.0, seen[k, :, 2])
         commands[k] = gate.apply(signal[k], 0.0, starts["actuator"][k], seen[k, :, 1])
-    _write(pipeline, robot, log, starts, took, seen, commands)
+    readings = [robot.read(Reading(*row.T.astype(np.float32), Transaction(0, 0, 0, 0))) for row in seen]
+    sent_commands = [robot.message(row.astype(np.float32)) for row in commands]
+    ends = {node: starts[node] + took[node] for node in took}
+    write_log(log, pipeline.name, (starts, ends), readings, sent_commands, robot.units)
     truth = {n: float(v) for n, v in made.plant.truth().items()}
     truth |= {"round_trip_delay": float(emulator.sensing_latency_s + emulator.actuation_latency_s)}
     position = seen[:, :, 0]
     cut = gate.counts.clamped + gate.counts.slewed
     return Session(log, truth, cut, np.abs(seen[:, :, 1]).max(axis=0), position.min(axis=0), position.max(axis=0))
-
-
-def _write(
-    pipeline: Pipeline,
-    robot: LoopRobot,
-    log: Path,
-    starts: dict[str, np.ndarray],
-    took: dict[str, np.ndarray],
-    seen: np.ndarray,
-    commands: np.ndarray,
-) -> None:
-    roles, none = robot.roles, Transaction(0, 0, 0, 0)
-    nodes = {roles.sensor: "sensor", roles.supervisor: "agent", roles.actuator: "actuator"}
-    senders = dict(zip(nodes, (None, *nodes), strict=False))
-    graph = {
-        n: {"rate_hz": robot.rate_hz, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
-        for n, s in senders.items()
-    }
-    said = lambda k: robot.read(Reading(*seen[k].T.astype(np.float32), none))  # noqa: E731
-    sent = lambda k: robot.message(commands[k].astype(np.float32))  # noqa: E731
-    outputs = {n: said(0) if n == roles.sensor else sent(0) for n in nodes}
-    metadata = {"pipeline": pipeline.name, "graph": graph}
-    inputs = [(n, s) for n, s in senders.items() if s]
-    units = dict.fromkeys(nodes, robot.units)
-    recorder = McapRecorder(log, metadata, {}, outputs, inputs, {roles.sensor: robot.joints}, units)
-    recorder.start(1_790_000_000_000_000_000, 0)
-    for k in range(len(commands)):
-        for node, key in nodes.items():
-            start, end = (round(1e6 * t) for t in (starts[key][k], starts[key][k] + took[key][k]))
-            message = said(k) if node == roles.sensor else sent(k)
-            recorder.step(StepRecord(node, k, start, start, start, -1, end, 0), message)
-            if sender := senders[node]:
-                recorder.message(MessageRecord(node, sender, k, k, start, start))
-    recorder.close("finished", 0, {})
