@@ -188,10 +188,11 @@ def restored(
     own: list[Path] = []
     if said["named"] != ROUND_TRIP:  # that is refused before the policy moves anything: there is no such log
         own = [Path(log) for log in logs_to_identify(logs, drifted, identified, logs[0].parent)]
-    if not own:
-        own = [logs[0].with_name(f"{change}_session.mcap")]
-        now.record(own[0], options.record_s, 1000)
-    again = identify(pipeline, own, now.number, options)
+    again = identify(pipeline, own, now.number, options) if own else None
+    if again is None or again.verdict.status != "accepted":
+        own.append(logs[0].with_name(f"{change}_session.mcap"))
+        now.record(own[-1], options.record_s, 1000)
+        again = identify(pipeline, own, now.number, options)
     bundle, _ = sim2real.train(pipeline, randomise.train_config(pipeline, "all", now.number, options), again)
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)

@@ -14,6 +14,7 @@ from sim2real.stages import console, targets
 if TYPE_CHECKING:
     from sim2real.artifacts.deployment import Deployment
     from sim2real.artifacts.iterations import Iteration
+    from sim2real.stages.config import IdentifyConfig
     from sim2real.stages.flags import RunFlags
     from sim2real.stages.pipeline import Pipeline
 
@@ -114,6 +115,8 @@ def _go_around(
                 ran.append(call(stage, config, run_dir))
             except DelayChanged as error:
                 refused = error
+            if stage == "identify" and config.log and not _accepted(ran[-1]):
+                ran += _identified_from_more(flags, call, run_dir, config)
         if not ran:
             break
     from sim2real.view.page import report  # matplotlib and jinja2 take 0.5 s to import
@@ -121,6 +124,30 @@ def _go_around(
     cells = [[r.number, ", ".join(r.stages), r.real, r.simulation, r.verdict, r.then] for r in rows]
     print(console.table(cells, ["iteration", "ran", "success", "in simulation", "verdict", "then"]))
     console.wrote(report(run_dir))
+
+
+def _accepted(identified: StageFolder) -> bool:
+    from sim2real.artifacts.identification import Identification
+
+    return Identification.load(identified.output("parameters")).verdict.status == "accepted"
+
+
+def _identified_from_more(flags: RunFlags, call: Call, run_dir: Path, config: IdentifyConfig) -> list[StageFolder]:
+    """Record, and identify from that and from the deployment's logs, which do not suffice: a policy moves too little.
+
+    Args:
+        flags: Of the run.
+        call: Runs a stage.
+        run_dir: Its folder.
+        config: With the deployment's logs.
+
+    Returns:
+        What the two stages left.
+    """
+    console.note("the deployment's own logs are not enough to identify from: a new recording joins them")
+    recorded = call("record", flags.record, run_dir)
+    logs = (*config.log, console.shown(recorded.output("log")))
+    return [recorded, call("identify", replace(config, log=logs), run_dir)]
 
 
 def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:

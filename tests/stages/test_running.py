@@ -30,7 +30,7 @@ def world(tmp_path, monkeypatch):
     """Stages that leave what the loop reads; each deployment takes the next verdict."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
-    seen = SimpleNamespace(calls=[], verdicts=[], root=tmp_path / "runs" / "pendulum")
+    seen = SimpleNamespace(calls=[], verdicts=[], judgements=[], root=tmp_path / "runs" / "pendulum")
 
     def call(stage, config, run_dir):
         seen.calls.append((stage, config))
@@ -39,7 +39,8 @@ def world(tmp_path, monkeypatch):
                 opened.output("log", "session.mcap").touch()
             if stage == "identify":
                 logs = (Source("record/session.mcap", ""),)
-                found = Identification("pendulum", logs, Judgement("accepted", ()), ())
+                status = seen.judgements.pop(0) if len(seen.calls) > 4 and seen.judgements else "accepted"
+                found = Identification("pendulum", logs, Judgement(status, ()), ())
                 found.write(opened.output("parameters", "parameters.json"))
             if stage == "deploy":
                 opened.output("log_0", "episode_0.mcap").touch()
@@ -116,6 +117,18 @@ def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
         ("fine", "why", ("record.2", "identify.2", "train.2", "deploy.2")),
     ]
     assert dict(world.calls[4:])["identify"].log == ()
+
+
+def test_where_the_deployment_shows_too_little_a_recording_joins_its_logs(world, capsys):
+    world.judgements = ["not identifiable"]
+    again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
+    assert again == ["identify", "record", "identify", "train", "deploy"]
+    own, more = (config.log for stage, config in world.calls[4:] if stage == "identify")
+    assert [path.rpartition("/")[2] for path in own] == ["episode_0.mcap"]
+    assert more[:-1] == own
+    assert more[-1].endswith("record.2/session.mcap")
+    assert rows[1].stages == ("identify.2", "record.2", "identify.3", "train.2", "deploy.2")
+    assert "not enough to identify from" in capsys.readouterr().err
 
 
 def test_the_loop_ends_as_a_deployment_does_that_is_refused_to_the_end(world):
