@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.optimize import fminbound
 from scipy.special import stdtr, stdtrit
 
 from sim2real.artifacts.drift import Changed, Drift
@@ -24,12 +24,8 @@ _SIZES = (-0.4, -0.25, -0.12, -0.05, 0.05, 0.12, 0.25, 0.4)
 largest is 3."""
 _ALIKE = 0.02
 """Changes whose shares of the error that they take away differ by less explain as much."""
-_POLISH = 12
-"""Most simulations of the log between the best of these and its neighbours."""
-_MOTION_S = 1.0
-"""Within so long [s] a model that is not of the robot's form errs alike: a swing or a reach is one motion."""
-_SHARED = 0.5
-"""Share of what such errors add that is the same in all motions of a policy, which may be slower than an excitation."""
+_TURNS = 3
+"""How often so many changes are tried, each time between the neighbours of the best."""
 _FELT = 1e-3
 """A change over all of the bounds moves residuals by at least so many of their variances where a log feels it."""
 Causes = Mapping[str, Mapping[str, float]]
@@ -115,7 +111,8 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     """
     table = problem.table
     posterior = _with_known(posterior, table)
-    tried = [_alone(problem, posterior, widening, way) for way in ways(table, causes)]
+    columns, _ = problem.at(table.at_scale(posterior.mean))
+    tried = [_alone(problem, posterior, widening, way, columns) for way in ways(table, causes)]
     found = [one for one in tried if one is not None]
     if not found:
         raise Sim2RealError("this log says nothing about any parameter", hint="deploy something that moves")
@@ -138,49 +135,97 @@ def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
     return Posterior(table.names, transform, mean, covariance, table.low, table.high)
 
 
-def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way) -> Fitted | None:
+def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way, columns: Any) -> Fitted | None:
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
 
-    None for a change that this log does not feel, as of a torque limit that no motion of it reached.
+    Args:
+        problem: The log.
+        posterior: What was identified.
+        widening: Factor on its deviations.
+        way: The change.
+        columns: What ``problem.at`` returned for what was identified.
 
-    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
-    sum of squares of how far each segment moves the size (a sandwich estimate). The identification's is how far its
-    errors, in whatever direction, move the size; what the model's own errors add to them differs in part from
-    motion to motion, and that evens out.
+    Returns:
+        The change; None where this log does not feel it, as a torque limit that no motion of it reached.
     """
     table = problem.table
 
     def point(size: float) -> np.ndarray:
         return table.at_scale(posterior.mean + size * way.along)
 
-    def loss(size: float) -> float:
-        found = problem.at(point(size))[1]
-        return found if np.isfinite(found) else 1e30
-
     moving = way.along != 0.0
     unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
-    sizes = unit * np.array(sorted([0.0, *_SIZES]))
-    best = int(np.argmin([loss(s) for s in sizes]))
-    ends = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
-    size = float(np.ravel(fminbound(loss, *ends, maxfun=_POLISH, disp=0))[0])
+    size = _best(problem, point, unit, columns)
     at = _finite(linearise(problem, point(size)))
-    J = at.jacobian @ way.along  # (S, C, F)
-    said = np.sum(J**2, axis=(1, 2))
-    information, variance = float(said.sum()), loss_variance(problem, at)
-    if information * unit**2 <= _FELT * variance:
+    variance, said = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
+    if said * unit**2 <= _FELT * variance:
         return None
-    segments = information**2 / float(np.sum(said**2))
-    pulls = np.sum(J * at.residuals, axis=(1, 2))
-    spread = float(np.sum(pulls**2)) / information**2 * segments / max(segments - 1.0, 0.5)
+    covariance = widening**2 * posterior.covariance
+    step, own, before, segments = _beside_the_rest(at, way, covariance, variance)
+    return Fitted(way, size + step, own, before, segments, _with_the_rest(at, covariance, variance))
+
+
+def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float, columns: Any) -> float:
+    """Return how far along a change the log is fitted best.
+
+    Args:
+        problem: The log.
+        point: Size of the change -> the unbounded vector ``(P,)``.
+        unit: The size that goes from bound to bound.
+        columns: What ``problem.at`` returned for a size of 0.
+    """
+    sizes = unit * np.array(sorted([0.0, *_SIZES]))
+    for turn in range(_TURNS):
+        losses = problem.near(np.stack([point(s) for s in sizes]), columns)
+        best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
+        size = float(sizes[best])
+        if turn == 0 and size != 0.0:
+            columns, _ = problem.at(point(size))
+        sizes = np.linspace(sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)], len(sizes))
+    return size
+
+
+def _beside_the_rest(
+    at: Linearised, way: Way, covariance: np.ndarray, variance: float
+) -> tuple[float, float, float, float]:
+    """Return how far a change goes if all else may be as far off as the identification leaves open.
+
+    By generalised least squares, so that what the change alone could have done counts most: where a hand moves slowly a
+    weaker motor looks like a longer delay, in the first moments of a quick step it does not.
+
+    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
+    sum of squares of how far each segment moves the size (a sandwich estimate).
+
+    Args:
+        at: The log, with the change that fits it best.
+        way: The change.
+        covariance: Shape ``(P, P)``: what the identification leaves open.
+        variance: Of a residual.
+
+    Returns:
+        How much further it goes; the variance of its size by the log's residuals, and by what is open; how many
+        segments of the log say something about it.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    along, residuals = at.jacobian @ way.along, at.residuals.reshape(len(at.residuals), -1)
+    unit = 1.0 / float(np.linalg.norm(along))
+    # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
+    columns = np.concatenate([unit * along[..., None], at.jacobian @ root], axis=-1)
+    columns = columns.reshape(len(residuals), -1, 1 + len(root))
+    known = np.diag([0.0] + [1.0] * len(root))
+    inverse = np.linalg.inv(np.einsum("sna,snb->ab", columns, columns) / variance + known)
+    moved = -inverse @ np.einsum("sna,sn->a", columns, residuals) / variance
+    weights = columns @ inverse[0]  # of each residual in the size
+    pulls = np.sum(weights * (residuals + columns @ moved), axis=1) / variance
+    said = np.sum(weights**2, axis=1)
+    segments = float(said.sum() ** 2 / np.sum(said**2))
     # Residuals are large where much moves, and there the log says most: each segment counts with its own.
-    squares, counted = np.sum(at.residuals**2, axis=(1, 2)), np.count_nonzero(at.residuals, axis=(1, 2))
+    squares, counted = np.sum(residuals**2, axis=1), np.count_nonzero(residuals, axis=1)
     uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)
-    own = max(variance * float(said @ uneven) / information**2, spread)
-    carried = np.einsum("scf,scfp->p", J, at.jacobian) / information
-    motions = max(segments * problem.segment_s / _MOTION_S, 1.0)
-    wider = 1.0 + (widening**2 - 1.0) * (_SHARED + (1.0 - _SHARED) / motions)
-    before = wider * float(carried @ posterior.covariance @ carried)
-    return Fitted(way, size, own, before, segments, _with_the_rest(at, widening**2 * posterior.covariance, variance))
+    spread = float(np.sum(pulls**2)) * segments / max(segments - 1.0, 0.5)
+    own = unit**2 * max(float(said @ uneven) / variance, spread)
+    return unit * float(moved[0]), own, unit**2 * float(np.sum(inverse[0, 1:] ** 2)), segments
 
 
 def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> float:

@@ -35,8 +35,8 @@ _LEAST, _LEAST_S = 4, 5.0
 _MOVES = 10.0
 """A joint moves where its positions spread over so many deviations of a measurement. Segments without motion do not
 count: all are alike, so that they are one, and where a joint sticks a model with smooth friction creeps."""
-_STEPS = 15
-"""Most steps of a refinement of all parameters."""
+_STEPS = 5
+"""Most steps of a round that refines all parameters: of an SO-101 errors are within 5 % of those after 15."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement are its noise."""
 
