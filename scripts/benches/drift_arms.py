@@ -52,7 +52,7 @@ class ReachingArm:
     acting_s: float
     pipeline: ClassVar[str] = "arm"
     links_kg: ClassVar[float] = 0.234
-    defaults: ClassVar[dict[str, float]] = {"record_s": 30.0, "seconds": 16.0, "episodes": 2, "generations": 30}
+    defaults: ClassVar[dict[str, float]] = {"record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 30}
     causes: ClassVar[dict[str, str]] = {"friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 
     @classmethod
@@ -184,7 +184,7 @@ class ReachingSO101(ReachingArm):
 
     pipeline = "so101"
     links_kg = 0.485
-    defaults: ClassVar[dict[str, float]] = {"record_s": 30.0, "seconds": 16.0, "episodes": 2, "generations": 40}
+    defaults: ClassVar[dict[str, float]] = {"record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 40}
 
     @classmethod
     def servos(cls, rng: np.random.Generator) -> dict[str, Any]:

@@ -31,9 +31,20 @@ def each(
     else:
         for name, value in _ONE_THREAD.items():  # the processes inherit them
             os.environ.setdefault(name, value)
-        with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        context = multiprocessing.get_context("spawn")
+        cores = context.Queue()
+        for worker in range(options.jobs):
+            cores.put(worker)
+        with ProcessPoolExecutor(options.jobs, context, _on_one_core, (cores,)) as pool:
             outcomes = list(pool.map(_outcome, [one] * len(numbers), numbers, [options] * len(numbers)))
     return [o for o in outcomes if "failed" not in o], [o for o in outcomes if "failed" in o]
+
+
+def _on_one_core(cores: Any) -> None:
+    """Keep a worker on a core of its own: C MuJoCo would start as many threads in each as there are cores."""
+    if hasattr(os, "sched_setaffinity"):
+        there = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {there[cores.get() % len(there)]})
 
 
 def _outcome(one: Callable[[int, Any], dict[str, Any]], number: int, options: Any) -> dict[str, Any]:

@@ -22,8 +22,6 @@ LEVEL = 0.05
 _SIZES = (-0.4, -0.25, -0.12, -0.05, 0.05, 0.12, 0.25, 0.4)
 """How large changes are that are tried first, in shares of the bounds' width: of a factor of four up and down, the
 largest is 3."""
-_ALIKE = 0.02
-"""Changes whose shares of the error that they take away differ by less explain as much."""
 _TURNS = 3
 """How often so many changes are tried, each time between the neighbours of the best."""
 _FELT = 1e-3
@@ -118,7 +116,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
         raise Sim2RealError("this log says nothing about any parameter", hint="deploy something that moves")
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
     now = _with_the_rest(at, widening**2 * posterior.covariance, loss_variance(problem, at))
-    found = _ordered(found, now, table)
+    found.sort(key=lambda one: one.loss)
     seconds = problem.segment_s * len(problem.train)
     return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
 
@@ -252,24 +250,6 @@ def _finite(at: Linearised) -> Linearised:
     whole = np.isfinite(at.residuals).all(axis=(1, 2)) & np.isfinite(at.jacobian).all(axis=(1, 2, 3))
     gone = lambda a: np.where(whole.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw))
-
-
-def _ordered(found: Sequence[Fitted], loss: float, table: ParameterTable) -> list[Fitted]:
-    """Return changes, the one that explains most first; of those that explain as much, friction.
-
-    Where a motor always pushes the way that it moves, as one that pumps energy does, more friction looks like a weaker
-    motor. Friction changes with wear, grease and temperature, a motor seldom.
-
-    Args:
-        found: What the log says about each change.
-        loss: Of the log, without any change.
-        table: The parameters.
-    """
-    friction = np.array([c.parameter.vanishes for c in table.columns])
-    ordered = sorted(found, key=lambda one: one.loss)
-    alike = [one for one in ordered if one.loss - ordered[0].loss <= _ALIKE * loss]
-    first = next((one for one in alike if not np.any(one.way.along[~friction])), ordered[0])
-    return [first, *(one for one in ordered if one is not first)]
 
 
 def weigh(found: Sequence[Fitted], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:

@@ -280,17 +280,9 @@ class Problem:
         return columns, float(loss)
 
     def near(self, candidates: np.ndarray, columns: Any) -> np.ndarray:
-        """Return the loss of each candidate, ``(N,)``, with the sensitivities of a point close to all; compiled once.
-
-        An evaluation of ``at`` simulates each segment anew for every component of its initial state; this one does not.
-
-        Args:
-            candidates: Shape ``(N, P)``.
-            columns: What ``at`` returned for that point.
-        """
+        """Return the loss of candidates ``(N, P)``, with what ``at`` returned for a point close to all."""
         if "near" not in self.programs:
-            every = jnp.asarray(self.train)
-            loss = lambda z, columns, data: self._loss(z, every, columns, data)  # noqa: E731
+            loss = lambda z, columns, data: self._loss(z, jnp.asarray(self.train), columns, data)  # noqa: E731
             self.programs["near"] = program(jax.vmap(loss, in_axes=(0, None, None)))
         return np.asarray(self.programs["near"](jnp.asarray(candidates, jnp.float32), columns, self.part()))
 

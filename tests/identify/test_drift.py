@@ -65,6 +65,16 @@ def test_a_change_is_told_in_the_units_of_what_changed(name, size, unit, before,
     assert row.low95 < row.now < row.high95
 
 
+def test_of_what_explains_much_the_surest_is_named():
+    """A torque limit that was hardly felt is sure and explains nothing; friction explains what a model lacks, too."""
+    later = alone("round_trip_delay", 0.015, own=1e-6, before=1e-6, loss=0.6)
+    rubs, load = alone("friction", 0.3, own=1e-3, before=5e-3, loss=0.5), alone("load", 0.2, 1e-8, 1e-8, loss=0.98)
+    found = weigh([rubs, later, load], 1.0, TABLE, POSTERIOR, 20.0)
+    assert set(found.alarms) == {"friction", "round_trip_delay", "load"}
+    assert found.named.name == "round_trip_delay"
+    assert weigh([rubs, load], 1.0, TABLE, POSTERIOR, 20.0).named.name == "friction"
+
+
 def test_few_segments_that_say_something_make_few_degrees_of_freedom():
     """A pendulum that is held upright says nothing: of fifty segments two moved."""
     assert alone(before=0.0, segments=50.0).freedom == pytest.approx(49.0)
