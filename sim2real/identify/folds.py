@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,10 +16,8 @@ from sim2real.identify.fit import Fit
 from sim2real.identify.prediction import labels, simulated
 from sim2real.identify.problem import Problem
 from sim2real.identify.refine import effort, refine
-from sim2real.identify.segments import Data, Span
+from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import linearise
-
-_HALVINGS = 8
 
 
 @dataclass(frozen=True)
@@ -128,9 +125,9 @@ def leave_out(
     for k, mask in enumerate(touched):
         chosen = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
         own = table.of_terms(chosen)
-        data = problem.part(problem.train[mask], own)
-        start = _start(problem, data, stats.x, stats.step(table, chosen, k))
-        z = refine(problem, start[None], *effort(problem), data=data).z
+        # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
+        start = table.at_scale(stats.x + stats.step(table, chosen, k))
+        z = refine(problem, start[None], *effort(problem), data=problem.part(problem.train[mask], own)).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
@@ -139,22 +136,6 @@ def leave_out(
     ahead = _ahead(found.windows, parts, stacked, settle_s)
     free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
     return [LeftOut(*row) for row in zip(parts, values, kept, shares, ahead, free, strict=True)]
-
-
-def _start(problem: Problem, data: Data, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return where the refinement without a part begins: a linear step from the estimate, halved until it is simulated.
-
-    Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
-
-    Args:
-        problem: The residuals.
-        data: What is left.
-        x: Shape ``(P,)``: the estimate of all, on the parameters' scales.
-        step: Shape ``(P,)``: to the estimate without the part, were the model linear; a long one may end where nothing
-            can be simulated.
-    """
-    starts = (problem.table.at_scale(x + 0.5**halvings * step) for halvings in range(_HALVINGS))
-    return next((z for z in starts if math.isfinite(problem.at(z, data)[1])), problem.table.at_scale(x + step))
 
 
 def _ahead(

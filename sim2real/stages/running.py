@@ -112,11 +112,11 @@ def _go_around(
         for stage, config in plan.configs.items():
             console.note(f"{stage} (iteration {row.number + 1})")
             try:
-                ran.append(call(stage, config, run_dir))
+                ran += (
+                    _identified(flags, call, run_dir, config) if stage == "identify" else [call(stage, config, run_dir)]
+                )
             except DelayChanged as error:
                 refused = error
-            if stage == "identify" and config.log and not _accepted(ran[-1]):
-                ran += _identified_from_more(flags, call, run_dir, config)
         if not ran:
             break
     from sim2real.view.page import report  # matplotlib and jinja2 take 0.5 s to import
@@ -126,28 +126,35 @@ def _go_around(
     console.wrote(report(run_dir))
 
 
-def _accepted(identified: StageFolder) -> bool:
-    from sim2real.artifacts.identification import Identification
+def _identified(flags: RunFlags, call: Call, run_dir: Path, config: IdentifyConfig) -> list[StageFolder]:
+    """Identify, from a new recording where the deployment's logs do not suffice.
 
-    return Identification.load(identified.output("parameters")).verdict.status == "accepted"
-
-
-def _identified_from_more(flags: RunFlags, call: Call, run_dir: Path, config: IdentifyConfig) -> list[StageFolder]:
-    """Record, and identify from that and from the deployment's logs, which do not suffice: a policy moves too little.
+    A policy may hold still, or balance what falls: there the smallest error grows a hundred times within a segment.
 
     Args:
         flags: Of the run.
         call: Runs a stage.
         run_dir: Its folder.
-        config: With the deployment's logs.
+        config: With the deployment's logs; with none: there is a new recording already.
 
     Returns:
-        What the two stages left.
+        What each stage that ran left.
     """
-    console.note("the deployment's own logs are not enough to identify from: a new recording joins them")
-    recorded = call("record", flags.record, run_dir)
-    logs = (*config.log, console.shown(recorded.output("log")))
-    return [recorded, call("identify", replace(config, log=logs), run_dir)]
+    from sim2real.artifacts.identification import Identification
+
+    if not config.log:
+        return [call("identify", config, run_dir)]
+    ran: list[StageFolder] = []
+    try:
+        ran.append(call("identify", config, run_dir))
+        why = Identification.load(ran[0].output("parameters")).verdict.status
+    except Sim2RealError as error:
+        why = str(error.args[0])
+    if why == "accepted":
+        return ran
+    console.note(f"the deployment's own logs do not suffice ({why}): record, identify from that")
+    ran.append(call("record", flags.record, run_dir))
+    return [*ran, call("identify", replace(config, log=()), run_dir)]
 
 
 def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:
@@ -214,7 +221,7 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
     logs = logs_to_identify(own, result.drift, found, deployed.folder)
     if not logs:
         return _anew(flags, run_dir)
-    words = f"identify from {len(logs)} logs, the deployment's among them, train, deploy"
+    words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
     return Plan({"identify": replace(flags.identify, log=logs), **train}, words)
 
 

@@ -10,7 +10,7 @@ from sim2real.artifacts.drift import Changed, Drift
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.iterations import Iterations
 from sim2real.artifacts.run_folder import STAGES, Source, open_stage
-from sim2real.errors import DelayChanged, UsageError
+from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.stages import running
 from sim2real.stages.flags import RunFlags
 from sim2real.stages.pipeline import load_pipeline
@@ -40,6 +40,8 @@ def world(tmp_path, monkeypatch):
             if stage == "identify":
                 logs = (Source("record/session.mcap", ""),)
                 status = seen.judgements.pop(0) if len(seen.calls) > 4 and seen.judgements else "accepted"
+                if status == "fails":
+                    raise Sim2RealError("nothing could be simulated")
                 found = Identification("pendulum", logs, Judgement(status, ()), ())
                 found.write(opened.output("parameters", "parameters.json"))
             if stage == "deploy":
@@ -119,16 +121,17 @@ def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
     assert dict(world.calls[4:])["identify"].log == ()
 
 
-def test_where_the_deployment_shows_too_little_a_recording_joins_its_logs(world, capsys):
-    world.judgements = ["not identifiable"]
+@pytest.mark.parametrize("judgement", ["not identifiable", "fails"])
+def test_where_the_deployment_shows_too_little_the_robot_is_recorded(world, capsys, judgement):
+    world.judgements = [judgement]
     again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
     assert again == ["identify", "record", "identify", "train", "deploy"]
-    own, more = (config.log for stage, config in world.calls[4:] if stage == "identify")
+    own, then = (config.log for stage, config in world.calls[4:] if stage == "identify")
     assert [path.rpartition("/")[2] for path in own] == ["episode_0.mcap"]
-    assert more[:-1] == own
-    assert more[-1].endswith("record.2/session.mcap")
-    assert rows[1].stages == ("identify.2", "record.2", "identify.3", "train.2", "deploy.2")
-    assert "not enough to identify from" in capsys.readouterr().err
+    assert then == (), "the newest recording, by itself"
+    assert rows[1].stages[-4:] == ("record.2", "identify.3", "train.2", "deploy.2")
+    why = "nothing could be simulated" if judgement == "fails" else judgement
+    assert f"the deployment's own logs do not suffice ({why})" in capsys.readouterr().err
 
 
 def test_the_loop_ends_as_a_deployment_does_that_is_refused_to_the_end(world):
