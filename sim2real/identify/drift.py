@@ -172,7 +172,7 @@ def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float, c
         unit: The size that goes from bound to bound.
         columns: What ``problem.at`` returned for a size of 0.
     """
-    sizes = unit * np.array(sorted([0.0, *_SIZES]))
+    size, sizes = 0.0, unit * np.array(sorted([0.0, *_SIZES]))
     for turn in range(_TURNS):
         losses = problem.near(np.stack([point(s) for s in sizes]), columns)
         best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
