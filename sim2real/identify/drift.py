@@ -101,7 +101,8 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
         causes: Known causes that move several parameters.
 
     Returns:
-        The tests, and the point ``(P,)`` on the parameters' scales of the change that explains most.
+        The tests, and the point ``(P,)`` on the parameters' scales that explains the log best: that of the change that
+        explains most, or what was identified.
 
     Raises:
         UsageError: When parameters of the posterior are not tested.
@@ -118,7 +119,9 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     now = _with_the_rest(at, widening**2 * posterior.covariance, loss_variance(problem, at))
     found.sort(key=lambda one: one.loss)
     seconds = problem.segment_s * len(problem.train)
-    return weigh(found, now, table, posterior, seconds), posterior.mean + found[0].size * found[0].way.along
+    ends = (posterior.mean + found[0].size * found[0].way.along, posterior.mean)
+    losses = [problem.at(table.at_scale(x))[1] for x in ends]
+    return weigh(found, now, table, posterior, seconds), ends[int(losses[1] < losses[0] or not np.isfinite(losses[0]))]
 
 
 def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
