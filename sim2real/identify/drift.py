@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -15,6 +14,7 @@ from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
+from sim2real.identify.programs import program
 from sim2real.identify.uncertainty import Linearised, linearise, loss_variance
 
 LEVEL = 0.05
@@ -110,13 +110,14 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     """
     table = problem.table
     posterior = _with_known(posterior, table)
-    columns, _ = problem.at(table.at_scale(posterior.mean))
-    tried = [_alone(problem, posterior, widening, way, columns) for way in ways(table, causes)]
+    values, axes = np.linalg.eigh(posterior.covariance)
+    root = widening * axes * np.sqrt(np.maximum(values, 0.0))
+    tried = [_alone(problem, posterior.mean, root, way) for way in ways(table, causes)]
     found = [one for one in tried if one is not None]
     if not found:
         raise Sim2RealError("this log says nothing about any parameter", hint="deploy something that moves")
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
-    now = _with_the_rest(at, widening**2 * posterior.covariance, loss_variance(problem, at))
+    now = _with_the_rest(at, root, loss_variance(problem, at))
     found.sort(key=lambda one: one.loss)
     seconds = problem.segment_s * len(problem.train)
     ends = (posterior.mean + found[0].size * found[0].way.along, posterior.mean)
@@ -136,15 +137,14 @@ def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
     return Posterior(table.names, transform, mean, covariance, table.low, table.high)
 
 
-def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way, columns: Any) -> Fitted | None:
+def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fitted | None:
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
 
     Args:
         problem: The log.
-        posterior: What was identified.
-        widening: Factor on its deviations.
+        mean: Shape ``(P,)``: what was identified, on the parameters' scales.
+        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
         way: The change.
-        columns: What ``problem.at`` returned for what was identified.
 
     Returns:
         The change; None where this log does not feel it, as a torque limit that no motion of it reached.
@@ -152,43 +152,39 @@ def _alone(problem: Problem, posterior: Posterior, widening: float, way: Way, co
     table = problem.table
 
     def point(size: float) -> np.ndarray:
-        return table.at_scale(posterior.mean + size * way.along)
+        return table.at_scale(mean + size * way.along)
 
     moving = way.along != 0.0
     unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
-    size = _best(problem, point, unit, columns)
+    size = _best(problem, point, unit)
     at = _finite(linearise(problem, point(size)))
     variance, said = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
     if said * unit**2 <= _FELT * variance:
         return None
-    covariance = widening**2 * posterior.covariance
-    step, own, before, segments = _beside_the_rest(at, way, covariance, variance)
-    return Fitted(way, size + step, own, before, segments, _with_the_rest(at, covariance, variance))
+    step, own, before, segments = _beside_the_rest(at, way, root, variance)
+    return Fitted(way, size + step, own, before, segments, _with_the_rest(at, root, variance))
 
 
-def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float, columns: Any) -> float:
+def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -> float:
     """Return how far along a change the log is fitted best.
 
     Args:
         problem: The log.
         point: Size of the change -> the unbounded vector ``(P,)``.
         unit: The size that goes from bound to bound.
-        columns: What ``problem.at`` returned for a size of 0.
     """
+    losses = problem.programs.setdefault("changes", program(problem.losses))
     size, sizes = 0.0, unit * np.array(sorted([0.0, *_SIZES]))
-    for turn in range(_TURNS):
-        losses = problem.near(np.stack([point(s) for s in sizes]), columns)
-        best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
+    for _ in range(_TURNS):
+        tried = np.array([point(s) for s in sizes], np.float32)
+        found = np.asarray(losses(tried, np.asarray(point(size), np.float32)))
+        best = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
         size = float(sizes[best])
-        if turn == 0 and size != 0.0:
-            columns, _ = problem.at(point(size))
         sizes = np.linspace(sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)], len(sizes))
     return size
 
 
-def _beside_the_rest(
-    at: Linearised, way: Way, covariance: np.ndarray, variance: float
-) -> tuple[float, float, float, float]:
+def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float) -> tuple[float, float, float, float]:
     """Return how far a change goes if all else may be as far off as the identification leaves open.
 
     By generalised least squares, so that what the change alone could have done counts most: where a hand moves slowly a
@@ -200,15 +196,13 @@ def _beside_the_rest(
     Args:
         at: The log, with the change that fits it best.
         way: The change.
-        covariance: Shape ``(P, P)``: what the identification leaves open.
+        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
         variance: Of a residual.
 
     Returns:
         How much further it goes; the variance of its size by the log's residuals, and by what is open; how many
         segments of the log say something about it.
     """
-    values, axes = np.linalg.eigh(covariance)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
     along, residuals = at.jacobian @ way.along, at.residuals.reshape(len(at.residuals), -1)
     unit = 1.0 / float(np.linalg.norm(along))
     # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
@@ -229,20 +223,18 @@ def _beside_the_rest(
     return unit * float(moved[0]), own, unit**2 * float(np.sum(inverse[0, 1:] ** 2)), segments
 
 
-def _with_the_rest(at: Linearised, covariance: np.ndarray, variance: float) -> float:
+def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
     """Return the loss at a point once all parameters moved as far as the identification leaves open.
 
     The right change needs little more; another one that imitates it needs much, and that costs.
 
     Args:
         at: The point.
-        covariance: Shape ``(P, P)``: what the identification leaves open.
+        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
         variance: Of a residual.
     """
     flat, rest = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
     # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
-    values, axes = np.linalg.eigh(covariance)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
     pulled, informed = root.T @ (flat.T @ rest), root.T @ (flat.T @ flat) @ root
     gain = pulled @ np.linalg.solve(informed + variance * np.eye(len(root)), pulled)
     return float(rest @ rest - gain) / max(int(np.count_nonzero(rest)), 1)

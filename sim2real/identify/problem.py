@@ -279,13 +279,6 @@ class Problem:
         columns, loss = self.programs["at"](jnp.asarray(z, jnp.float32), data or self.part())
         return columns, float(loss)
 
-    def near(self, candidates: np.ndarray, columns: Any) -> np.ndarray:
-        """Return the loss of candidates ``(N, P)``, with what ``at`` returned for a point close to all."""
-        if "near" not in self.programs:
-            loss = lambda z, columns, data: self._loss(z, jnp.asarray(self.train), columns, data)  # noqa: E731
-            self.programs["near"] = program(jax.vmap(loss, in_axes=(0, None, None)))
-        return np.asarray(self.programs["near"](jnp.asarray(candidates, jnp.float32), columns, self.part()))
-
     def sensitivities(self, z: Any, pick: Any = None, data: Data | None = None) -> Any:
         """Return ``sensitivity`` for several segments, ``(B, 2 * channels, C, fields)``; None if states are not fitted.
 

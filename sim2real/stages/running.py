@@ -14,7 +14,6 @@ from sim2real.stages import console, targets
 if TYPE_CHECKING:
     from sim2real.artifacts.deployment import Deployment
     from sim2real.artifacts.iterations import Iteration
-    from sim2real.stages.config import IdentifyConfig
     from sim2real.stages.flags import RunFlags
     from sim2real.stages.pipeline import Pipeline
 
@@ -112,9 +111,7 @@ def _go_around(
         for stage, config in plan.configs.items():
             console.note(f"{stage} (iteration {row.number + 1})")
             try:
-                ran += (
-                    _identified(flags, call, run_dir, config) if stage == "identify" else [call(stage, config, run_dir)]
-                )
+                ran += _ran(flags, call, run_dir, stage, config)
             except DelayChanged as error:
                 refused = error
         if not ran:
@@ -126,8 +123,8 @@ def _go_around(
     console.wrote(report(run_dir))
 
 
-def _identified(flags: RunFlags, call: Call, run_dir: Path, config: IdentifyConfig) -> list[StageFolder]:
-    """Identify, from a new recording where the deployment's logs do not suffice.
+def _ran(flags: RunFlags, call: Call, run_dir: Path, stage: str, config: Any) -> list[StageFolder]:
+    """Run a stage; identification from a new recording, too, where the deployment's logs do not suffice.
 
     A policy may hold still, or balance what falls: there the smallest error grows a hundred times within a segment.
 
@@ -135,15 +132,16 @@ def _identified(flags: RunFlags, call: Call, run_dir: Path, config: IdentifyConf
         flags: Of the run.
         call: Runs a stage.
         run_dir: Its folder.
-        config: With the deployment's logs; with none: there is a new recording already.
+        stage: The stage's name.
+        config: Its configuration: that of an identification names the deployment's logs, or there is a recording.
 
     Returns:
         What each stage that ran left.
     """
     from sim2real.artifacts.identification import Identification
 
-    if not config.log:
-        return [call("identify", config, run_dir)]
+    if stage != "identify" or not config.log:
+        return [call(stage, config, run_dir)]
     ran: list[StageFolder] = []
     try:
         ran.append(call("identify", config, run_dir))
