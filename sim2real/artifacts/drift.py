@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 _MUCH = 0.5
 """Share of what the change explains that explains most, from which on another one may be the cause. In 26 logs of nine
-hidden robots, on which this was chosen, the right one explained 0.98 of that at least; later, of an SO-101, once 0.49. A
-torque limit that was hardly felt explained nothing, and was sure."""
+hidden robots, on which this was chosen, the right one explained 0.98 of that at least; later, of an SO-101, once 0.49.
+A torque limit that was hardly felt explained nothing, and was sure."""
 
 
 @dataclass(frozen=True)
