@@ -57,8 +57,9 @@ def assert_steps_are_a_log(folder):
     assert np.median(np.diff(t_s)) < 1.4 / 50
     left_s = log.steps["actuator"].end[up + 1] * 1e-6
     after = np.interp(left_s + 0.13, t_s, moved) * np.sign(volts[up + 1])
-    assert np.sum(after > 0.05) >= 8, "so many are undisturbed: others were made again"
-    soon = (t_s > left_s[:, None]) & (t_s < left_s[:, None] + 0.2)
+    assert np.median(after) > 0.07
+    assert np.mean(after > 0.05) >= 0.75, "a busy machine may hold up an emulated motor's answer, rarely"
+    soon = (t_s > left_s[:, None]) & (t_s < np.append(left_s[1:], np.inf)[:, None])
     farthest = np.max(np.where(soon, moved * np.sign(volts[up + 1])[:, None], -np.inf), axis=1)
     assert np.all(farthest > 0.05), "each step is answered, in its direction"
 
