@@ -1,4 +1,9 @@
-"""Local refinement by Levenberg-Marquardt, from the best candidates of a search."""
+"""Local refinement by damped least squares, from the best candidates of a search.
+
+Where rollouts are part of a program, so is the whole descent: optimistix's Levenberg-Marquardt. On C its steps are
+scipy's, which takes derivatives of accepted steps alone; optimistix takes them of rejected ones, too. From one start a
+quadruped of 16 parameters ended after 14 Jacobians instead of 25, at the same loss: 10.6 instead of 18 s.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,9 +26,13 @@ _GAIN = 1e-4
 """A round that gains a smaller share of the loss is the last."""
 _STEPS = 8
 """Most steps of a short round, on C: of a quadruped the loss is within 0.01 % of its end after four."""
-_TOLERANCE, _TOLERANCE_C = (1e-5, 1e-6), (1e-4, 1e-4)
-"""Relative and absolute change of point and loss at which a round ends. Finer steps are lost in the noise of finite
-differences: an arm on C took twice the steps to the same point."""
+_TOLERANCE = (1e-5, 1e-6)
+"""Relative and absolute change of point and loss at which a round of a program ends."""
+_LEAST, _MOST = 1e-4, 1e-3
+"""Relative change at which one on C does, from the finest to the coarsest: a round's own gain in between. Finer steps
+are lost in the noise of finite differences: an arm took twice the steps to the same point."""
+Improve = Callable[[Any, Any, Data, float], tuple[Any, Any]]
+"""One round: ``z, columns, data, least gain of a step -> (z, steps taken)``."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +104,7 @@ def refine(
     data = data or problem.part()
     if ("improve", steps) not in problem.programs:
         with telling(on_compile):
-            like = jnp.asarray(starts[0], jnp.float32)
-            columns, _ = problem.at(like, data)
-            problem.programs["improve", steps] = _program(problem, steps).lower(like, columns, data).compile()
+            problem.programs["improve", steps] = _improve(problem, steps, jnp.asarray(starts[0], jnp.float32), data)
     improve = problem.programs["improve", steps]
     begin = [problem.at(s, data) for s in starts]
     first = [loss for _, loss in begin]
@@ -111,7 +119,7 @@ def refine(
     for turn in range(rounds):
         ended = []
         for z, columns, loss in going:
-            moved, count = improve(z, columns, data)
+            moved, count = improve(z, columns, data, gain)
             taken += int(count)
             after, new = problem.at(moved, data)
             better = bool(jnp.all(jnp.isfinite(moved))) and new < loss
@@ -128,20 +136,53 @@ def refine(
     return Refined(best, best_loss, float(np.nanmin(first)), taken, tuple(ends))
 
 
-def _program(problem: Problem, steps: int) -> Any:
-    """Return one round of Levenberg-Marquardt, jitted: ``z, columns, data -> (z, steps taken)``."""
-    import optimistix  # 0.5 s
-
-    rtol, atol = _TOLERANCE_C if problem.engine.name == "c" else _TOLERANCE
-    solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=atol)
+def _improve(problem: Problem, steps: int, like: Any, data: Data) -> Improve:
+    """Return one round of descent, compiled for points like this one."""
+    columns, _ = problem.at(like, data)
     scale = 1.0 / np.sqrt(max(problem.measurements, 1))
 
-    def improve(z: Any, columns: Any, data: Data) -> tuple[Any, Any]:
-        def weighed(y: Any) -> Any:
-            residuals = problem.stacked(y, columns, data).reshape(-1)
-            return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
+    def weighed(y: Any, columns: Any, data: Data) -> Any:
+        residuals = problem.stacked(y, columns, data).reshape(-1)
+        return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
 
-        residuals = by_jacobian(problem.differentiable(weighed))
+    if problem.engine.name == "c":
+        return _on_host(problem, weighed, steps, (like, columns, data))
+    compiled = _as_program(problem, weighed, steps).lower(like, columns, data).compile()
+    return lambda z, columns, data, _: compiled(z, columns, data)
+
+
+def _on_host(problem: Problem, weighed: Callable[..., Any], steps: int, like: Any) -> Improve:
+    """Return a round of scipy's trust-region method."""
+    from scipy.optimize import least_squares  # 0.2 s
+
+    def columns_of(y: Any, columns: Any, data: Data) -> Any:
+        f = problem.differentiable(lambda x: weighed(x, columns, data))
+        return jax.vmap(lambda d: jax.jvp(f, (y,), (d,))[1], out_axes=-1)(jnp.eye(y.size, dtype=y.dtype))
+
+    value, slope = (program(f).lower(*like).compile() for f in (weighed, columns_of))
+
+    def improve(z: Any, columns: Any, data: Data, gain: float) -> tuple[Any, Any]:
+        def of(f: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda y: np.asarray(f(jnp.asarray(y, jnp.float32), columns, data), np.float64)
+
+        if not np.isfinite(of(value)(z)).all():
+            return z, 0
+        least = float(np.clip(gain, _LEAST, _MOST))
+        found = least_squares(of(value), np.asarray(z, np.float64), of(slope), ftol=least, xtol=_LEAST, max_nfev=steps)
+        return jnp.asarray(found.x, jnp.float32), found.njev
+
+    return improve
+
+
+def _as_program(problem: Problem, weighed: Callable[..., Any], steps: int) -> Any:
+    """Return a round of optimistix's Levenberg-Marquardt, jitted."""
+    import optimistix  # 0.5 s
+
+    rtol, atol = _TOLERANCE
+    solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=atol)
+
+    def improve(z: Any, columns: Any, data: Data) -> tuple[Any, Any]:
+        residuals = by_jacobian(problem.differentiable(lambda y: weighed(y, columns, data)))
         found = optimistix.least_squares(
             lambda y, _: residuals(y), solver, z, options={"jac": "fwd"}, max_steps=steps, throw=False
         )
