@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.c.rollouts import Start, check_steps
-from sim2real.composer.mjx import constants, open_loop
+from sim2real.composer.c.rollouts import Start, StepLaw, check_steps
+from sim2real.composer.mjx import constants, open_loop, stepping
 from sim2real.composer.mjx.environment import MjxEnvironment, State
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
@@ -101,6 +101,8 @@ class ComposedWorld(BaseWorld):
             )
         super().__init__(name, ticks, color=color, order=order)
         self.input_name, self.field = command, field
+        self.law: StepLaw | None = None
+        """What is set before every physics step from the state then; a subclass's. Of the model: fields alone."""
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
         self._apart, self._derived = False, frozenset[str]()
@@ -141,7 +143,7 @@ class ComposedWorld(BaseWorld):
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
         if self._apart:
             return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
-        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel))
+        return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
 
     def output(self, state: State) -> Any:
         """Return the message that says what a state is; default: the task's observation."""
@@ -166,12 +168,30 @@ class ComposedWorld(BaseWorld):
         """Take a control step under the newest action."""
         action = self._action(step_state)
         before = self.entered(step_state.state, action)
-        state: Any = self.environment.step(before, action, self._model(step_state.params))
+        params = step_state.params
+        state: Any = self.environment.step(before, action, self._model(params), self._lawful(params))
         # What is over stays over: others look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)
         return new, self.output(state)
+
+    def law_values(self, params: WorldParams) -> dict[str, jax.Array]:
+        """Return the numbers that ``law`` needs; they may differ from copy to copy."""
+        del params
+        return {}
+
+    def _lawful(self, params: WorldParams) -> stepping.Law | None:
+        """Return the law as MJX takes it, with the numbers of a copy."""
+        if (law := self.law) is None:
+            return None
+        values = self.law_values(params)
+
+        def lawful(model: mjx.Model, data: mjx.Data) -> mjx.Model:
+            changed = law(jnp, values, data.ctrl, data.qpos, data.qvel)[2]
+            return stepping.with_fields(model, {n: jnp.asarray(v, model.qpos0.dtype) for n, v in changed.items()})
+
+        return lawful
 
     # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
 

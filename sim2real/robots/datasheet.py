@@ -20,10 +20,11 @@ class DataSheet:
         stall: Torque at full duty and standstill [N m].
         damping: Back-EMF and viscous friction together, about ``stall`` divided by the no-load speed [N m s/rad].
         armature: Inertia of the rotor, as seen at the gear's output [kg m^2].
-        friction: Dry friction [N m].
+        friction: Dry friction [N m]; where it wears off with speed, that at standstill.
         p_gain: Position P Gain [counts].
         profile_rad_s: Profile Velocity [rad/s].
         model_number: Model number of the servos; a twin of the robot emulates that model's firmware.
+        stribeck_rad_s: Speed at which 1/e of the dry friction is left [rad/s]; None: it is the same at every speed.
     """
 
     stall: float
@@ -33,6 +34,12 @@ class DataSheet:
     p_gain: int = 800
     profile_rad_s: float = 5.0
     model_number: int = 1060
+    stribeck_rad_s: float | None = None
+
+    @property
+    def worn(self) -> bool:
+        """Whether dry friction wears off with speed."""
+        return self.stribeck_rad_s is not None
 
     @property
     def full_rad(self) -> float:

@@ -66,7 +66,8 @@ class Loaded:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
         task = self._robot.task
         fields = {_MASS: ([self._body], "mass"), _CENTRE: ([self._body], "ipos"), **self._robot.fields(task)}
-        return ServoWorld(self.roles.world, task, fields, resumed, self.roles.actuator)
+        worn = self._robot.servos.sheet.worn
+        return ServoWorld(self.roles.world, task, fields, resumed, self.roles.actuator, worn)
 
     def sim_actuator(self) -> SimActuator:
         """Return the bus in simulation."""

@@ -229,7 +229,8 @@ class ServoRobot(LoopRobot):
 
     def make_world(self, resumed: bool = False) -> ServoWorld:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
-        return ServoWorld(self.roles.world, self.task, self.fields(self.task), resumed, self.roles.actuator)
+        fields, worn = self.fields(self.task), self.servos.sheet.worn
+        return ServoWorld(self.roles.world, self.task, fields, resumed, self.roles.actuator, worn)
 
     def make_agent(self, **options: Any) -> GoalAgent:
         """Return the policy's node, with options of ``BaseNode``."""
@@ -280,10 +281,9 @@ class ServoRobot(LoopRobot):
             aim: What the episode is about ``(k,)``.
             policy: The policy.
         """
-        start, speed = jnp.asarray(position, jnp.float32), jnp.asarray(velocity, jnp.float32)
-        params = self._world_params.replace(values=self.place(values, aim), qpos=start, qvel=speed)
+        start, speed = (jnp.asarray(x, jnp.float32) for x in (position, velocity))
         return {
-            self.roles.world: params,
+            self.roles.world: self._world_params.replace(values=self.place(values, aim), qpos=start, qvel=speed),
             self.roles.sensor: DelayParams(delay=values.get("sensor_delay")),
             self.roles.actuator: DelayParams(delay=values.get("actuator_delay")),
             self.roles.supervisor: AgentParams(policy=policy, aim=aim, start=start),
@@ -291,8 +291,8 @@ class ServoRobot(LoopRobot):
 
     def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
         """Return parameters for an episode in the middle of a recording, from positions, then velocities."""
-        n, start = len(self.servos.joints), jnp.asarray(start)
-        params = self.node_params(values, start[:n], start[n:], jnp.zeros(len(self.aim)))
+        position, velocity = jnp.split(jnp.asarray(start), 2)
+        params = self.node_params(values, position, velocity, jnp.zeros(len(self.aim)))
         del params[self.roles.supervisor]
         return params
 

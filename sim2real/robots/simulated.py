@@ -7,15 +7,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sim2real.composer.world import ComposedWorld
+from sim2real.composer.world import ComposedWorld, WorldParams
+from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import JointReading
 from sim2real.robots.parts import REFERENCE, GoalTask
 from sim2real.robots.roles import ROLES
+from sim2real.worlds.worn import WornFriction
 
 __all__ = ["ServoWorld", "SimActuator", "SimSensor"]
+
+STRIBECK = "stribeck_rad_s"
+"""Value of the world's parameters ``(joints,)`` [rad/s]."""
 
 
 class ServoWorld(ComposedWorld):
@@ -28,6 +33,7 @@ class ServoWorld(ComposedWorld):
         resumed: Whether episodes begin in the middle of a recording. The servos' setpoints, which are not recorded,
             then start at the goals of that time; otherwise they start at the joints' positions, as when torque goes on.
         actuator: Name of the actuator.
+        worn: Whether dry friction wears off with speed; ``stribeck_rad_s`` of the parameters' values says where.
         **options: Options of ``ComposedWorld``.
     """
 
@@ -38,15 +44,32 @@ class ServoWorld(ComposedWorld):
         parameters: Any,
         resumed: bool = False,
         actuator: str = ROLES.actuator,
+        worn: bool = False,
         **options: Any,
     ) -> None:
+        if worn and options.get("impl", "jax") != "jax":
+            raise UsageError("friction that wears off with speed is set between MJX's steps", hint='take impl="jax"')
         super().__init__(name, task, actuator, "goal", parameters, **options)
         self._resumed = resumed
+        self.law = WornFriction() if worn else None
         self.lead_s = 0.5 * task.physics_timestep
         model = self.environment.model
         joints = [model.joint(j.full_identifier) for j in task.joints]
         self._qpos = jnp.array([int(j.qposadr[0]) for j in joints])
         self._qvel = jnp.array([int(j.dofadr[0]) for j in joints])
+
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> WorldParams:
+        """Return the parameters' compiled values; friction then is the same at every speed."""
+        params = super().init_params(rng, graph_state)
+        if self.law is None:
+            return params
+        return params.replace(values={**params.values, STRIBECK: jnp.full(len(self._qvel), jnp.inf)})
+
+    def law_values(self, params: WorldParams) -> dict[str, jax.Array]:
+        """Return friction at standstill [N m], and at which speed [rad/s] 1/e of it is left, of all that moves."""
+        friction = self._model(params).dof_frictionloss
+        widths = jnp.full(friction.shape, jnp.inf).at[self._qvel].set(jnp.asarray(params.values[STRIBECK]))
+        return {"frictionloss": friction, STRIBECK: widths}
 
     def output(self, state: Any) -> JointReading:
         """Return positions and velocities of the joints."""

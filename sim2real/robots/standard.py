@@ -17,12 +17,15 @@ from sim2real.hardware.joint import Joint
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.datasheet import DataSheet
 from sim2real.robots.parts import ServoDriven
+from sim2real.robots.simulated import STRIBECK
 
 _NAMES = ("gain", "damping", "armature", "friction")
 
 
 def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
-    """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 8 of the data sheet.
+    """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 10 of the data sheet.
+
+    Where friction wears off with speed, how fast is a parameter, too, which all joints share.
 
     Args:
         sheet: The servo's data sheet.
@@ -40,6 +43,9 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
         names = [f"{name}_{j.name}" for j in map(Joint.of, joints)] if name in own else [name]
         gone = name != "gain"
         found += [Parameter(n, unit, value, value / factor, value * factor, about=about, vanishes=gone) for n in names]
+    if (width := sheet.stribeck_rad_s) is not None:
+        about = "speed at which 1/e of the dry friction is left"
+        found.append(Parameter("stribeck", "rad/s", width, width / 10, width * 10, about=about))
     return found
 
 
@@ -92,6 +98,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
         for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad))
     )
+    worn = {STRIBECK: jnp.stack(of_joints(values, "stribeck", joints, jnp.inf)) / gear} if sheet.worn else {}
     armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
@@ -101,6 +108,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         "damping": damping * gear**2,
         "armature": armature * gear**2,
         "friction": friction * gear,
+        **worn,
     }
 
 

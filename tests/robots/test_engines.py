@@ -1,5 +1,6 @@
 """Segments on C MuJoCo and in the compiled graph: the same numbers, whatever the delays."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_robot import VALUES, PairRobot, PairTask
+from small_robot import SHEET, VALUES, PairRobot, PairTask
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -17,6 +18,7 @@ from sim2real.identify.segments import Span
 
 MAX_DELAY_S, SEGMENT_S = 0.03, 0.4
 LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03), "friction_left": (0.01, 0.1)}
+LIMITS |= {"stribeck": (0.05, 2.0)}
 
 
 class ConvergedRobot(PairRobot):
@@ -27,6 +29,12 @@ class ConvergedRobot(PairRobot):
         option = task.root_entity.mjcf_model.option
         option.iterations, option.ls_iterations, option.tolerance = 100, 50, 0
         return task
+
+
+class WornRobot(ConvergedRobot):
+    """Its friction wears off with speed."""
+
+    servos = replace(PairRobot.servos, sheet=replace(SHEET, stribeck_rad_s=0.5))
 
 
 def steps(start, stamp, end):
@@ -51,15 +59,15 @@ def episode():
     )
 
 
-@pytest.fixture(scope="module")
-def engines(episode):
+@pytest.fixture(scope="module", params=[ConvergedRobot, WornRobot], ids=["constant", "worn"])
+def engines(request, episode):
     """Programs that return the residuals of two segments in radians, of both engines, in double precision."""
     programs = {}
     jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
     try:
         for engine in ("c", "compiled"):
             config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state="measured", engine=engine)
-            model = ConvergedRobot().identifiable(MAX_DELAY_S)
+            model = request.param().identifiable(MAX_DELAY_S)
             problem = Problem(model, [episode], [Span(0, 0.2), Span(0, 0.55)], SEGMENT_S, config)
             assert problem.engine.name == engine
             sigmas = jnp.array([s for _, s, _ in problem.fields])
@@ -69,7 +77,7 @@ def engines(episode):
                 return sigmas * errors
 
             programs[engine] = jax.jit(run)
-        yield SimpleNamespace(**programs)
+        yield SimpleNamespace(**programs, worn=request.param is WornRobot)
     finally:
         jax.config.update("jax_enable_x64", False)
 
@@ -90,6 +98,12 @@ def test_both_engines_say_the_same(engines, sensor, actuator, own):
 
 @pytest.mark.parametrize("name", ["sensor_delay", "actuator_delay"])
 def test_that_would_fail_if_a_tick_were_wrong(engines, name):
-    values = {**VALUES, "sensor_delay": 0.006, "actuator_delay": 0.011}
+    values = {**VALUES, "stribeck": 0.5, "sensor_delay": 0.006, "actuator_delay": 0.011}
     there = played(engines.c, {**values, name: values[name] + 0.01})
     assert np.abs(there - played(engines.compiled, values)).max() > 1e-2
+
+
+def test_friction_wears_off_only_where_the_robot_says_so(engines):
+    values = {**VALUES, "friction_left": 0.1, "sensor_delay": 0.0, "actuator_delay": 0.01}
+    one, other = (played(engines.compiled, {**values, "stribeck": width}) for width in (0.1, 1.0))
+    assert (np.abs(one - other).max() > 1e-2) == engines.worn

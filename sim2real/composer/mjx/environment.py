@@ -20,7 +20,7 @@ from sim2real.composer.mjx import gate, stepping, views, warp
 from sim2real.composer.mjx.physics import MjxPhysics
 from sim2real.composer.mjx.random import JaxRandomState, Registry
 from sim2real.composer.mjx.rings import Samples, make_rings
-from sim2real.composer.mjx.tracing import TracedHooks
+from sim2real.composer.mjx.tracing import TracedHooks, check_variables
 from sim2real.composer.models.translate import mj
 from sim2real.composer.reward import split_reward
 from sim2real.composer.task import Task
@@ -156,11 +156,14 @@ class MjxEnvironment:
         self._hooks.run("after_compile", view, random_state)
         self._action_spec = self.task.action_spec(view)
 
-    def _physics(self, state: State | None = None, model: mjx.Model | None = None) -> tuple[MjxPhysics, JaxRandomState]:
+    def _physics(
+        self, state: State | None = None, model: mjx.Model | None = None, law: stepping.Law | None = None
+    ) -> tuple[MjxPhysics, JaxRandomState]:
         """Return the view of a state, or of the model's initial state, for hooks."""
         compiled = self.mjx_model if model is None else model
         data = self.initial if state is None else state.data
-        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, self._warp or stepping)
+        engine = stepping.Lawful(law) if law else self._warp or stepping
+        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, engine)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()
         physics.start = self.initial
@@ -193,14 +196,18 @@ class MjxEnvironment:
                 f"physics.variables {', '.join(map(repr, missing))} first appear in a step",
                 hint="set them in initialize_episode too: a compiled program carries the same variables all along",
             )
-        _check_variables(state.variables, after.variables)
+        check_variables(state.variables, after.variables)
 
     def _trace(self, key: jax.Array, action: jax.Array) -> tuple[State, State]:
         state = jax.eval_shape(self.reset, key)
         return state, jax.eval_shape(self.step, state, action)
 
     def reset(
-        self, key: jax.Array, model: mjx.Model | None = None, start: tuple[ArrayLike, ArrayLike] | None = None
+        self,
+        key: jax.Array,
+        model: mjx.Model | None = None,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+        law: stepping.Law | None = None,
     ) -> State:
         """Return a copy at the start of an episode.
 
@@ -208,8 +215,9 @@ class MjxEnvironment:
             key: JAX key.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
             start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
+            law: What is set of the model from the state, not on Warp; ``step`` takes the same.
         """
-        physics, random_state = self._physics(None, model)
+        physics, random_state = self._physics(None, model, law)
         random_state.key = key
         if start is not None:
             physics.replace("data", "qpos", start[0])
@@ -276,15 +284,18 @@ class MjxEnvironment:
         kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
         return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
 
-    def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
+    def step(
+        self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
+    ) -> State:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
 
         Args:
             state: The copy.
             action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
+            law: See ``reset``.
         """
-        physics, random_state = self._physics(state, model)
+        physics, random_state = self._physics(state, model, law)
         self._hooks.run("before_step", physics, action, random_state)
         rings, diverged = self._substeps(physics, random_state, state, action)
         self._hooks.run("after_step", physics, random_state)
@@ -383,17 +394,3 @@ def is_unstable(data: mjx.Data) -> jax.Array:
     """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
     return ~(jnp.abs(state) <= mj.mjMAXVAL).all()
-
-
-def _check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
-    for name, value in before.items():
-        old, new = (
-            [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree_util.tree_leaves(v)] for v in (value, after[name])
-        )
-        if old != new:
-            (shape, dtype), (shape_after, dtype_after) = next(p for p in zip(old, new, strict=False) if p[0] != p[1])
-            raise UsageError(
-                f"physics.variables[{name!r}] starts as {dtype}{list(shape)} and is {dtype_after}{list(shape_after)} "
-                "after a step",
-                hint="start it with what it becomes, such as physics.np.zeros(3)",
-            )

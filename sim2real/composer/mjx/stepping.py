@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import jax.numpy as jnp
 from mujoco import mjx
 
 T = TypeVar("T", mjx.Model, mjx.Data)
+Law = Callable[[mjx.Model, mjx.Data], mjx.Model]
+"""Model and state -> the model with what follows from the state, such as friction that wears off with speed."""
 
 
 def with_fields(tree: T, values: dict[str, Any]) -> T:
@@ -15,7 +18,7 @@ def with_fields(tree: T, values: dict[str, Any]) -> T:
     return cast("T", tree.tree_replace(values))
 
 
-def advance(model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
+def advance(model: mjx.Model, data: mjx.Data, legacy: bool, law: Law | None = None) -> mjx.Data:
     """Return the data a time step later.
 
     With ``legacy`` the data must be consistent, what ``forward`` or an earlier step returned, and that is no dearer:
@@ -25,13 +28,36 @@ def advance(model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
         model: The ``mjx.Model``.
         data: The ``mjx.Data``.
         legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
+        law: What is set of the model where constraints are made: from the state that a step begins with.
     """
+    now = law(model, data) if law else model
     if not legacy:
-        return _integrate(model, forward(model, data))
+        return _integrate(now, forward(now, data))
     if model.opt.integrator == mjx.IntegratorType.RK4:
-        return _positions(model, _integrate(model, forward(model, data)))
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    return _positions(model, _integrate(model, _accelerate(model, data)))
+        data = _integrate(now, forward(now, data))
+    else:
+        data = mjx.fwd_acceleration(now, mjx.fwd_actuation(now, data))
+        data = _integrate(now, _accelerate(now, data))
+    return _positions(law(model, data) if law else model, data)
+
+
+class Lawful:
+    """Steps as this module does, under a law.
+
+    Args:
+        law: What is set of the model from the state.
+    """
+
+    def __init__(self, law: Law) -> None:
+        self._law = law
+
+    def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
+        """Return the data a time step later; see the function."""
+        return advance(model, data, legacy, self._law)
+
+    def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
+        """Compute everything that follows from the state; see the function."""
+        return forward(self._law(model, data), data, actuation)
 
 
 def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -214,3 +214,26 @@ def _drawn() -> object:
 def _numbers(state: Any) -> tuple[bytes, int, list[Any]]:
     _, keys, position, *rest = state
     return keys.tobytes(), position, rest
+
+
+def check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
+    """Check that a step leaves the variables of a task as large as it found them.
+
+    Args:
+        before: Name -> value, at the start.
+        after: After a step.
+
+    Raises:
+        UsageError: With the variable.
+    """
+    for name, value in before.items():
+        old, new = (
+            [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree_util.tree_leaves(v)] for v in (value, after[name])
+        )
+        if old != new:
+            (shape, dtype), (shape_after, dtype_after) = next(p for p in zip(old, new, strict=False) if p[0] != p[1])
+            raise UsageError(
+                f"physics.variables[{name!r}] starts as {dtype}{list(shape)} and is {dtype_after}{list(shape_after)} "
+                "after a step",
+                hint="start it with what it becomes, such as physics.np.zeros(3)",
+            )

@@ -1,0 +1,32 @@
+"""Dry friction that wears off with speed, of the joints of a MuJoCo model (Stribeck effect)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+class WornFriction:
+    """Sets dry friction before every step: ``frictionloss * exp(-|velocity| / stribeck_rad_s)``.
+
+    What MuJoCo's constraint holds at standstill stays exact; only how large it is follows the speed.
+    """
+
+    fields: tuple[str, ...] = ("dof_frictionloss",)
+    """What it sets of the model, ``(nv,)``."""
+
+    def __call__(
+        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Return controls ``(..., nu)`` as they are, forces of 0 ``(..., nv)``, and the friction of the next step.
+
+        Args:
+            xp: ``numpy`` or ``jax.numpy``.
+            values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, where 1/e of it is left, ``(..., nv)``.
+            control: Controls ``(..., nu)``.
+            qpos: Not used.
+            qvel: Velocities ``(..., nv)`` [rad/s].
+        """
+        del qpos
+        left = xp.exp(-xp.abs(qvel) / values["stribeck_rad_s"])
+        return control, 0.0 * qvel, {"dof_frictionloss": values["frictionloss"] * left}
