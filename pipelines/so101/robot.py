@@ -90,7 +90,7 @@ class SO101Robot(ServoRobot):
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified: servos of one model, each with friction and brake of its own."""
-        found = standard.parameters(SHEET, JOINTS, own=("damping", "friction"))
+        found = standard.parameters(SHEET, JOINTS, own=("damping", "friction")) + standard.offsets(JOINTS)
         full, about = SHEET.full_rad, "error from which on it pushes no harder"
         # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
         limit = Parameter("", "rad", full, full / 10, full * 2, about=about, begin=full / 4)

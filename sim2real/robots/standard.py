@@ -20,6 +20,9 @@ from sim2real.robots.parts import ServoDriven
 from sim2real.robots.simulated import STRIBECK
 
 _NAMES = ("gain", "damping", "armature", "friction")
+MISSES = "goal_offset"
+"""By how much a servo misses its goals [rad]: their zero is not the encoder's, or gears hang."""
+_MOST_RAD = 0.05
 
 
 def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
@@ -47,6 +50,17 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
         about = "speed at which 1/e of the dry friction is left"
         found.append(Parameter("stribeck", "rad/s", width, width / 10, width * 10, about=about))
     return found
+
+
+def offsets(joints: Sequence[Joint | str]) -> list[Parameter]:
+    """Return by how much the servo of each joint misses its goals, for ``ServoRobot.dynamics``.
+
+    Args:
+        joints: The joints, or their names.
+    """
+    about = "where it comes to rest without load, from its goal"
+    names = [f"{MISSES}_{joint.name}" for joint in map(Joint.of, joints)]
+    return [Parameter(name, "rad", 0.0, -_MOST_RAD, _MOST_RAD, "linear", about=about) for name in names]
 
 
 def causes(joints: Sequence[Joint | str]) -> dict[str, dict[str, float]]:
@@ -94,15 +108,15 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         step_s: The physics' time step [s].
     """
     n, gear = len(joints), np.array([Joint.of(joint).gear for joint in joints], np.float32)
-    gain, damping, inertia, friction, full = (
+    gain, damping, inertia, friction, full, off = (
         jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
-        for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad))
+        for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad), (MISSES, 0.0))
     )
     worn = {STRIBECK: jnp.stack(of_joints(values, "stribeck", joints, jnp.inf)) / gear} if sheet.worn else {}
     armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
-        "bias": jnp.zeros((n, 10)).at[:, 1].set(-gain * gear**2),
+        "bias": jnp.zeros((n, 10)).at[:, 0].set(gain * off * gear).at[:, 1].set(-gain * gear**2),
         # The torque limit is that at full duty, so it is proportional to the gain.
         "most": (gain * full * gear)[:, None] * jnp.array([-1.0, 1.0]),
         "damping": damping * gear**2,
@@ -126,17 +140,18 @@ def identified_mjcf(
     """
     spec: Any = mj.MjSpec.from_string(mjcf)
     found = [of_joints(values, name, joints) for name in _NAMES]
-    found.append(of_joints(values, "saturation", joints, sheet.full_rad))
+    found += [of_joints(values, "saturation", joints, sheet.full_rad), of_joints(values, MISSES, joints, 0.0)]
     rows = zip(joints, robot.joints, robot.actuators, zip(*found, strict=True), strict=True)
     for mounted, element, actuator, numbers in rows:
         gear = Joint.of(mounted).gear
-        gain, damping, armature, friction, full = (float(n) for n in numbers)
+        gain, damping, armature, friction, full, off = (float(n) for n in numbers)
         joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
         joint.damping = [damping * gear**2, *joint.damping[1:]]
         joint.armature = max(_beside_damping(armature, damping, spec.option.timestep), 0.0) * gear**2
         joint.frictionloss = friction * gear
         stiffness, most = gain * gear**2, gain * full * gear
-        motor.gainprm, motor.biasprm = [stiffness, *motor.gainprm[1:]], [0.0, -stiffness, *motor.biasprm[2:]]
+        motor.gainprm = [stiffness, *motor.gainprm[1:]]
+        motor.biasprm = [gain * off * gear, -stiffness, *motor.biasprm[2:]]
         motor.forcerange = [-most, most]
     spec.compile()
     return spec.to_xml()

@@ -52,11 +52,23 @@ class Lawful:
         self._law = law
 
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
-        """Return the data a time step later; see the function."""
+        """Return the data a time step later.
+
+        Args:
+            model: The ``mjx.Model``.
+            data: The ``mjx.Data``.
+            legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
+        """
         return advance(model, data, legacy, self._law)
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        """Compute everything that follows from the state; see the function."""
+        """Compute everything that follows from the state; without actuation, as at the start of an episode.
+
+        Args:
+            model: The ``mjx.Model``.
+            data: The ``mjx.Data``.
+            actuation: Whether actuators act.
+        """
         return forward(self._law(model, data), data, actuation)
 
 
