@@ -61,3 +61,15 @@ class Drift:
         significant = [c for c in self.changes if c.name in self.alarms]
         most = max((c.explains for c in significant), default=0.0)
         return min((c for c in significant if c.explains >= _MUCH * most), key=lambda c: c.p, default=None)
+
+    @property
+    def likely(self) -> Changed | None:
+        """What has most likely changed if something has, where no test raises an alarm.
+
+        What explains most, if that is more than half of the error, and by itself less likely by chance than the level:
+        of an arm with twice the friction it is that in the cases that the tests leave open.
+        """
+        if self.alarms or not self.changes:
+            return None
+        most = self.changes[0]
+        return most if most.explains > _MUCH and most.p < self.level else None

@@ -116,7 +116,9 @@ def verdict_of(replay: Sequence[Replay], drifted: Drift | None) -> Advice | None
     if drifted is not None and (named := drifted.named):
         return Advice("re-identify", (f"the robot has changed: {_change(named)}", *_also(drifted)))
     if off := [r for r in replay if _beyond(r, "identified") > _OFF]:
-        return Advice("re-identify", tuple(f"{r.name}: {_error(r, 'identified')}" for r in off))
+        likely = drifted.likely if drifted else None
+        guess = [f"most likely the robot has changed: {_change(likely)}"] if likely else []
+        return Advice("re-identify", (*(f"{r.name}: {_error(r, 'identified')}" for r in off), *guess))
     return None
 
 

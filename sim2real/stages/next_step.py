@@ -67,7 +67,7 @@ def logs_to_identify(own: Sequence[Path], drift: Drift | None, found: Identifica
         Paths, the deployment's first: training takes its timing from the first; empty where the logs are too short.
     """
     logs = tuple(shown(path) for path in own)
-    if drift is not None and drift.alarms:
+    if drift is not None and (drift.alarms or drift.likely):
         return logs if drift.seconds >= ENOUGH_S else ()
     before = (folder.parent / log.path for log in found.logs)
     return (*logs, *(shown(path) for path in before if path.is_file()))

@@ -20,6 +20,7 @@ from sim2real.view.judging import tables, verdict_blocks
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
 ALARM = Drift((FRICTION,), 0.05, ("friction",), 20.0)
+LIKELY = Drift((replace(FRICTION, p=0.03), replace(FRICTION, name="gain", explains=0.4, p=0.01)), 0.05, (), 20.0)
 BUNDLE = SimpleNamespace(
     contract=SimpleNamespace(rate_hz=50.0, delays_s={"sensor_delay": 0.02, "actuator_delay": 0.03}),
     episodes=SimpleNamespace(drawn_s={"agent": np.full(100, 0.001)}),
@@ -62,6 +63,28 @@ def test_one_finding_decides(found, status, said):
     assert told.status == status
     assert said in told.reasons[0]
     assert told.joint == ("hinge" if status == "look at this joint" else "")
+
+
+def test_what_has_most_likely_changed_is_said_where_the_model_is_off_and_no_test_is_sure():
+    told = judging.verdict(deployed(identified=0.04, drift=LIKELY), BUNDLE)
+    assert told.status == "re-identify"
+    assert "most likely the robot has changed: friction is 12 rad/s^2" in told.reasons[1]
+    assert judging.verdict(deployed(drift=LIKELY), BUNDLE).status == "fine", "by itself that is no proof"
+
+
+@pytest.mark.parametrize(
+    ("drift", "likely"),
+    [
+        (LIKELY, "friction"),
+        (ALARM, None),
+        (STEADY, None),
+        (replace(LIKELY, changes=(replace(FRICTION, p=0.06),)), None),
+        (replace(LIKELY, changes=(replace(FRICTION, explains=0.4, p=0.01),)), None),
+        (replace(LIKELY, changes=()), None),
+    ],
+)
+def test_a_likely_change_explains_much_and_is_rare(drift, likely):
+    assert (drift.likely.name if drift.likely else None) == likely
 
 
 @pytest.fixture
