@@ -6,7 +6,7 @@ from typing import Any
 
 from sim2real.robots.parts import GoalTask
 
-from .parts import SHAPES, TIP_M, Arm, Table
+from .parts import SHAPES, STEP_S, TIP_M, Arm, Table
 
 CLOSE_M, CLOSE_RAD = 0.02, 0.1
 """How near tip and jaw must come [m], [rad]."""
@@ -37,7 +37,7 @@ class Reach(GoalTask):
     def __init__(self) -> None:
         self.robot, self.table = Arm(), Table()
         self.table.attach(self.robot)
-        self.set_timesteps(control_timestep=0.01, physics_timestep=0.005)
+        self.set_timesteps(control_timestep=0.01, physics_timestep=STEP_S)
 
     @property
     def root_entity(self) -> Any:
