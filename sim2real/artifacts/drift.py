@@ -8,6 +8,8 @@ _MUCH = 0.5
 """Share of what the change explains that explains most, from which on another one may be the cause. In 26 logs of nine
 hidden robots, on which this was chosen, the right one explained 0.98 of that at least; later, of an SO-101, once 0.49.
 A torque limit that was hardly felt explained nothing, and was sure."""
+_RARE = 0.1
+"""Probability by chance below which a change that explains much may be told as likely, by itself."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,8 @@ class Changed:
         low95: Lower end of the 95 % interval of ``now``, for the identification's own uncertainty as well.
         high95: Its upper end.
         explains: Share of the error that the change takes away, beyond what the identification leaves open.
-        p: Probability of as much by chance, before the correction for several tests.
+        p: Probability of as much by chance, or by a factor of less than a twentieth, before the correction for several
+            tests.
     """
 
     name: str
@@ -42,7 +45,8 @@ class Drift:
     Attributes:
         changes: Each way in which the robot may have changed, the one that explains most first.
         level: Share of robots that did not change for which any of the tests raises an alarm.
-        alarms: Names of those that are significant at this level, all tests together (Holm), the surest first.
+        alarms: Names of those that are significant at this level, all tests together (Holm), and explain a tenth of the
+            error at least, the surest first.
         seconds: How much of the log is in motion, and was tested [s].
     """
 
@@ -66,10 +70,10 @@ class Drift:
     def likely(self) -> Changed | None:
         """What has most likely changed if something has, where no test raises an alarm.
 
-        What explains most, if that is more than half of the error, and by itself less likely by chance than the level:
-        of an arm with twice the friction it is that in the cases that the tests leave open.
+        What explains most, if that is more than half of the error, and by itself rare by chance: of an arm with twice
+        the friction it is that in the cases that the tests leave open.
         """
         if self.alarms or not self.changes:
             return None
         most = self.changes[0]
-        return most if most.explains > _MUCH and most.p < self.level else None
+        return most if most.explains > _MUCH and most.p < _RARE else None

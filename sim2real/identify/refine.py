@@ -168,7 +168,8 @@ def _on_host(problem: Problem, weighed: Callable[..., Any], steps: int, like: An
         if not np.isfinite(of(value)(z)).all():
             return z, 0
         least = float(np.clip(gain, _LEAST, _MOST))
-        found = least_squares(of(value), np.asarray(z, np.float64), of(slope), ftol=least, xtol=_LEAST, max_nfev=steps)
+        jac: Any = of(slope)  # scipy's stubs know the names of its own differences alone
+        found = least_squares(of(value), np.asarray(z, np.float64), jac, ftol=least, xtol=_LEAST, max_nfev=steps)
         return jnp.asarray(found.x, jnp.float32), found.njev
 
     return improve

@@ -38,14 +38,28 @@ def test_delays_change_as_their_sum_and_causes_of_other_robots_are_left_out():
     assert [way.name for way in ways(one, {})] == ["gain", "sensor_delay"]
 
 
-def test_one_in_twenty_robots_that_did_not_change_raises_an_alarm():
-    rng = np.random.default_rng(0)
-    sizes = np.sqrt(2e-3) * rng.standard_normal((2000, len(WAYS)))
-    raised = [
-        bool(weigh([alone(n, s) for n, s in zip(WAYS, row, strict=True)], 1.0, TABLE, POSTERIOR, 20.0).alarms)
-        for row in sizes
-    ]
-    assert np.mean(raised) == pytest.approx(0.05, abs=0.015)
+@pytest.fixture(params=[1, -1], ids=["more", "less"])
+def hardly_changed(request):
+    """Sizes of changes of 4,000 robots ``(N, ways)``: factors off by what does not count, delays not at all."""
+    small = [0.0 if name == "round_trip_delay" else request.param * 0.05 for name in WAYS]
+    return small + np.sqrt(2e-3) * np.random.default_rng(0).standard_normal((4000, len(WAYS)))
+
+
+def raised(sizes, loss=0.5):
+    """The share of robots with an alarm, where each change takes away ``1 - loss`` of the error."""
+    rows = [[alone(n, s, loss=loss) for n, s in zip(WAYS, row, strict=True)] for row in sizes]
+    return np.mean([bool(weigh(row, 1.0, TABLE, POSTERIOR, 20.0).alarms) for row in rows])
+
+
+def test_at_most_one_in_twenty_robots_that_hardly_changed_raises_an_alarm(hardly_changed):
+    assert raised(hardly_changed) == pytest.approx(0.045, abs=0.01)
+    assert raised(2 * hardly_changed) > 0.2, "that would fail if the test were too lax"
+
+
+def test_what_explains_next_to_nothing_raises_none():
+    sizes = np.full((1, len(WAYS)), 0.7)
+    assert raised(sizes, loss=0.89) == 1.0
+    assert raised(sizes, loss=0.91) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -70,7 +84,7 @@ def test_of_what_explains_much_the_surest_is_named():
     later = alone("round_trip_delay", 0.015, own=1e-6, before=1e-6, loss=0.6)
     rubs, load = alone("friction", 0.3, own=1e-3, before=5e-3, loss=0.5), alone("load", 0.2, 1e-8, 1e-8, loss=0.98)
     found = weigh([rubs, later, load], 1.0, TABLE, POSTERIOR, 20.0)
-    assert set(found.alarms) == {"friction", "round_trip_delay", "load"}
+    assert set(found.alarms) == {"friction", "round_trip_delay"}
     assert found.named.name == "round_trip_delay"
     assert weigh([rubs, load], 1.0, TABLE, POSTERIOR, 20.0).named.name == "friction"
 
@@ -80,7 +94,8 @@ def test_few_segments_that_say_something_make_few_degrees_of_freedom():
     assert alone(before=0.0, segments=50.0).freedom == pytest.approx(49.0)
     assert alone(before=0.0, segments=2.0).freedom == pytest.approx(1.0)
     assert alone(own=1e-3, before=9e-3, segments=2.0).freedom == pytest.approx(100.0), "the rest is known"
-    sure, unsure = (weigh([alone(size=0.2, before=1e-5, segments=s)], 1.0, TABLE, POSTERIOR, 20.0) for s in (50.0, 2.0))
+    few = [[alone(size=0.2, before=1e-5, segments=s, loss=0.5)] for s in (50.0, 2.0)]
+    sure, unsure = (weigh(row, 1.0, TABLE, POSTERIOR, 20.0) for row in few)
     assert sure.alarms
     assert not unsure.alarms
     assert unsure.named is None
@@ -134,11 +149,11 @@ def test_what_a_log_shows_is_named(true, named):
 
 @pytest.mark.parametrize(
     ("widening", "segments", "alarm"),
-    [(1.0, 40, True), (3.0, 40, True), (5.0, 40, False), (1.0, 3, False), (5.0, 3, False), (20.0, 40, False)],
+    [(1.0, 40, True), (3.0, 40, True), (8.0, 40, False), (1.0, 3, False), (5.0, 3, False), (20.0, 40, False)],
 )
 def test_errors_of_the_model_are_no_change(widening, segments, alarm):
     """What the identification leaves open, widened by its misfit, is not drift."""
-    moved = Robot(np.array([20.0, 6.6]), segments=segments)
+    moved = Robot(np.array([20.0, 7.0]), segments=segments)
     assert bool(drift(moved, OF_TWO, widening, {})[0].alarms) == alarm
 
 

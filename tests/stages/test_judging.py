@@ -78,7 +78,7 @@ def test_what_has_most_likely_changed_is_said_where_the_model_is_off_and_no_test
         (LIKELY, "friction"),
         (ALARM, None),
         (STEADY, None),
-        (replace(LIKELY, changes=(replace(FRICTION, p=0.06),)), None),
+        (replace(LIKELY, changes=(replace(FRICTION, p=0.11),)), None),
         (replace(LIKELY, changes=(replace(FRICTION, explains=0.4, p=0.01),)), None),
         (replace(LIKELY, changes=()), None),
     ],

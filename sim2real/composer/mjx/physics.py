@@ -52,7 +52,7 @@ class MjxPhysics:
         data: The ``mjx.Data``.
         variables: What tasks keep from hook to hook: name -> array.
         legacy: After a step, also compute positions and velocities of the new state.
-        engine: What steps: the module ``stepping``, or a ``WarpEngine``.
+        engine: What steps: the module ``stepping``, which may be under a law, or a ``WarpEngine``.
 
     Attributes:
         np: The module that computes with this engine's arrays: ``jax.numpy``.
@@ -71,7 +71,7 @@ class MjxPhysics:
         data: mjx.Data | None,
         variables: dict[str, Any],
         legacy: bool = True,
-        engine: ModuleType | WarpEngine = stepping,
+        engine: ModuleType | stepping.Lawful | WarpEngine = stepping,
     ) -> None:
         self._engine = engine
         self.host, self.mjx_model = host, model
