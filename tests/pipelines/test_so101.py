@@ -19,7 +19,7 @@ PIPELINE = load_pipeline("so101")
 ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")
 MODULE = PIPELINE.load("robot")
 LOW, HIGH = np.array(ROBOT.servos.low), np.array(ROBOT.servos.high)
-STEP_S = 0.005
+STEP_S = 0.01 / 3
 
 
 @pytest.fixture(scope="module")
