@@ -21,12 +21,12 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 SHEET = StsSheet(stall=2.94, damping=0.60, armature=0.005, friction=0.06, stribeck_rad_s=0.5)
 """An STS3215 at 12 V: 30 kg cm at standstill, 0.222 s/60 deg without load; LeRobot's P gain of 16.
 
-Friction is a guess, and so is where it wears off. That it does, recordings of real ones show: without it a model that
-was identified on fast motions was four times as far off in slow ones.
+Friction is a guess, and so is where it wears off. That it does, recordings of real ones show (plant.py). Of an
+embedded arm a model without it, identified on fast motions, was up to five times as far off in slow ones.
 """
 STEP_S = 0.01 / 3
 """Time step of the physics [s]. At 5 ms an identification of the embedded arm finds rotors 44 % too heavy and a delay
-1.8 ms too short, at this step 15 % and 0.7 ms, at 2.5 ms 5 % and 0.2 ms, in a third more time.
+1.8 ms too short, at this step 15 % and 0.7 ms, at 2.5 ms 5 % and 0.2 ms, in a third more steps.
 """
 TIP_M = 0.0981
 """From the wrist's roll joint to between the jaws, along its axis [m]."""
