@@ -100,8 +100,11 @@ BENCHES = {
             *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
             *("sim2real/artifacts", "sim2real/log", "pipelines/disk", "pipelines/xl330", "pipelines/so101"),
             *("sim2real/composer/c", "sim2real/stages/config.py", "sim2real/stages/described.py"),
-            *(f"scripts/benches/league_{part}.py" for part in ("bam", "jobs", "mujoco", "ours", "sets")),
-            *(f"scripts/benches/{part}.py" for part in ("cmaes", "identify", "recordings", "sysid", "sysid_rows")),
+            *(f"scripts/benches/league_{part}.py" for part in ("bam", "mujoco", "ours", "sets")),
+            *(
+                f"scripts/benches/{part}.py"
+                for part in ("cmaes", "identify", "jobs", "recordings", "sysid", "sysid_rows")
+            ),
         ),
     ),
     "links": Bench(

@@ -21,7 +21,7 @@ from benches import randomise
 from benches.drift_arms import ReachingArm, ReachingSO101
 from benches.drift_pendulum import Pendulum
 from benches.figures import row
-from benches.jobs import each
+from benches.jobs import robots
 from sim2real.errors import Sim2RealError, UsageError
 
 ROBOTS: dict[str, Any] = {"pendulum": Pendulum, "arm": ReachingArm, "so101": ReachingSO101}
@@ -46,7 +46,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--volts", type=float, default=2.0, help="most that it may command a pendulum")
     parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps of its training")
     parser.add_argument("--envs", type=int, default=256, help="copies of its training")
-    parser.add_argument("--jobs", type=int, default=1, help="robots at the same time, one process each")
+    parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
+    parser.add_argument("--within-s", type=float, help="after this [s] robots that are not done count as failed")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
@@ -56,7 +57,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             setattr(options, name, value)
     if options.restore and options.robot != "pendulum":
         raise UsageError("--restore trains a policy in seconds, which the pendulum alone can", hint="leave it out")
-    found, failed = each(one_robot, range(options.first, options.first + options.runs), options)
+    found, failed = robots(one_robot, range(options.first, options.first + options.runs), options)
     lines = rows(found, options)
     lines.append(row(f"drift/{options.robot}/failed", len(failed), f"of {options.runs}", "", "0"))
     if found:

@@ -1,55 +1,150 @@
-"""Many robots at the same time: one process each, and what becomes of one is no other's business."""
+"""Many fits or robots at once, each in a process of its own that has one processor: as fair as one after the other."""
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import os
+import signal
 import sys
+import time
 import traceback
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from itertools import cycle, islice
+from queue import SimpleQueue
 from typing import Any
 
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
+ONE_THREAD = {
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "JAX_PLATFORMS": "cpu",
+}
+"""Environment of a process that computes by one thread; what stands in XLA_FLAGS already is kept."""
 
 
 def each(
-    one: Callable[[int, Any], dict[str, Any]], numbers: Sequence[int], options: Any
+    work: Callable[..., dict[str, Any]],
+    tasks: Sequence[Sequence[Any]],
+    options: argparse.Namespace,
+    lost: Callable[[Sequence[Any]], dict[str, Any]] | None = None,
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Do ``work(*task, options)`` for each task, and yield its number and its result as they come.
+
+    Args:
+        work: A function of a module.
+        tasks: Arguments.
+        options: The bench's flags; ``jobs`` of them run at once, in this process where that is 1.
+        lost: Takes a task whose process was killed, and returns what to yield for it; without it that is an error.
+    """
+    if options.jobs == 1:
+        for i, task in enumerate(tasks):
+            yield i, work(*task, options)
+        return
+    context, free = multiprocessing.get_context("spawn"), SimpleQueue()
+    for number in islice(cycle(_processors()), options.jobs):
+        free.put(number)
+
+    def alone(task: Sequence[Any]) -> dict[str, Any]:
+        number = free.get()
+        try:
+            # A process a task: none finds programs compiled that another had to compile.
+            with ProcessPoolExecutor(1, context, _hold, (number,)) as pool:
+                return pool.submit(work, *task, options).result()
+        except BrokenProcessPool:
+            if lost is None:
+                raise
+            return lost(task)
+        finally:
+            free.put(number)
+
+    with _environment(), ThreadPoolExecutor(options.jobs) as threads:
+        numbers = {threads.submit(alone, task): i for i, task in enumerate(tasks)}
+        try:
+            for done in as_completed(numbers):
+                yield numbers[done], done.result()
+        finally:
+            threads.shutdown(cancel_futures=True)
+
+
+def robots(
+    one: Callable[[int, Any], dict[str, Any]], numbers: Sequence[int], options: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Call a function for every robot, ``options.jobs`` at the same time; several have one thread each.
+    """Call a function for every robot; what becomes of one is no other's business.
 
     Args:
         one: Takes a robot's number and the flags, and returns what became of it.
         numbers: Of the robots.
-        options: Flags of the bench.
+        options: The bench's flags: ``jobs`` as for :func:`each`; ``within_s``, if there is one, seconds after which
+            robots that are not done count as failed: what the others found is reported.
 
     Returns:
         What became of each, and number and error of those that failed, in order.
     """
-    if options.jobs == 1:
-        outcomes = [_outcome(one, n, options) for n in numbers]
-    else:
-        for name, value in _ONE_THREAD.items():  # the processes inherit them
-            os.environ.setdefault(name, value)
-        context = multiprocessing.get_context("spawn")
-        cores = context.Queue()
-        for worker in range(options.jobs):
-            cores.put(worker)
-        with ProcessPoolExecutor(options.jobs, context, _on_one_core, (cores,)) as pool:
-            outcomes = list(pool.map(_outcome, [one] * len(numbers), numbers, [options] * len(numbers)))
+    within_s = getattr(options, "within_s", None)
+    until = None if within_s is None else time.time() + within_s
+    tasks = [(number,) for number in numbers]
+    lost = lambda task: {"number": task[0], "failed": "its process was killed"}  # noqa: E731
+    outcomes = [outcome for _, outcome in each(partial(_outcome, one, until), tasks, options, lost)]
+    outcomes.sort(key=lambda outcome: outcome["number"])
     return [o for o in outcomes if "failed" not in o], [o for o in outcomes if "failed" in o]
 
 
-def _on_one_core(cores: Any) -> None:
-    """Keep a worker on a core of its own: C MuJoCo would start as many threads in each as there are cores."""
-    if hasattr(os, "sched_setaffinity"):
-        there = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {there[cores.get() % len(there)]})
-
-
-def _outcome(one: Callable[[int, Any], dict[str, Any]], number: int, options: Any) -> dict[str, Any]:
+def _outcome(
+    one: Callable[[int, Any], dict[str, Any]], until: float | None, number: int, options: Any
+) -> dict[str, Any]:
     try:
-        return one(number, options)
+        with _until(until):
+            return one(number, options)
     except Exception as error:  # an hour's other robots must not be lost to it
         print(f"robot {number} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
         return {"number": number, "failed": f"{type(error).__name__}: {error}"}
+
+
+@contextmanager
+def _until(until: float | None) -> Iterator[None]:
+    """Raise TimeoutError in what runs within when the time is up; one call into C ends first."""
+    if until is None:
+        yield
+        return
+
+    def ring(*_: Any) -> None:
+        raise TimeoutError("not done when the bench's time was up")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, max(until - time.time(), 1e-3))
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _hold(number: int) -> None:
+    """Hold this process on one processor: C engines count those that it may use, and take a thread for each."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {number})
+
+
+def _processors() -> list[int]:
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+@contextmanager
+def _environment() -> Iterator[None]:
+    """Have processes that are started meanwhile compute by one thread: libraries read this when they are loaded."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD | {"XLA_FLAGS": f"{before['XLA_FLAGS'] or ''} {ONE_THREAD['XLA_FLAGS']}".strip()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

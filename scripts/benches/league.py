@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benches import figures, league_bam, league_jobs, league_mujoco, league_ours
+from benches import figures, jobs, league_bam, league_mujoco, league_ours
 from benches.league_sets import SETS, Fold
 from benches.sysid import Recording
 from sim2real.errors import UsageError
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     known, tasks = _known(options), _tasks(options)
     missing = {key: task for key, task in tasks.items() if key not in known}
     keys = list(missing)
-    for i, found in league_jobs.each(judge, list(missing.values()), options):
+    for i, found in jobs.each(judge, list(missing.values()), options):
         known[keys[i]] = {**dict(zip(_KEY, keys[i], strict=True)), **found}
         _add(options.results, known[keys[i]])
     measured = [known[key] for key in tasks]

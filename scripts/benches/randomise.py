@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 from benches import hidden_robots as hidden
 from benches import hidden_wall
 from benches.figures import row
-from benches.jobs import each
+from benches.jobs import robots
 
 RECORD_S, UPRIGHT = 40.0, 0.8
 """Length of the recording [s]; share of the second half in which a deployment that succeeds is upright."""
@@ -57,14 +57,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--generations", type=int, default=80, help="generations of the search")
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS), help="what is trained on")
     parser.add_argument("--clock", choices=["simulated", "wall"], default="simulated", help="of the robots")
-    parser.add_argument("--jobs", type=int, default=1, help="robots at the same time, one process each")
+    parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Record, identify, train and deploy for each robot."""
     numbers = list(range(options.first, options.first + options.robots))
     begin = time.perf_counter()
-    found, failed = each(one_robot, numbers, options)
+    found, failed = robots(one_robot, numbers, options)
     lines = rows(found, options, time.perf_counter() - begin)
     lines.append(row("randomise/failed", len(failed), f"of {len(numbers)}", "", "0"))
     return {"rows": lines, "robots": found, "failed": failed}

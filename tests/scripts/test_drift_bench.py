@@ -1,6 +1,8 @@
 """The bench of drift: robots on simulated clocks that change as they are told, and outcomes that are kept."""
 
+import importlib
 import sys
+import time
 from argparse import Namespace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from sim2real.log.reader import read_log
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.drift_arms import ReachingArm, ReachingSO101
 from benches.drift_pendulum import Pendulum
-from benches.jobs import each
+from benches.jobs import robots
 
 KINDS = pytest.mark.parametrize("kind", [ReachingArm, ReachingSO101])
 
@@ -62,7 +64,40 @@ def odd(number, options):
 
 
 def test_one_robot_that_fails_loses_no_other(capsys):
-    found, failed = each(odd, range(3), Namespace(jobs=1, bad=1))
+    found, failed = robots(odd, range(3), Namespace(jobs=1, bad=1))
     assert [robot["number"] for robot in found] == [0, 2]
     assert failed == [{"number": 1, "failed": "RuntimeError: a loose cable"}]
     assert "a loose cable" in capsys.readouterr().err
+
+
+def slow(number, options):
+    """Take longer than there is, but for the first."""
+    time.sleep(60.0 if number else 0.0)
+    return {"number": number}
+
+
+def test_what_is_not_done_in_time_fails_and_the_rest_is_reported():
+    begin = time.monotonic()
+    found, failed = robots(slow, range(3), Namespace(jobs=1, within_s=1.0))
+    assert time.monotonic() - begin < 30.0
+    assert found == [{"number": 0}]
+    assert [f["number"] for f in failed] == [1, 2]
+    assert all("time was up" in f["failed"] for f in failed)
+
+
+KILLED = """
+import os, signal
+
+def one(number, options):
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"number": number}
+"""
+
+
+def test_a_robot_whose_process_is_killed_loses_no_other(tmp_path, monkeypatch):
+    (tmp_path / "killed_task.py").write_text(KILLED)
+    monkeypatch.syspath_prepend(tmp_path)
+    found, failed = robots(importlib.import_module("killed_task").one, range(3), Namespace(jobs=2))
+    assert [robot["number"] for robot in found] == [0, 2]
+    assert failed == [{"number": 1, "failed": "its process was killed"}]

@@ -16,7 +16,7 @@ import pytest
 from sim2real.errors import UsageError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import cmaes, league_bam, league_jobs, league_ours, league_sets, recordings
+from benches import cmaes, jobs, league_bam, league_ours, league_sets, recordings
 from benches.league_sets import Fold
 from benches.sysid import Recording
 
@@ -180,7 +180,7 @@ def test_jobs_are_processes_of_one_thread_and_one_processor(tmp_path, monkeypatc
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", "--kept")
     where, before = importlib.import_module("a_task").where, dict(os.environ)
-    found = dict(league_jobs.each(where, [("a",), ("b",), ("c",)], argparse.Namespace(jobs=2)))
+    found = dict(jobs.each(where, [("a",), ("b",), ("c",)], argparse.Namespace(jobs=2)))
     assert os.environ == before
     assert [found[i]["name"] for i in range(3)] == ["a", "b", "c"]
     assert len({found[i]["process"] for i in range(3)} | {os.getpid()}) == 4, "a process a task"
@@ -189,7 +189,7 @@ def test_jobs_are_processes_of_one_thread_and_one_processor(tmp_path, monkeypatc
 
 
 def test_one_job_is_done_here():
-    ((number, found),) = league_jobs.each(lambda a, o: {"sum": a + o.jobs}, [(2,)], argparse.Namespace(jobs=1))
+    ((number, found),) = jobs.each(lambda a, o: {"sum": a + o.jobs}, [(2,)], argparse.Namespace(jobs=1))
     assert (number, found) == (0, {"sum": 3})
 
 
@@ -198,5 +198,5 @@ def test_a_job_that_fails_ends_the_others_and_leaves_the_environment(monkeypatch
     monkeypatch.syspath_prepend(tmp_path)
     before = dict(os.environ)
     with pytest.raises(ValueError, match="a"):
-        list(league_jobs.each(importlib.import_module("bad_task").bad, [("a",)], argparse.Namespace(jobs=2)))
+        list(jobs.each(importlib.import_module("bad_task").bad, [("a",)], argparse.Namespace(jobs=2)))
     assert os.environ == before
