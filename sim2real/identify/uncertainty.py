@@ -22,6 +22,8 @@ _BLOCK_S = 1.0
 """Residuals further apart than this count as independent [s]."""
 _BLOCKS = 20
 """How many blocks there are at least, where the recordings are long enough: fewer leave too few degrees of freedom."""
+_RESOLVED = 1e-13
+"""Least eigenvalue of a precision with a diagonal of ones: what is below is rounding of doubles."""
 _LEAST_FREEDOM = 2.0
 """With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
 _ALONE = 0.5
@@ -136,7 +138,8 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     rest = np.setdiff1d(np.arange(size), fixed)
     precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
     cov = np.zeros((size, size))
-    cov[np.ix_(rest, rest)] = np.linalg.inv(precision)
+    root = _root_of_inverse(precision)
+    cov[np.ix_(rest, rest)] = root @ root.T
     quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
     error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
@@ -304,7 +307,7 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
         informations: Shape ``(B, Q, Q)``.
         prior: Shape ``(Q, Q)``: what the prior adds to the information.
     """
-    root = np.linalg.cholesky(np.linalg.inv(informations.sum(axis=0) + prior))
+    root = _root_of_inverse(informations.sum(axis=0) + prior)
     shares = root.T @ informations @ root  # they sum to the identity, less the prior's
     left, axes = np.linalg.eigh(np.eye(len(root)) - shares)
     scaled = (axes / np.sqrt(np.maximum(left, 1e-3))[:, None, :]) @ axes.transpose(0, 2, 1)
@@ -316,6 +319,17 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
     between = own - seen @ seen.transpose(0, 2, 1)
     trace, square = np.trace(between, axis1=1, axis2=2), np.sum(between**2, axis=(1, 2))
     return np.sqrt(variance), trace**2 / np.maximum(square, 1e-300)
+
+
+def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
+    """Return ``R (Q, Q)`` with ``R R' = precision^-1``, for a matrix that rounding may have made indefinite.
+
+    What was measured a million times, and what only the bounds say, differ by more than doubles resolve: the inverse
+    had negative variances there.
+    """
+    unit = 1.0 / np.sqrt(np.diag(precision))
+    values, axes = np.linalg.eigh(precision * np.outer(unit, unit))
+    return unit[:, None] * axes / np.sqrt(np.maximum(values, _RESOLVED))
 
 
 def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.ndarray:

@@ -16,7 +16,8 @@ from sim2real.robots.mjcf import gains_of, limit_of
 
 What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
-    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf",
+    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "tilt_x", "tilt_y",
+    "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
 ]  # fmt: skip
 ALL = ".*"
 _WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
@@ -43,6 +44,14 @@ _ABOUT = {
     "drag": ("N m s^2/rad^2", "friction by the square of the speed"),
     "bias": ("N m", "dry friction upwards beyond the mean of both directions"),
     "back_emf": ("N m s/rad", "damping by the motor's voltage, with torque on, beyond its limit"),
+    "play": ("rad", "error of the angle that the drive leaves alone: dead zone, play of gears"),
+    "tilt_x": ("rad", "turn of the direction of gravity about the model's x axis"),
+    "tilt_y": ("rad", "turn of the direction of gravity about the model's y axis"),
+    "eccentric_cos": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's cosine"),
+    "eccentric_sin": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's sine"),
+    "cogging_cos": ("N m", "torque that repeats with the angle, by the cosine"),
+    "cogging_sin": ("N m", "torque that repeats with the angle, by the sine"),
+    "cogging_per_turn": ("1", "how often that torque repeats in a turn"),
 }
 _EXCITE = {
     "kp": "goals that change while the joint bears a load",
@@ -62,28 +71,49 @@ _EXCITE = {
     "drag": "fast motion of each joint, at several speeds",
     "bias": "slow motion of each joint, with reversals",
     "back_emf": "commands that the drive cannot follow, so that it is at its limit",
+    "play": "slow motion of each joint, with reversals, and goals that change little",
+    "tilt_x": "motion of joints whose axes are not upright, against gravity, up and down",
+    "tilt_y": "motion of joints whose axes are not upright, against gravity, up and down",
+    "eccentric_cos": "motion of each joint over most of a turn",
+    "eccentric_sin": "motion of each joint over most of a turn",
+    "cogging_cos": "slow motion of each joint over many of its repeats, both ways",
+    "cogging_sin": "slow motion of each joint over many of its repeats, both ways",
+    "cogging_per_turn": "slow motion of each joint over many of its repeats, both ways",
 }
 """Which motion tells a quantity."""
 _VANISHING = ("kd", "damping", "armature", "frictionloss")
 """Quantities that a joint may be without."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
-          "load": (0.0, 0.0, 1.0)}  # fmt: skip
+          "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
+          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
+          "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
 _OF_MODEL = {
     "static": ("frictionloss", 5.0),
     "bias": ("frictionloss", 5.0),
     "drag": ("damping", 5.0),
     "back_emf": ("damping", 30.0),
+    "cogging_cos": ("frictionloss", 5.0),
+    "cogging_sin": ("frictionloss", 5.0),
 }
 """Terms without a usual size: up to a factor of what the model has of another quantity."""
+_BOTH_WAYS = ("bias", "cogging_cos", "cogging_sin")
+"""Those of them that may be negative."""
 OPTIONAL = {
     "load": ("load",),
     "stribeck": ("static", "stribeck_rad_s"),
     "drag": ("drag",),
     "direction": ("bias",),
     "back_emf": ("back_emf",),
+    "play": ("play",),
+    "tilt": ("tilt_x", "tilt_y"),
+    "eccentricity": ("eccentric_cos", "eccentric_sin"),
+    "cogging": ("cogging_cos", "cogging_sin"),
 }
 """Optional terms, and the quantities that each has."""
-LAWS = tuple(what for quantities in OPTIONAL.values() for what in quantities)
+ASKED = ("tilt", "eccentricity", "cogging")
+"""Those that ``auto`` leaves out unless a parameter names them: few robots tell them from a zero or a stiffness."""
+LAWS = (*(q for name, own in OPTIONAL.items() if name != "tilt" for q in own), "cogging_per_turn")
+"""Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 _ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
 
@@ -124,6 +154,13 @@ class ParameterPattern:
             raise UsageError(
                 f"{self.joints!r} is no pattern for joints: {error}", hint="such as .*_hip_joint"
             ) from None
+        if self.what == "cogging_per_turn" and self.free:
+            raise UsageError(
+                "cogging_per_turn is counted, not identified",
+                hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
+            )
+        if self.what in ("tilt_x", "tilt_y") and (self.each or self.joints != ALL):
+            raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
 
     @staticmethod
     def parse(text: str) -> ParameterPattern:
@@ -191,17 +228,31 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
     return found
 
 
-def optional(terms: Sequence[ParameterPattern]) -> tuple[ParameterPattern, ...]:
-    """Return patterns with all optional terms added that none of them is of: one value for all joints, not identified.
+def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[ParameterPattern, ...]:
+    """Return patterns with optional terms added that none of them is of: one value for all joints, not identified.
 
     Terms are chosen with ``--terms``; without, they are 0.
+
+    Args:
+        terms: What there is.
+        wanted: ``auto``, ``all``, or names with commas between, which are offered beside those of ``auto``. Of a term
+            that ``auto`` leaves out, parameters that were named are offered without its others.
+
+    Raises:
+        UsageError: When cogging is wanted, and nobody said how often it repeats.
     """
-    said = {term.what for term in terms}
+    said, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
+    if "cogging" in names and "cogging_per_turn" not in said:
+        raise UsageError("how often does cogging repeat in a turn?", hint="add --parameter cogging_per_turn=N")
+    there = {name for name in OPTIONAL if name not in ASKED or name in names}
+    if wanted == "all":
+        there |= set(ASKED) - (set() if "cogging_per_turn" in said else {"cogging"})
     return (
         *(replace(term, term=own) if (own := _term_of(term.what)) else term for term in terms),
         *(
             ParameterPattern(what, free=False, term=name)
             for name, quantities in OPTIONAL.items()
+            if name in there
             for what in quantities
             if what not in said
         ),
@@ -228,6 +279,8 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
     # A speed without load makes a damping of the torque limit, so that comes first.
     for p in sorted(placed, key=lambda p: p.what == "speed"):
         value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
+        if p.what in ("tilt_x", "tilt_y"):
+            continue
         if p.what in _ON_DRIVE:
             drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
         elif p.what in LAWS:
@@ -244,7 +297,26 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
         else:
             field = _ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
+    if any(p.what in ("tilt_x", "tilt_y") for p in placed):
+        model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
     return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
+
+
+def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) -> Any:
+    """Return gravity ``(3,)`` [m/s^2] turned about the model's x axis, then about its y axis.
+
+    Args:
+        placed: What ``expand`` returned.
+        values: Parameters by name.
+        gravity: As the model has it, ``(3,)`` [m/s^2].
+    """
+    angle = {p.what: values[p.parameter.name] for p in placed if p.what in ("tilt_x", "tilt_y")}
+    if not angle:
+        return gravity
+    x, y = (jnp.asarray(angle.get(what, 0.0), float) for what in ("tilt_x", "tilt_y"))
+    g = jnp.asarray(gravity, float)
+    g = jnp.array([g[0], jnp.cos(x) * g[1] - jnp.sin(x) * g[2], jnp.sin(x) * g[1] + jnp.cos(x) * g[2]])
+    return jnp.array([jnp.cos(y) * g[0] + jnp.sin(y) * g[2], g[1], jnp.cos(y) * g[2] - jnp.sin(y) * g[0]])
 
 
 def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
@@ -255,7 +327,7 @@ def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: floa
         _, low, high = _FIXED[term.what]
         transform = "linear"
     elif term.what in _OF_MODEL:
-        low, high, transform = -own_size if term.what == "bias" else 0.0, own_size, "linear"
+        low, high, transform = -own_size if term.what in _BOTH_WAYS else 0.0, own_size, "linear"
     else:
         below, above = _WIDE[term.what]
         low, high = nominal / below, nominal * above

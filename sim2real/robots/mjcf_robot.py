@@ -19,8 +19,9 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.mjcf import driven, joints_of, read_model, read_spec
-from sim2real.robots.mjcf_parameters import LAWS, ParameterPattern, Placed, expand, optional, place
+from sim2real.robots.mjcf_parameters import LAWS, ParameterPattern, Placed, expand, optional, place, tilted
 from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
+from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
@@ -121,8 +122,8 @@ class Encoders(BaseNode):
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> EncoderParams:
         """Return encoders that read 0 at the model's zero."""
-        del rng, graph_state
-        return EncoderParams(jnp.zeros(len(self._world.qpos_at)))
+        own = self._world.init_params(rng, graph_state)
+        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), own.terms)
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measured:
         """Return zeros."""
@@ -132,16 +133,24 @@ class Encoders(BaseNode):
 
     def step(self, step_state: StepState) -> tuple[StepState, Measured]:
         """Read."""
-        seen = step_state.inputs[self._world.name][-1].data
-        speed = seen.qvel[self._world.qvel_at] if self._velocity else None
-        return step_state, Measured(seen.qpos[self._world.qpos_at] + step_state.params.zero, speed)
+        seen, own = step_state.inputs[self._world.name][-1].data, step_state.params
+        angle, speed = seen.qpos[self._world.qpos_at], seen.qvel[self._world.qvel_at]
+        if own.terms is not None:
+            angle, speed = own.terms.read(angle), own.terms.rate(angle, speed)
+        return step_state, Measured(angle + own.zero, speed if self._velocity else None)
 
 
 @struct.dataclass
 class EncoderParams(Base):
-    """What the encoders read at the model's zero, ``(joints,)`` [rad]."""
+    """Parameters of the encoders.
+
+    Attributes:
+        zero: What they read at the model's zero, ``(joints,)`` [rad].
+        terms: The drives' own, which say how far each is off its axis; None: not at all.
+    """
 
     zero: Any
+    terms: DriveTerms | None = None
 
 
 class MjcfRobot(LoggedRobot):
@@ -198,9 +207,13 @@ class MjcfRobot(LoggedRobot):
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
 
-    def with_optional_terms(self) -> MjcfRobot:
-        """Return the robot with all optional terms to choose from; a step of its simulation then takes longer."""
-        return MjcfRobot(replace(self.config, terms=optional(self.config.terms)))
+    def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
+        """Return the robot with optional terms to choose from; a step of its simulation then takes longer.
+
+        Args:
+            wanted: ``auto``, ``all``, or names with commas between.
+        """
+        return MjcfRobot(replace(self.config, terms=optional(self.config.terms, wanted)))
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
@@ -221,6 +234,7 @@ class MjcfRobot(LoggedRobot):
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
         """Return the file's model with identified friction and inertia; drives are in ``parameters.json``."""
         spec = read_spec(self.config.model)
+        spec.option.gravity = np.asarray(tilted(self.placed, values, spec.option.gravity))
         fields_of = {"damping": "damping", "armature": "armature", "frictionloss": "frictionloss"}
         for p in self.placed:
             for i in p.at if p.what in fields_of else ():
@@ -259,9 +273,13 @@ class IdentifiableMjcf(IdentifiableRecording):
         tree = self.parameters.placed(self._params, values)
         world = place(self._placed, values, tree["world"], self._joints, self._dofs)
         n = len(self._dofs)
-        qpos = world.qpos.at[self._qpos].set(start[:n] - world.zero)
-        qvel = world.qvel.at[self._dofs].set(start[n:])
-        return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero)}
+        angle = start[:n] - world.zero
+        speed = start[n:]
+        if world.terms is not None:
+            angle = world.terms.angle(angle)
+            speed = speed / world.terms.rate(angle, 1.0)
+        qpos, qvel = world.qpos.at[self._qpos].set(angle), world.qvel.at[self._dofs].set(speed)
+        return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero, world.terms)}
 
 
 def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:

@@ -59,7 +59,7 @@ def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
         wanted: As ``widest`` takes it.
     """
     offer = getattr(robot, "with_optional_terms", None)
-    return robot if offer is None or wanted in ("own", "none") else offer()
+    return robot if offer is None or wanted in ("own", "none") else offer(wanted)
 
 
 def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:

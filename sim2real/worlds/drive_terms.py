@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -29,6 +30,12 @@ class DriveTerms(Base):
         drag: Friction proportional to the square of the speed [N m s^2/rad^2].
         bias: By how much dry friction is larger upwards than on average, and smaller downwards [N m].
         back_emf: What the motor's voltage takes off its torque per speed, with torque on, beyond its limit [N m s/rad].
+        play: Error of the angle up to which the drive does not push: a servo's dead zone, play of its gears [rad].
+        cogging_cos: Torque that pulls the joint back, by the cosine of its angle times ``cogging_per_turn`` [N m].
+        cogging_sin: The same, by the sine [N m].
+        cogging_per_turn: How often that torque repeats in a turn of the joint [1].
+        eccentric_cos: What an encoder off its axis reads beyond the angle, by the angle's cosine [rad].
+        eccentric_sin: The same, by the sine [rad].
     """
 
     load: Value = 0.0
@@ -37,6 +44,27 @@ class DriveTerms(Base):
     drag: Value = 0.0
     bias: Value = 0.0
     back_emf: Value = 0.0
+    play: Value = 0.0
+    cogging_cos: Value = 0.0
+    cogging_sin: Value = 0.0
+    cogging_per_turn: Value = 1.0
+    eccentric_cos: Value = 0.0
+    eccentric_sin: Value = 0.0
+
+    def read(self, angle: Value) -> Value:
+        """Return what encoders off their axes read at angles [rad], zeros apart."""
+        return angle + self.eccentric_cos * jnp.cos(angle) + self.eccentric_sin * jnp.sin(angle)
+
+    def rate(self, angle: Value, speed: Value) -> Value:
+        """Return how fast that changes [rad/s]."""
+        return speed * (1.0 - self.eccentric_cos * jnp.sin(angle) + self.eccentric_sin * jnp.cos(angle))
+
+    def angle(self, reading: Value) -> Value:
+        """Return the angles for what encoders read [rad]: three fixed-point iterations, as ``Encoder.angle``."""
+        angle = reading
+        for _ in range(3):
+            angle = reading - (self.read(angle) - angle)
+        return angle
 
 
 class DriveLaw:
@@ -61,20 +89,26 @@ class DriveLaw:
         Args:
             xp: ``numpy`` or ``jax.numpy``.
             values: Coefficients and the model's own ``damping``, ``frictionloss`` and ``limit``, ``(..., joints)``.
-            control: Forces, stiffnesses, dampings, and 1 with torque on: ``(..., 4 * joints)``.
+            control: Forces, stiffnesses, dampings, 1 with torque on, goals: ``(..., 5 * joints)``.
             qpos: Positions ``(..., nq)`` [rad].
             qvel: Velocities ``(..., nv)`` [rad/s].
         """
         v, count = values, len(self._joints)
-        force, kp, kd, on = (control[..., i * count : (i + 1) * count] for i in range(4))
+        force, kp, kd, on, goal = (control[..., i * count : (i + 1) * count] for i in range(5))
         angle, speed = qpos[..., self._qpos_at], qvel[..., self._qvel_at]
         fast = xp.abs(speed)
+        beyond = v["eccentric_cos"] * xp.cos(angle) + v["eccentric_sin"] * xp.sin(angle)
+        # A servo sees what its encoder reads, and leaves an error within its dead zone alone.
+        force = force - kp * (beyond + xp.clip(goal - angle - beyond, -v["play"], v["play"]))
         braked = on * v["back_emf"]
         drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
         stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
         damping = v["damping"] + v["drag"] * fast + braked
         friction = v["frictionloss"] + stuck + v["load"] * xp.abs(drive)
+        phase = v["cogging_per_turn"] * angle
+        cogging = v["cogging_cos"] * xp.cos(phase) + v["cogging_sin"] * xp.sin(phase)
         # Friction that differs by direction is a mean one and a constant torque: it sticks in the same band.
-        applied = -v["bias"] + 0.0 * speed
+        applied = -v["bias"] - cogging
         rows = damping[..., self._joints], friction[..., self._joints]
-        return control[..., : 3 * count], applied[..., self._joints], dict(zip(self.fields, rows, strict=True))
+        told = xp.concatenate([force, kp, kd], axis=-1)
+        return told, applied[..., self._joints], dict(zip(self.fields, rows, strict=True))

@@ -103,7 +103,7 @@ class DrivenWorld(MjxWorld):
         """Return the model at its reference, with drives that do nothing."""
         own = super().init_params(rng, graph_state)
         zero = jnp.zeros(len(self.joints))
-        terms = DriveTerms(zero, zero, zero + 0.1, zero, zero, zero) if self.law else None
+        terms = DriveTerms().replace(**{f.name: zero + f.default for f in fields(DriveTerms)}) if self.law else None
         return DriveParams(own.model, own.qpos, own.qvel, terms=terms)
 
     def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
@@ -128,7 +128,7 @@ class DrivenWorld(MjxWorld):
     def _control(self, step_state: StepState) -> jax.Array:
         """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command.
 
-        With terms, 1 with torque on and 0 with torque off stand behind them: ``(4 * joints,)``.
+        With terms, 1 with torque on and 0 with torque off, and the goals, stand behind them: ``(5 * joints,)``.
         """
         p: DriveParams = step_state.params
         told: DriveCommand = step_state.inputs[self.input_name][-1].data
@@ -136,11 +136,12 @@ class DrivenWorld(MjxWorld):
         on = still + 1.0 if told.enabled is None else jnp.asarray(told.enabled) + still
         kp = still if told.goal is None else on * p.kp * _of_log(told.kp, self.units[0])
         kd = p.kd * _of_log(told.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
-        force = still if told.goal is None else kp * (told.goal - p.zero)
+        goal = still if told.goal is None else told.goal - p.zero + still
+        force = kp * goal
         force += still if told.goal_velocity is None else on * kd * told.goal_velocity
         for pushed in (told.torque, told.duty):
             force += still if pushed is None else on * p.gain * pushed
-        return jnp.concatenate([force, kp, kd, *([on] if self.law else [])])
+        return jnp.concatenate([force, kp, kd, *([on, goal] if self.law else [])])
 
 
 def _of_log(gain: Value | None, unit: float) -> Value:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sim2real.identify import uncertainty
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty import Linearised, centred, from_linearised, sum_of, time_shift
@@ -256,3 +257,18 @@ def test_time_is_centred_within_the_bounds(delayed):
     assert x[0] == pytest.approx(delayed.table.scale(z)[0][0])
     one = delayed.table.with_fixed({"early": 0.0})
     np.testing.assert_array_equal(centred(stub(one, "free"), z[:2]), z[:2])
+
+
+def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
+    """Two parameters that a recording tells only as a sum, and a third that only its bounds say anything of."""
+    column = np.random.default_rng(0).normal(size=400) * 1e6
+    J = np.stack([column, column * (1.0 + 1e-12), 0.0 * column], axis=1)
+    precision = J.T @ J + np.diag([1e-5, 1e-5, 1e-5])
+    root = uncertainty._root_of_inverse(precision)
+    assert np.isfinite(root).all()
+    variance = np.diag(root @ root.T)
+    assert variance[2] == pytest.approx(1e5)
+    assert (variance[:2] > 100.0 / float(column @ column)).all(), "neither is known by itself"
+    sure = np.diag([1.0, 4.0, 9.0]) + 0.5
+    root = uncertainty._root_of_inverse(sure)
+    np.testing.assert_allclose(root @ root.T, np.linalg.inv(sure), rtol=1e-12)

@@ -10,12 +10,22 @@ import numpy as np
 import pytest
 
 from sim2real.composer.c.rollouts import Rollouts, Start
+from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem import Problem
+from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
 from sim2real.robots.mjcf import driven
-from sim2real.robots.mjcf_parameters import LAWS, OPTIONAL, ParameterPattern, optional
+from sim2real.robots.mjcf_parameters import (
+    ASKED,
+    LAWS,
+    OPTIONAL,
+    ParameterPattern,
+    expand,
+    optional,
+    tilted,
+)  # fmt: skip
 from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
 from sim2real.stages import left_out
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
@@ -26,8 +36,11 @@ XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
   <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="1e-4 1e-4 1e-4"/></body></worldbody>
   <actuator><motor joint="servo" forcerange="-3 3"/></actuator></mujoco>"""
 OWN = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "kp": 9.0, "kd": 0.3, "limit": 3.0}
-ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12}
-OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1}
+ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12, "play": 0.04,
+      "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
+      "tilt_x": 0.25, "tilt_y": -0.2}  # fmt: skip
+OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0}
+PER_TURN = ParameterPattern("cogging_per_turn", nominal=9.0, free=False)
 
 
 @pytest.fixture
@@ -49,12 +62,18 @@ def by_hand(terms, goals, on, start):
     inertia = MASS * LENGTH**2 + 1e-4 + p["armature"]
     q, w, out = *start, []
     for goal, enabled in zip(goals, on, strict=True):
-        servo = enabled * (p["kp"] * (goal - q) - p["kd"] * w)
+        error = goal - q - p["eccentric_cos"] * math.cos(q) - p["eccentric_sin"] * math.sin(q)
+        answered = math.copysign(max(abs(error) - p["play"], 0.0), error)
+        servo = enabled * (p["kp"] * answered - p["kd"] * w)
+        cogging = p["cogging_cos"] * math.cos(9.0 * q) + p["cogging_sin"] * math.sin(9.0 * q)
+        # Gravity, turned about x and then about y, in the plane of a joint about y.
+        down, aside = 9.81 * math.cos(p["tilt_x"]), math.sin(p["tilt_y"])
+        lever = MASS * LENGTH * down * (math.cos(p["tilt_y"]) * math.sin(q) - aside * math.cos(q))
         drive = max(-p["limit"], min(p["limit"], servo)) - enabled * p["back_emf"] * w
         dry = p["frictionloss"] + p["static"] * math.exp(-abs(w) / p["stribeck_rad_s"]) + p["load"] * abs(drive)
         inside = drive + enabled * p["back_emf"] * w
         brake = p["damping"] + p["drag"] * abs(w) + enabled * p["back_emf"]
-        pushed = w + STEP_S / inertia * (inside - p["bias"] - MASS * 9.81 * LENGTH * math.sin(q))
+        pushed = w + STEP_S / inertia * (inside - p["bias"] - cogging - lever)
         stopped = math.copysign(max(abs(pushed) - STEP_S * dry / inertia, 0.0), pushed)
         w = stopped / (1 + STEP_S * brake / inertia)
         q += STEP_S * w
@@ -66,10 +85,12 @@ def in_c(model_file, terms, goals, on, start):
     model = driven(model_file, ("servo",), STEP_S, False, False)
     law = DriveLaw(np.array([0]), np.array([0]))
     kp = OWN["kp"] * on
-    control = np.stack([kp * goals, kp, OWN["kd"] * on, on], axis=1)[:, None]
+    control = np.stack([kp * goals, kp, OWN["kd"] * on, on, goals], axis=1)[:, None]
     values = {n: np.array([v]) for n, v in {**OWN, **terms}.items()}
     state = Start(np.array([start[0]]), np.array([start[1]]), np.zeros(1))
-    return Rollouts(model, 1, (), law=law)({}, state, control, values)[0][1:, 0]
+    tilt = expand([ParameterPattern("tilt_x"), ParameterPattern("tilt_y")], ["servo"], model, model)
+    fields = {"opt.gravity": np.asarray(tilted(tilt, terms, model.opt.gravity))}
+    return Rollouts(model, 1, tuple(fields), law=law)(fields, state, control, values)[0][1:, 0]
 
 
 @pytest.mark.parametrize("one", [*OPTIONAL, "all"])
@@ -91,7 +112,7 @@ def engines(tmp_path_factory):
     """Residuals of a segment as functions of the parameters, of both engines, in double precision."""
     path = tmp_path_factory.mktemp("model") / "robot.xml"
     path.write_text(XML.format(friction=0.0).replace(f'"{STEP_S}"', '"0.002"'))
-    terms = (ParameterPattern("kp"), ParameterPattern("kd"), ParameterPattern("frictionloss"))
+    terms = (ParameterPattern("kp"), ParameterPattern("kd"), ParameterPattern("frictionloss"), PER_TURN)
     robot = MjcfRobot(RobotConfig(path, ("servo",), ("goal", "enabled"), step_s=0.002, rate_hz=100.0, terms=terms))
     robot = robot.with_optional_terms()
     count, rng = 60, np.random.default_rng(1)
@@ -133,20 +154,70 @@ def test_friction_acts_on_the_compiled_engine_although_the_file_has_none(engines
     assert np.abs(with_it - without).max() > 1e-2
 
 
+def test_play_and_tilt_are_found_in_a_recording_made_by_hand(model_file):
+    """100 measurements a second of 6 s, with counts of half a milliradian."""
+    goals = np.repeat(commands(6000)[0][::10], 10)
+    truth = {"play": 0.03, "tilt_y": 0.15}
+    angle = np.concatenate([[0.0], by_hand(OFF | truth, goals, np.ones(6000), (0.0, 0.0))])[:6000:10]
+    at = np.arange(600) * 10_000
+    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
+    outputs = {"sensor": {"position": 5e-4 * np.round(angle / 5e-4)[:, None]}, "actuator": {"goal": goals[::10, None]}}
+    episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    held = [ParameterPattern(what, nominal=OWN[what], free=False) for what in ("kp", "kd", "frictionloss")]
+    sought = [ParameterPattern(what) for what in truth]
+    config = RobotConfig(model_file, ("servo",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=(*held, *sought))
+    model = MjcfRobot(config).identifiable(0.02)
+    spans = [Span(0, 0.1 + 0.5 * i) for i in range(10)]
+    problem = Problem(model, [episode], spans, 0.5, FitConfig(max_delay_s=0.02, engine="c"))
+    found = problem.table.decode(refine(problem, problem.table.start()[None]).z)
+    assert {n: float(found[n]) for n in truth} == pytest.approx(truth, rel=0.1)
+
+
 def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
-    config = RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",)))
-    robot = MjcfRobot(config)
+    terms = (*usual_terms(("goal",)), PER_TURN)
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms[:-1]))
     assert left_out.offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
     table = left_out.offering(robot, "auto").identifiable(0.02).parameters
-    assert {p.term for p in table} - {""} == set(OPTIONAL)
+    assert {p.term for p in table} - {""} == set(OPTIONAL) - set(ASKED)
     assert table.terms == ()  # none is free by itself
-    every = left_out.widest(table, "all")
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms))
+    every = left_out.widest(left_out.offering(robot, "all").identifiable(0.02).parameters, "all")
     assert set(every.terms) == set(OPTIONAL)
-    assert {p.name: p.without for p in every if p.term} == {**dict.fromkeys(LAWS, 0.0), "stribeck_rad_s": 0.1}
+    off = {p.name: p.without for p in every if p.term}
+    assert off == dict.fromkeys(set(ON) - {"cogging_per_turn"}, 0.0) | {"stribeck_rad_s": 0.1}
     values = every.decode(every.start())
-    assert all(values[what] > 0.0 for what in LAWS if what != "bias")  # at a bound nothing would move
+    either = {"bias", "cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin", "tilt_x", "tilt_y"}
+    assert all(values[what] > 0.0 for what in set(off) - either)  # at a bound nothing would move
     assert left_out.widest(table, "load").terms == ("load",)
+
+
+@pytest.mark.parametrize("one", ASKED)
+def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_file, one):
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_terms(("goal",)), PER_TURN)))
+    table = left_out.offering(robot, f"load,{one}").identifiable(0.02).parameters
+    assert left_out.widest(table, f"load,{one}").terms == ("load", one)
+    own = optional((ParameterPattern(OPTIONAL[one][0]),), "auto")
+    assert {t.term for t in own} == set(OPTIONAL) - set(ASKED) | {one}
+    assert [t.what for t in own if t.term == one] == [OPTIONAL[one][0]], "a robot may feel tilt_y and not tilt_x"
+
+
+def test_cogging_is_refused_without_how_often_it_repeats(model_file):
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
+    with pytest.raises(UsageError, match="how often"):
+        left_out.offering(robot, "cogging")
+    with pytest.raises(UsageError, match="counted"):
+        ParameterPattern("cogging_per_turn")
+    with pytest.raises(UsageError, match="whole robot"):
+        ParameterPattern("tilt_x", each=True)
+
+
+def test_an_encoder_off_its_axis_is_read_back():
+    terms = DriveTerms(eccentric_cos=jnp.array([0.05]), eccentric_sin=jnp.array([-0.1]))
+    angle = jnp.linspace(-3.0, 3.0, 41)
+    np.testing.assert_allclose(terms.angle(terms.read(angle)), angle, atol=2e-4)
+    np.testing.assert_allclose(terms.rate(angle, 2.0), 2.0 * jax.vmap(jax.grad(lambda a: terms.read(a)[0]))(angle),
+                               rtol=1e-5)  # fmt: skip
 
 
 def test_parameters_of_a_term_bring_it_back(model_file):
@@ -158,7 +229,7 @@ def test_parameters_of_a_term_bring_it_back(model_file):
 def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():
     own = optional((ParameterPattern("load", each=True, high=0.5),))
     assert own[0] == ParameterPattern("load", each=True, high=0.5, term="load")
-    assert sorted(t.what for t in own) == sorted(LAWS)
+    assert sorted(t.what for t in own) == sorted({*LAWS, "tilt_x", "tilt_y"} - {w for w in LAWS if "cogging" in w})
 
 
 def test_every_coefficient_can_be_identified():
