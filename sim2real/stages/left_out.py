@@ -28,6 +28,8 @@ _LEAST_TO_CHOOSE = 3
 """Parts of which one is left out, and terms chosen by how the others predict each other."""
 _ANY_DELAY_S = 0.1
 """Which parameters a model has does not depend on its longest delay [s]."""
+_VAGUE = 4.0
+"""How many times the worst error a promise may be before the words say that it is none."""
 _FEWEST = 4
 """Parts from which on they say how much estimates differ."""
 
@@ -139,11 +141,13 @@ def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: fl
             ("in one go", _of(rows, p, "free")),
         ):
             if errors.size >= _LEAST_PARTS:
-                unit = f" {p.unit}".rstrip()
+                unit, most = f" {p.unit}".rstrip(), further(errors)
+                promise = f"95 % of further parts like these stay below {most:.2g}{unit}"
+                if most > _VAGUE * errors.max():
+                    promise = f"so few parts that differ so much promise no more than {most:.2g}{unit}: record more"
                 said.append(
                     f"{p.name}, {what}, on parts that were left out of the fit: off by {errors.mean():.2g}{unit} on "
-                    f"average, {errors.max():.2g}{unit} at worst of {errors.size}; 95 % of further parts like these "
-                    f"stay below {further(errors):.2g}{unit}"
+                    f"average, {errors.max():.2g}{unit} at worst of {errors.size}; {promise}"
                 )
     return said
 

@@ -39,6 +39,14 @@ def test_mean_worst_and_promise_are_said_of_every_position_that_has_errors():
     assert sentences([], [ANGLE], 0.5) == []
 
 
+def test_parts_that_differ_too_much_for_a_promise_are_said_to():
+    alike, apart = ([left(n, ahead=e) for n, e in zip("abc", errors, strict=True)] for errors in (
+        (0.1, 0.12, 0.11), (0.005, 0.006, 0.12)))  # fmt: skip
+    assert "further parts like these stay below 0.1" in sentences(alike, [ANGLE], 0.5)[0]
+    assert "promise no more than" in sentences(apart, [ANGLE], 0.5)[0]
+    assert "record more" in sentences(apart, [ANGLE], 0.5)[0]
+
+
 def test_what_is_promised_of_a_field_is_the_bound_on_one_more_part():
     rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=float("nan"))]
     assert promises(rows) == {"th": pytest.approx(further(np.array([0.1, 0.2])))}
