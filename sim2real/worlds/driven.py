@@ -103,7 +103,8 @@ class DrivenWorld(MjxWorld):
         """Return the model at its reference, with drives that do nothing."""
         own = super().init_params(rng, graph_state)
         zero = jnp.zeros(len(self.joints))
-        terms = DriveTerms().replace(**{f.name: zero + f.default for f in fields(DriveTerms)}) if self.law else None
+        off = DriveTerms()
+        terms = off.replace(**{f.name: zero + getattr(off, f.name) for f in fields(off)}) if self.law else None
         return DriveParams(own.model, own.qpos, own.qvel, terms=terms)
 
     def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
