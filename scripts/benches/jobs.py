@@ -24,6 +24,8 @@ ONE_THREAD = {
     "JAX_PLATFORMS": "cpu",
 }
 """Environment of a process that computes by one thread; what stands in XLA_FLAGS already is kept."""
+OVER = "not done when the bench's time was up"
+"""What an error says that ends what took too long."""
 
 
 def each(
@@ -112,7 +114,7 @@ def _until(until: float | None) -> Iterator[None]:
         return
 
     def ring(*_: Any) -> None:
-        raise TimeoutError("not done when the bench's time was up")
+        raise TimeoutError(OVER)
 
     before = signal.signal(signal.SIGALRM, ring)
     try:
