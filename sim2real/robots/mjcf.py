@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
-_NO_LIMIT = 1e6
+NO_LIMIT = 1e6
 _LEAST_FRICTION = 1e-9
 
 
@@ -86,7 +87,7 @@ def driven(
             part.gaintype = mj.mjtGain.mjGAIN_AFFINE
             part.gainprm[:3] = gain
     for joint in joints:
-        most = limits[joint] or _NO_LIMIT
+        most = limits[joint] or NO_LIMIT
         spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
         if rubbing:
             spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
@@ -101,6 +102,49 @@ def driven(
         raise UsageError(
             f"{path} does not compile with joints held: {error}", hint="take what needs them out of the model"
         ) from None
+
+
+@dataclass(frozen=True)
+class JointDrive:
+    """One actuator of a joint.
+
+    Attributes:
+        told: What its control is.
+        stiffness: Of one that is told a position [N m/rad].
+        damping: Of its own [N m s/rad]; of one that is told a velocity its gain, too.
+        gain: Torque for each unit of the control, of one that is told neither [N m].
+        most: Largest torque [N m]; None: no limit.
+    """
+
+    told: Literal["position", "velocity", "torque"]
+    stiffness: float
+    damping: float
+    gain: float
+    most: float | None
+
+
+def set_drives(spec: Any, drives: Mapping[str, JointDrive]) -> None:
+    """Give joints of a model one actuator each: the file's own where it has just one, else a new one.
+
+    Args:
+        spec: ``mujoco.MjSpec`` of the model; it is changed.
+        drives: By joint.
+    """
+    fixed, affine = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+    for joint, drive in drives.items():
+        own = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
+        for element in own[1:]:
+            spec.delete(element)
+        part: Any = own[0] if own else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+        gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.told]
+        stiffness = drive.stiffness if drive.told == "position" else 0.0
+        part.gaintype, part.biastype, part.dyntype = fixed, affine, mj.mjtDyn.mjDYN_NONE
+        part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        part.gainprm[:3], part.biasprm[:3] = [gain, 0.0, 0.0], [0.0, -stiffness, -drive.damping]
+        part.ctrllimited = False  # what the file allowed may have been a torque
+        part.forcelimited = False
+        if drive.most is not None:  # the joint's, as in identification: MuJoCo then still takes damping implicitly
+            spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-drive.most, drive.most]
 
 
 def limit_of(model: Any, joint: str) -> float | None:

@@ -115,7 +115,7 @@ ASKED = ("tilt", "eccentricity", "cogging")
 LAWS = (*(q for name, own in OPTIONAL.items() if name != "tilt" for q in own), "cogging_per_turn")
 """Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
-_ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
+ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
         elif p.what == "payload":
             model["body_mass"] = model.get("body_mass", base.model.body_mass).at[at].add(value)
         else:
-            field = _ON_DOF[p.what]
+            field = ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
     if any(p.what in ("tilt_x", "tilt_y") for p in placed):
         model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
@@ -347,8 +347,8 @@ def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
         return 0.0
     values: list[float] = []
     for name in names:
-        if term.what in _ON_DOF:
-            values.append(float(getattr(own, _ON_DOF[term.what])[own.joint(name).dofadr[0]]))
+        if term.what in ON_DOF:
+            values.append(float(getattr(own, ON_DOF[term.what])[own.joint(name).dofadr[0]]))
         elif term.what in ("kp", "kd") and (gains := gains_of(own, name)):
             values.append(gains[term.what == "kd"])
         elif term.what == "torque" and (limit := limit_of(own, name)):

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.mjcf import driven, joints_of, read_model, read_spec
-from sim2real.robots.mjcf_parameters import LAWS, ParameterPattern, Placed, expand, optional, place, tilted
+from sim2real.robots.mjcf import NO_LIMIT, JointDrive, driven, joints_of, limit_of, read_model, read_spec, set_drives
+from sim2real.robots.mjcf_parameters import LAWS, ON_DOF, ParameterPattern, Placed, expand, optional, place, tilted
 from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
@@ -231,17 +232,55 @@ class MjcfRobot(LoggedRobot):
             zero=zero,
         )
 
+    @property
+    def export_lead_s(self) -> float:
+        """What C MuJoCo adds to the delay of commands [s].
+
+        Half a step for the integrator's sake, as ``DrivenWorld`` does in the graph.
+        """
+        return 0.5 * self.config.step_s
+
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
-        """Return the file's model with identified friction and inertia; drives are in ``parameters.json``."""
-        spec = read_spec(self.config.model)
+        """Return the file's model with what was identified: friction, inertia, payload, tilt, and each joint's drive.
+
+        Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
+        """
+        config, spec = self.config, read_spec(self.config.model)
+        spec.option.timestep, spec.option.integrator = config.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.gravity = np.asarray(tilted(self.placed, values, spec.option.gravity))
-        fields_of = {"damping": "damping", "armature": "armature", "frictionloss": "frictionloss"}
-        for p in self.placed:
-            for i in p.at if p.what in fields_of else ():
-                joint, value = spec.joint(self.config.joints[i]), float(values[p.parameter.name])
-                vector = isinstance(getattr(joint, p.what), np.ndarray)
-                setattr(joint, p.what, [value, *joint.damping[1:]] if vector else value)
+        drives = self._drives(values)
+        if not ("kp" in config.commands and config.kp_unit == 1.0):
+            set_drives(spec, dict(zip(config.joints, drives, strict=True)))
+        model = spec.compile()
+        dofs = [model.joint(name).dofadr[0] for name in config.joints]
+        # A speed without load makes a damping of the torque limit, after a damping that was identified.
+        for p in sorted(self.placed, key=lambda p: p.what == "speed"):
+            value = float(values[p.parameter.name])
+            for i in p.at:
+                if p.what == "payload":
+                    model.body_mass[i] += value
+                elif p.what == "speed":
+                    model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
+                elif p.what in ON_DOF:
+                    getattr(model, ON_DOF[p.what])[dofs[i]] = value
+        spec.copy_back(model)
         return spec.to_xml()
+
+    def _drives(self, values: Mapping[str, Any]) -> list[JointDrive]:
+        """Return the joints' drives with identified values."""
+        told: Any = next(
+            (t for n, t in (("goal", "position"), ("goal_velocity", "velocity")) if n in self.config.commands), "torque"
+        )
+        own = read_model(self.config.model)
+        found: list[dict[str, Any]] = [
+            {"stiffness": 20.0, "damping": 0.0, "gain": 1.0, "most": limit_of(own, joint)}
+            for joint in self.config.joints
+        ]
+        names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
+        for p in self.placed:
+            for i in p.at if p.what in names else ():
+                found[i][names[p.what]] = float(values[p.parameter.name])
+        return [JointDrive(told, **one) for one in found]
 
 
 class IdentifiableMjcf(IdentifiableRecording):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.identification import Identification
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log import bags, importer
@@ -21,7 +22,7 @@ from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
 from sim2real.stages import importing
 from sim2real.stages.config import MODEL_IDENTIFY, RobotFlags
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, load_pipeline
 
 _STEPS_S = (0.0005, 0.005)
 """Between these, the model's own time step is taken."""
@@ -128,6 +129,17 @@ def from_file(path: Path, name: str) -> DescribedPipeline:
     return DescribedPipeline(
         name, f"described by {path}", "", identify=MODEL_IDENTIFY, description=RobotConfig.load(path)
     )
+
+
+def pipeline_beside(parameters: Path, found: Identification) -> Pipeline:
+    """Return the robot that parameters are of: described beside them, or a pipeline.
+
+    Args:
+        parameters: Their file, or its folder.
+        found: What they say.
+    """
+    beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
+    return from_file(beside, found.pipeline) if beside.is_file() else load_pipeline(found.pipeline)
 
 
 def files_of(description: RobotConfig) -> dict[str, str]:

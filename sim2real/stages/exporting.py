@@ -19,7 +19,9 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.base import RecordedRobot
 from sim2real.stages.config import ExportConfig
 from sim2real.stages.console import note, wrote
-from sim2real.stages.pipeline import available, load_pipeline
+from sim2real.stages.described import pipeline_beside
+from sim2real.stages.left_out import having
+from sim2real.stages.pipeline import available
 from sim2real.stages.targets import find_run
 
 _FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json"}
@@ -46,8 +48,9 @@ def run(config: ExportConfig) -> Path:
             f"the search that {file} is from was interrupted: nothing is known about how far off its values are",
             hint=f"sim2real identify {found.pipeline}",
         )
-    robot = load_pipeline(found.pipeline).load()
-    table = robot.identifiable(load_pipeline(found.pipeline).identify.max_delay_s).parameters
+    pipeline = pipeline_beside(file, found)
+    robot = having(pipeline.load(), [p.name for p in found.parameters])
+    table = robot.identifiable(pipeline.identify.max_delay_s).parameters
     out = config.out or Path(f"{found.pipeline}_{_FILES[config.to]}")
     about = [
         ("pipeline", found.pipeline),
@@ -81,8 +84,9 @@ def write(
         about: Names and texts to keep with it.
     """
     sides = {p.name: p.side for p in table}
-    text = robot.identified_mjcf(values_of(found))
-    terms = None if text is None else find_terms(found, lambda values: _text(robot, values), sides)
+    off = {p.name: p.nominal for p in table}  # of optional terms that nobody asked for
+    text = robot.identified_mjcf({**off, **values_of(found)})
+    terms = None if text is None else find_terms(found, lambda values: _text(robot, {**off, **values}), sides)
     if to == "json":
         write_json(out, json_document(found, terms, find_delays(found, sides), about))
         return

@@ -71,9 +71,11 @@ def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
         robot: The robot.
         names: Names of parameters that were identified.
     """
-    offered = offering(robot, "all")
-    terms = {p.name for p in offered.identifiable(_ANY_DELAY_S).parameters if p.term}
-    return offered if offered is not robot and terms & set(names) else robot
+    own, every = (
+        {p.name: p.term for p in r.identifiable(_ANY_DELAY_S).parameters} for r in (robot, offering(robot, "all"))
+    )
+    lacking = sorted({every[name] for name in names if name in every and name not in own})
+    return offering(robot, ",".join(lacking)) if lacking else robot
 
 
 def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> terms.Selection:

@@ -20,12 +20,11 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, check_log
 from sim2real.identify.verdict import Score, scores
 from sim2real.log.mapping import load_mapping
-from sim2real.robots.mjcf_robot import ROBOT_FILE
 from sim2real.stages import described, identified, left_out
 from sim2real.stages.config import IdentifyConfig, ValidateConfig
 from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.cutting import reach
-from sim2real.stages.pipeline import Pipeline, load_pipeline
+from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording
 
 _PARAMETERS = "parameters.json"
@@ -67,10 +66,9 @@ def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pi
         found: What they say.
         config: May name a mapping.
     """
-    beside = (path if path.is_dir() else path.parent) / ROBOT_FILE
-    if not beside.is_file():
-        return load_pipeline(found.pipeline)
-    own = described.from_file(beside, found.pipeline)
+    own = described.pipeline_beside(path, found)
+    if not isinstance(own, described.DescribedPipeline):
+        return own
     return own.reading(config.log, load_mapping(config.mapping, own.name) if config.mapping else None)
 
 

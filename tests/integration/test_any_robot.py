@@ -63,3 +63,22 @@ def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, c
     model = mujoco.MjModel.from_xml_path(str(folder / "identified.xml"))
     assert model.dof_damping[0] == pytest.approx(rows["damping"], rel=1e-5)
     assert cli.main(["validate", str(folder / "parameters.json"), "--log", "later.npz"]) == 0
+    assert cli.main(["export", "identified", str(folder / "parameters.json"), "--out", "exported.xml"]) == 0
+    assert "not expressed" not in capsys.readouterr().err
+    t, goal, q = simulated(1)
+    assert np.abs(alone("exported.xml", t, goal) - q).max() < 0.02 * np.ptp(q)
+
+
+def alone(path, t, goals):
+    """Return what a model's joint does [rad] when its one actuator gets the goals, with nothing else around it."""
+    model = mujoco.MjModel.from_xml_path(path)
+    data, q = mujoco.MjData(model), np.zeros_like(t)
+    step_s = model.opt.timestep
+    for k in range(round(t[-1] / step_s) + 1):
+        now = k * step_s
+        row = min(int(now * RATE_HZ + 1e-6), len(t) - 1)
+        if abs(now - t[row]) < 0.5 * step_s:
+            q[row] = data.qpos[0]
+        data.ctrl[0] = goals[row]
+        mujoco.mj_step(model, data)
+    return q

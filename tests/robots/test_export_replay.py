@@ -23,6 +23,8 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
+from sim2real.robots.mjcf_parameters import ParameterPattern
+from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.recorded import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay
@@ -126,38 +128,82 @@ def test_intervals_are_those_of_the_posterior_field_by_field(terms):
     assert (terms.delays.command.estimate, terms.delays.measurement.estimate) == (FOUND["delay"], FOUND["sensor_delay"])
 
 
-def test_the_exported_file_alone_does_in_c_what_the_graph_predicts(terms):
-    """Off by less than 1 % of the motion: commands, delays of both sides, friction that sticks."""
-    robot, count = Hinge(), 70
-    sent = 20_000 * np.arange(count)
-    goals = np.where(np.arange(count) % 25 < 12, 0.6, -0.2)[:, None] + 0.1 * np.sin(0.9 * np.arange(count))[:, None]
-    measured = 10_000 * np.arange(2 * count)
+COUNT = 70
+SENT = 20_000 * np.arange(COUNT)
+GOALS = np.where(np.arange(COUNT) % 25 < 12, 0.6, -0.2) + 0.1 * np.sin(0.9 * np.arange(COUNT))
+
+
+def predicted(robot, values, field, commands, shape=(1,)):
+    """Return when a segment's measurements are, and what the graph predicts of them [rad]."""
+    measured = 10_000 * np.arange(2 * COUNT)
     episode = Episode(
-        steps={"sensor": steps(measured), "actuator": steps(sent)},
+        steps={"sensor": steps(measured), "actuator": steps(SENT)},
         messages={},
-        outputs={"sensor": {"position": np.zeros(2 * count)}, "actuator": {"action": goals}},
+        outputs={"sensor": {"position": np.zeros((2 * COUNT, *shape))}, "actuator": {field: commands[:, None]}},
     )
     config = FitConfig(max_delay_s=0.03, initial_state="rest", jacobian="finite")
     problem = Problem(robot.identifiable(0.03), [episode], [Span(0, 0.0)], SEGMENT_S, config)
-    values = {n: jnp.float32(v) for n, v in FOUND.items()}
-    error, ts = (np.asarray(x) for x in jax.jit(lambda v: problem.residuals(v, 0, jnp.zeros(2)))(values))
+    tree = {n: jnp.float32(v) for n, v in values.items()}
+    error, ts = (np.asarray(x) for x in jax.jit(lambda v: problem.residuals(v, 0, jnp.zeros(2)))(tree))
     counted = ts >= 0
-    ours = error[counted, 0] * 0.002
-
-    text = late_mjcf(robot.identified_mjcf(FOUND), terms, Late(robot.export_lead_s, robot.profile_rad_s), [])
-    model = mujoco.MjModel.from_xml_string(text)
-    data, rows = mujoco.MjData(model), []
-    nsample = int(model.actuator_history[0, 0])  # the first command was there before, as in the graph
-    mujoco.mj_initCtrlHistory(model, data, 0, -STEP_S * np.arange(nsample, 0, -1), np.full(nsample, goals[0, 0]))
-    while data.time < SEGMENT_S + 2 * STEP_S:
-        data.ctrl[:], now = goals[np.searchsorted(sent, 1e6 * data.time + 1, side="right") - 1], data.time
-        mujoco.mj_step(model, data)
-        rows.append([now, data.sensor("sim2real/position/hinge").data[0]])
-    theirs = np.interp(ts[counted], *np.array(rows).T)
-    off = np.sqrt(np.mean((theirs - ours) ** 2)) / np.std(ours)
     assert counted.sum() > 80
+    return ts[counted], error[counted, 0] * robot.channels[0].position_sigma
+
+
+def played(text, joint, commands):
+    """Return times and what the sensor of an exported file says in C MuJoCo, where the first command was before."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rows, step_s = mujoco.MjData(model), [], model.opt.timestep
+    nsample = int(model.actuator_history[0, 0])
+    mujoco.mj_initCtrlHistory(model, data, 0, -step_s * np.arange(nsample, 0, -1), np.full(nsample, commands[0]))
+    while data.time < SEGMENT_S + 2 * step_s:
+        data.ctrl[:], now = commands[np.searchsorted(SENT, 1e6 * data.time + 1, side="right") - 1], data.time
+        mujoco.mj_step(model, data)
+        rows.append([now, data.sensor(f"sim2real/position/{joint}").data[0]])
+    return np.array(rows).T
+
+
+def test_the_exported_file_alone_does_in_c_what_the_graph_predicts(terms):
+    """Off by less than 1 % of the motion: commands, delays of both sides, friction that sticks."""
+    robot = Hinge()
+    ts, ours = predicted(robot, FOUND, "action", GOALS, ())
+    text = late_mjcf(robot.identified_mjcf(FOUND), terms, Late(robot.export_lead_s, robot.profile_rad_s), [])
+    rows = played(text, "hinge", GOALS)
     assert np.ptp(ours) > 0.5
-    assert off < 0.01
-    exact = FOUND["delay"] + FOUND["sensor_delay"]
-    late = np.interp(ts[counted] - 0.002, *np.array(rows).T)
-    assert np.sqrt(np.mean((late - ours) ** 2)) > 0.01 * np.std(ours), f"2 ms of {exact} s would be seen"
+    off = lambda early_s: np.sqrt(np.mean((np.interp(ts - early_s, *rows) - ours) ** 2)) / np.std(ours)  # noqa: E731
+    assert off(0.0) < 0.01
+    assert off(0.002) > 0.01, f"2 ms of {FOUND['delay'] + FOUND['sensor_delay']} s would be seen"
+
+
+ANY = """<mujoco><option timestep="0.005"/><worldbody><body name="arm">
+  <joint name="servo" axis="0 1 0"/><geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.1" mass="0.3"/></body>
+  </worldbody><actuator>{drive}</actuator></mujoco>"""
+MOTOR = '<motor name="own" joint="servo" gear="2" ctrlrange="-0.5 0.5"/>'
+SHARED = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "payload": 0.1, "tilt_y": 0.1, "torque": 0.8}
+
+
+@pytest.mark.parametrize(
+    ("field", "own", "drive"),
+    [("goal", {"kp": 4.0, "kd": 0.08}, ""), ("goal", {"kp": 4.0, "kd": 0.08}, MOTOR), ("duty", {"gain": 0.6}, MOTOR),
+     ("goal_velocity", {"kd": 0.4}, "")],
+)  # fmt: skip
+def test_a_robot_that_only_its_file_describes_takes_its_drives_along(field, own, drive, tmp_path):
+    """Its own actuators, if any, are of other gains, limits and gears: one command, and the motion is the graph's."""
+    path, values = tmp_path / "any.xml", {**SHARED, **own}
+    path.write_text(ANY.format(drive=drive))
+    config = RobotConfig(path, ("servo",), (field,), step_s=STEP_S, rate_hz=100.0,
+                         terms=tuple(ParameterPattern(what) for what in values))  # fmt: skip
+    robot = MjcfRobot(config)
+    ts, ours = predicted(robot, {**values, "delay": 0.0131}, field, GOALS)
+    rows = [Estimate(n, "1", "dynamics", "", v, v, "accepted") for n, v in values.items()]
+    rows.append(Estimate("delay", "s", "delay", "", 0.0, 0.0131, "accepted"))
+    known = Identification("any", (), Judgement("accepted", ()), tuple(rows))
+    terms = find_terms(known, robot.identified_mjcf, {"delay": "command"})
+    assert terms.unexpressed == ()
+    assert terms.joints["servo"]["effort_limit"].estimate == pytest.approx(0.8)
+    assert mujoco.MjModel.from_xml_string(robot.identified_mjcf(values)).nu == 1
+    text = late_mjcf(robot.identified_mjcf(values), terms, Late(robot.export_lead_s, robot.profile_rad_s), [])
+    off = lambda early_s: np.interp(ts - early_s, *played(text, "servo", GOALS)) - ours  # noqa: E731
+    assert np.ptp(ours) > 0.2
+    assert np.sqrt(np.mean(off(0.0) ** 2)) < 0.01 * np.std(ours)
+    assert np.sqrt(np.mean(off(0.002) ** 2)) > 0.01 * np.std(ours), "2 ms would be seen"

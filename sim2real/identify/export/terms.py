@@ -168,6 +168,8 @@ def _numbers(model: Any) -> dict[tuple[str, str, str], float]:
                 found["joint", joint, "gain"] = float(model.actuator_gainprm[a, 0])
             if model.actuator_forcelimited[a]:
                 found["joint", joint, "effort_limit"] = float(model.actuator_forcerange[a, 1])
+            elif model.jnt_actfrclimited[model.actuator_trnid[a, 0]]:
+                found["joint", joint, "effort_limit"] = float(model.jnt_actfrcrange[model.actuator_trnid[a, 0], 1])
     for b in range(1, model.nbody):
         for field in _BODY:
             values = np.atleast_1d(getattr(model, f"body_{field}")[b])
@@ -182,6 +184,8 @@ def _unexpressed(
 ) -> list[str]:
     """Return the parameters without which the model would be the same, but for delays."""
     names = {p.name.partition("@")[0]: p for p in found.parameters if p.kind not in ("delay", "derived")}
+    # An optional term that was left out has nothing to express.
+    names = {name: p for name, p in names.items() if p.verdict != "fixed" or p.estimate != p.nominal}
     text = mjcf(best)
     return [
         name for name, p in names.items() if mjcf({**best, name: best[name] + 0.1 * (abs(best[name]) or 1.0)}) == text
