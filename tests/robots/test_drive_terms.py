@@ -16,6 +16,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.problem import Problem
 from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
+from sim2real.identify.uncertainty import linearise
 from sim2real.robots.mjcf import driven
 from sim2real.robots.mjcf_parameters import (
     ASKED,
@@ -154,23 +155,45 @@ def test_friction_acts_on_the_compiled_engine_although_the_file_has_none(engines
     assert np.abs(with_it - without).max() > 1e-2
 
 
-def test_play_and_tilt_are_found_in_a_recording_made_by_hand(model_file):
-    """100 measurements a second of 6 s, with counts of half a milliradian."""
+@pytest.fixture(scope="module")
+def by_hands_log(tmp_path_factory):
+    """Residuals of a recording made by hand: 100 measurements a second of 6 s, with counts of half a milliradian."""
+    path = tmp_path_factory.mktemp("model") / "robot.xml"
+    path.write_text(XML.format(friction=OWN["frictionloss"]))
     goals = np.repeat(commands(6000)[0][::10], 10)
-    truth = {"play": 0.03, "tilt_y": 0.15}
-    angle = np.concatenate([[0.0], by_hand(OFF | truth, goals, np.ones(6000), (0.0, 0.0))])[:6000:10]
+    angle = np.concatenate([[0.0], by_hand(OFF | PLAY, goals, np.ones(6000), (0.0, 0.0))])[:6000:10]
     at = np.arange(600) * 10_000
     steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
     outputs = {"sensor": {"position": 5e-4 * np.round(angle / 5e-4)[:, None]}, "actuator": {"goal": goals[::10, None]}}
     episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
     held = [ParameterPattern(what, nominal=OWN[what], free=False) for what in ("kp", "kd", "frictionloss")]
-    sought = [ParameterPattern(what) for what in truth]
-    config = RobotConfig(model_file, ("servo",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=(*held, *sought))
+    sought = [ParameterPattern(what) for what in PLAY]
+    config = RobotConfig(path, ("servo",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=(*held, *sought))
     model = MjcfRobot(config).identifiable(0.02)
     spans = [Span(0, 0.1 + 0.5 * i) for i in range(10)]
-    problem = Problem(model, [episode], spans, 0.5, FitConfig(max_delay_s=0.02, engine="c"))
-    found = problem.table.decode(refine(problem, problem.table.start()[None]).z)
-    assert {n: float(found[n]) for n in truth} == pytest.approx(truth, rel=0.1)
+    return Problem(model, [episode], spans, 0.5, FitConfig(max_delay_s=0.02, engine="c"))
+
+
+PLAY = {"play": 0.03, "tilt_y": 0.15}
+
+
+def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
+    found = by_hands_log.table.decode(refine(by_hands_log, by_hands_log.table.start()[None]).z)
+    assert {n: float(found[n]) for n in PLAY} == pytest.approx(PLAY, rel=0.1)
+
+
+@pytest.mark.parametrize("share", [1e-4, 1e-6, 1e-9])
+def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
+    """At a bound the search's own unknown changes nothing, and the delay does: 10 ms of it would be seen."""
+    table = by_hands_log.table
+    z, late = table.start(), table.names.index("delay")
+
+    def column(share):
+        at = linearise(by_hands_log, np.where(np.arange(len(z)) == late, np.log(share / (1 - share)), z))
+        return at.jacobian[..., late]
+
+    known = column(0.02)
+    assert np.abs(column(share) - known).max() < 0.15 * np.abs(known).max()
 
 
 def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
