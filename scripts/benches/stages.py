@@ -67,12 +67,13 @@ def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
 
 
 def estimates(identify: StageFolder) -> dict[str, Any]:
-    """Return how far the identified dynamics and the round trip are off the true ones."""
+    """Return how far the identified dynamics and the round trip are off the true ones, where there is a true one."""
     document = json.loads(identify.output("parameters").read_text())
     by_name = {p["name"]: p for p in document["parameters"]}
     trip = by_name["round_trip_delay"]
+    dynamics = {n: p for n, p in by_name.items() if p["kind"] == "dynamics" and p["truth"]}
     return {
-        "errors": {n: p["estimate"] / p["truth"] - 1 for n, p in by_name.items() if p["kind"] == "dynamics"},
+        "errors": {n: p["estimate"] / p["truth"] - 1 for n, p in dynamics.items()},
         "round_trip_ms": 1e3 * trip["estimate"],
         "round_trip_error_ms": 1e3 * (trip["estimate"] - trip["truth"]),
     }
