@@ -103,25 +103,22 @@ def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
 def linearise(problem: Problem, z: np.ndarray) -> Linearised:
     """Compute residuals and Jacobian at ``z (P,)``.
 
-    At a bound nothing changes with ``z`` any more, but it does with the parameter: there the Jacobian is that of a
-    point a little inside.
+    At a bound nothing changes with ``z`` any more, but it does with the parameter: there both are computed at a point a
+    little inside, and the residuals carried on to the estimate along the Jacobian.
     """
-    linearised = problem.programs.setdefault("linearised", program(problem.linearised))
-
-    def at(z: np.ndarray) -> tuple[np.ndarray, ...]:
-        columns, _ = problem.at(z)
-        return tuple(np.asarray(a, np.float64) for a in linearised(jnp.asarray(z, jnp.float32), columns))
-
+    table = problem.table
     most = np.log((1.0 - _INSIDE) / _INSIDE)
     inside = np.clip(z, -most, most)
-    r, J, raw = at(inside)
-    if not np.array_equal(inside, z):
-        r, _, raw = at(z)
-    stretch = problem.table.scale(inside)[1]
     point = jnp.asarray(inside, jnp.float32)
-    priors = np.asarray(jax.jacfwd(problem.table.prior_residuals)(point), np.float64) / stretch
-    prior = priors.T @ priors + np.diag(12.0 / problem.table.span**2)
-    return Linearised(r, J / stretch, prior, problem.table.scale(z)[0], raw)
+    linearised = problem.programs.setdefault("linearised", program(problem.linearised))
+    columns, _ = problem.at(inside)
+    r, J, raw = (np.asarray(a, np.float64) for a in linearised(point, columns))
+    at, stretch = table.scale(inside)
+    x = table.scale(z)[0]
+    onward = (J / stretch) @ (x - at)
+    priors = np.asarray(jax.jacfwd(table.prior_residuals)(point), np.float64) / stretch
+    prior = priors.T @ priors + np.diag(12.0 / table.span**2)
+    return Linearised(r + onward, J / stretch, prior, x, raw + onward)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
