@@ -129,7 +129,7 @@ def leave_out(
         chosen = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
         own = table.of_terms(chosen)
         # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
-        start = table.at_scale(stats.x + stats.step(table, chosen, k))
+        start = table.at_scale(stats.x + stats.step(table, chosen, k, bounded=True))
         z = refine(problem, start[None], *effort(problem), data=problem.part(problem.train[mask], own), gain=_GAIN).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))

@@ -41,13 +41,16 @@ class Statistics:
     prior: np.ndarray
     count: np.ndarray
 
-    def step(self, table: ParameterTable, kept: np.ndarray, left_out: int | None = None) -> np.ndarray:
+    def step(
+        self, table: ParameterTable, kept: np.ndarray, left_out: int | None = None, bounded: bool = False
+    ) -> np.ndarray:
         """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
 
         Args:
             table: The parameters.
             kept: Shape ``(T,)``, bool: which terms are part of the model.
             left_out: Number of the part that is left out; None: none is.
+            bounded: Whether parameters that would leave their bounds stop there, and the others go where that is best.
         """
         place = {name: i for i, name in enumerate(table.terms)}
         step, gone = np.zeros(len(self.x)), np.zeros(len(self.x), bool)
@@ -59,8 +62,16 @@ class Statistics:
         g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
         if left_out is not None:
             g, H = g - self.gradient[left_out], H - self.information[left_out]
-        rest = np.flatnonzero(~gone)
-        step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
+        for _ in range(len(self.x)):
+            rest = np.flatnonzero(~gone)
+            step[rest] = 0.0
+            step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
+            end = self.x + step
+            beyond = ~gone & ((end < table.low) | (end > table.high))
+            if not bounded or not beyond.any():
+                break
+            step[beyond] = (np.clip(end, table.low, table.high) - self.x)[beyond]
+            gone |= beyond
         return step
 
     def without(self, part: int) -> Statistics:

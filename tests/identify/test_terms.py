@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -138,3 +139,18 @@ def test_votes_are_those_of_scores_that_differ_by_part():
     assert share[2] == 0.0, "worse everywhere"
     smaller = votes(scores, np.array([2, 1, 1]))
     assert smaller[1] > 0.7, "the smaller of two that cannot be told apart"
+
+
+def test_a_bounded_step_is_that_of_a_solver_with_bounds():
+    """Parameters that would leave their bounds stop there, and the others go where the loss is least then."""
+    rng = np.random.default_rng(5)
+    table = ParameterTable([Parameter(n, "1", 0.5, 0.0, 1.0, "linear") for n in "abcd"])
+    J, r = rng.normal(size=(40, 4)), rng.normal(size=40)
+    r = r + J @ np.array([1.5, -0.2, 0.1, 0.0])  # a would go far below 0
+    x = np.array([0.3, 0.5, 0.5, 0.5])
+    whole = Statistics(x, np.array([r @ r]), (J.T @ r)[None], (J.T @ J)[None], np.zeros((4, 4)), np.array([40]))
+    step = whole.step(table, np.ones(0, bool), bounded=True)
+    best = lsq_linear(J, -r, (0.0 - x, 1.0 - x), method="bvls").x
+    np.testing.assert_allclose(step, best, atol=1e-9)
+    assert step[0] == pytest.approx(-0.3)
+    assert whole.step(table, np.ones(0, bool))[0] < -0.3
