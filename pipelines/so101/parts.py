@@ -26,7 +26,7 @@ embedded arm a model without it, identified on fast motions, was up to five time
 """
 STEP_S = 0.01 / 3
 """Time step of the physics [s]. At 5 ms an identification of the embedded arm finds rotors 44 % too heavy and a delay
-1.8 ms too short, at this step 15 % and 0.7 ms, at 2.5 ms 5 % and 0.2 ms, in a third more steps.
+1.8 ms too short, at this step 15 to 28 % and 0.7 to 1.0 ms, at 2.5 ms 5 % and 0.2 ms, in a third more steps.
 """
 TIP_M = 0.0981
 """From the wrist's roll joint to between the jaws, along its axis [m]."""

@@ -23,8 +23,8 @@ _BLOCK_S = 1.0
 _BLOCKS = 20
 """How many blocks there are at least, where the recordings are long enough: fewer leave too few degrees of freedom."""
 _INSIDE = 5e-3
-"""Share of the bounds' width from a bound within which derivatives are taken further inside: of a delay of up to 40 ms
-at 1e-3 finite differences were half rounding, at 1e-9 nothing else."""
+"""Share of the bounds' width from a bound within which derivatives are taken further inside: a servo's by a delay of up
+to 20 ms were mostly rounding at 1e-4 of it."""
 _RESOLVED = 1e-13
 """Least eigenvalue of a precision with a diagonal of ones: what is below is rounding of doubles."""
 _LEAST_FREEDOM = 2.0

@@ -23,7 +23,7 @@ ALL = ".*"
 _WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
          "armature": (30, 30), "frictionloss": (50, 20), "stribeck_rad_s": (10, 20)}  # fmt: skip
 """By which factors bounds lie below and above the nominal value."""
-_FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
+FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
              "frictionloss": 0.1, "stribeck_rad_s": 0.1}  # fmt: skip
 """Nominal values where the model has none."""
 _ABOUT = {
@@ -110,9 +110,10 @@ OPTIONAL = {
     "cogging": ("cogging_cos", "cogging_sin"),
 }
 """Optional terms, and the quantities that each has."""
+TILT = OPTIONAL["tilt"]
 ASKED = ("tilt", "eccentricity", "cogging")
 """Those that ``auto`` leaves out unless a parameter names them: few robots tell them from a zero or a stiffness."""
-LAWS = (*(q for name, own in OPTIONAL.items() if name != "tilt" for q in own), "cogging_per_turn")
+LAWS = (*(q for own in OPTIONAL.values() if own != TILT for q in own), "cogging_per_turn")
 """Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -159,7 +160,7 @@ class ParameterPattern:
                 "cogging_per_turn is counted, not identified",
                 hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
             )
-        if self.what in ("tilt_x", "tilt_y") and (self.each or self.joints != ALL):
+        if self.what in TILT and (self.each or self.joints != ALL):
             raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
 
     @staticmethod
@@ -278,9 +279,9 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
     terms: Any = base.terms
     # A speed without load makes a damping of the torque limit, so that comes first.
     for p in sorted(placed, key=lambda p: p.what == "speed"):
-        value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
-        if p.what in ("tilt_x", "tilt_y"):
+        if p.what in TILT:
             continue
+        value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
         if p.what in _ON_DRIVE:
             drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
         elif p.what in LAWS:
@@ -297,7 +298,7 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
         else:
             field = ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
-    if any(p.what in ("tilt_x", "tilt_y") for p in placed):
+    if any(p.what in TILT for p in placed):
         model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
     return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
 
@@ -310,10 +311,10 @@ def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) ->
         values: Parameters by name.
         gravity: As the model has it, ``(3,)`` [m/s^2].
     """
-    angle = {p.what: values[p.parameter.name] for p in placed if p.what in ("tilt_x", "tilt_y")}
+    angle = {p.what: values[p.parameter.name] for p in placed if p.what in TILT}
     if not angle:
         return gravity
-    x, y = (jnp.asarray(angle.get(what, 0.0), float) for what in ("tilt_x", "tilt_y"))
+    x, y = (jnp.asarray(angle.get(what, 0.0), float) for what in TILT)
     g = jnp.asarray(gravity, float)
     g = jnp.array([g[0], jnp.cos(x) * g[1] - jnp.sin(x) * g[2], jnp.sin(x) * g[1] + jnp.cos(x) * g[2]])
     return jnp.array([jnp.cos(y) * g[0] + jnp.sin(y) * g[2], g[1], jnp.cos(y) * g[2] - jnp.sin(y) * g[0]])
@@ -354,7 +355,7 @@ def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
         elif term.what == "torque" and (limit := limit_of(own, name)):
             values.append(limit)
     known = [v for v in values if v > 0]
-    return float(np.median(known)) if known else _FALLBACK[term.what]
+    return float(np.median(known)) if known else FALLBACK[term.what]
 
 
 def _size(term: ParameterPattern, names: Sequence[str], own: Any) -> float:

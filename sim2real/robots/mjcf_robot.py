@@ -20,7 +20,17 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.mjcf import NO_LIMIT, JointDrive, driven, joints_of, limit_of, read_model, read_spec, set_drives
-from sim2real.robots.mjcf_parameters import LAWS, ON_DOF, ParameterPattern, Placed, expand, optional, place, tilted
+from sim2real.robots.mjcf_parameters import (
+    FALLBACK,
+    LAWS,
+    ON_DOF,
+    ParameterPattern,
+    Placed,
+    expand,
+    optional,
+    place,
+    tilted,
+)
 from sim2real.robots.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
@@ -179,6 +189,7 @@ class MjcfRobot(LoggedRobot):
         rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
         self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts, rubbing)
         self.placed = tuple(expand(config.terms, config.joints, self.model, own))
+        self._limits = [limit_of(own, joint) for joint in config.joints]
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -225,7 +236,7 @@ class MjcfRobot(LoggedRobot):
         n, driving = len(self.config.joints), set(self.config.commands)
         zero, one = jnp.zeros(n), jnp.ones(n)
         return params.replace(
-            kp=20.0 * one if "goal" in driving else zero,
+            kp=FALLBACK["kp"] * one if "goal" in driving else zero,
             kd=zero,
             gain=one,
             released=zero,
@@ -258,7 +269,10 @@ class MjcfRobot(LoggedRobot):
             value = float(values[p.parameter.name])
             for i in p.at:
                 if p.what == "payload":
-                    model.body_mass[i] += value
+                    name = self.model.body(
+                        i
+                    ).name  # by name: a body that hangs on a held joint may be fused in one of both
+                    model.body_mass[model.body(name).id if name else i] += value
                 elif p.what == "speed":
                     model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
                 elif p.what in ON_DOF:
@@ -271,11 +285,8 @@ class MjcfRobot(LoggedRobot):
         told: Any = next(
             (t for n, t in (("goal", "position"), ("goal_velocity", "velocity")) if n in self.config.commands), "torque"
         )
-        own = read_model(self.config.model)
-        found: list[dict[str, Any]] = [
-            {"stiffness": 20.0, "damping": 0.0, "gain": 1.0, "most": limit_of(own, joint)}
-            for joint in self.config.joints
-        ]
+        usual: dict[str, Any] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
+        found = [{**usual, "most": most} for most in self._limits]
         names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
         for p in self.placed:
             for i in p.at if p.what in names else ():
