@@ -43,7 +43,7 @@ class FitConfig:
     long_s: float = 0.0
     """Length of the segments of a last refinement [s]; 0 leaves it out."""
     engine: Literal["auto", "c", "compiled"] = "auto"
-    """What simulates: C MuJoCo, or the compiled graph; 'auto' takes C on a CPU where the world is one of MuJoCo's."""
+    """What simulates: C MuJoCo, or the compiled graph; 'auto' takes C where the world is one of MuJoCo's."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
     """Derivatives: forward mode or finite differences; 'auto' takes the latter where a node has no derivative."""
     difference: float = 3e-3

@@ -42,6 +42,10 @@ class Choice:
 def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any], jacobian: str = "auto") -> Choice:
     """Choose an engine, and take the physics out of the world where it is C.
 
+    C is taken beside an accelerator, too: a dog's 15 s with 12 joints took 8.5 s a generation of 512 candidates on MJX and
+    an H200, and 3.5 s on the 16 processors beside it; refined, more than 58 s and 13 s. MJX's solver steps on until the
+    slowest of all copies is done.
+
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.
         nodes: The nodes.
@@ -53,10 +57,7 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
     """
     if wanted == "compiled":
         return Choice("compiled", "asked for")
-    backend = jax.default_backend()
     try:
-        if wanted == "auto" and backend != "cpu":
-            raise UsageError(f"there is an accelerator ({backend})")
         if jacobian == "forward":
             raise UsageError("derivatives are taken in forward mode, which C MuJoCo does not have")
         world = _world(nodes, given)
@@ -66,7 +67,7 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
             hint = error.hint or "take --engine compiled, or auto"
             raise UsageError(f"engine c: {error.args[0]}", hint=hint) from None
         return Choice("compiled", error.args[0])
-    return Choice("c", "asked for" if wanted == "c" else "the world is MuJoCo's, and there is no accelerator", model)
+    return Choice("c", "asked for" if wanted == "c" else "the world is MuJoCo's", model)
 
 
 def check_devices(count: int, engine: Choice) -> None:

@@ -1,5 +1,6 @@
 """The physics is taken out of a world only where nothing that is set depends on it."""
 
+import jax
 import pytest
 from small_robot import PairRobot, PairTask
 
@@ -99,7 +100,9 @@ def test_a_world_that_is_not_of_mujoco_takes_the_compiled_engine(motor):
         choose("c", *motor)
 
 
-def test_auto_takes_c_where_it_can(pair):
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_auto_takes_c_where_it_can_beside_an_accelerator_too(pair, backend, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     model = pair.identifiable(0.03)
     for wanted, jacobian, name in (
         ("auto", "auto", "c"),
