@@ -23,6 +23,9 @@ collect_ignore = ["plugin"]  # a package of its own, whose tests run once it is 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Threads of several workers wait for each other in every product of matrices: 0.4 s of them took 14 s.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Compiling takes most of the suite's time: without XLA's own effort an identification with a tiny budget takes 18 s of
 # processor time instead of 27. Last bits differ then, on which no test may hang anyway. Two workers share two cores:
 # one program does not take both.

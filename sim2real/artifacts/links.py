@@ -32,6 +32,8 @@ class Link:
         drift: How much faster the clock of the stamps runs than that of the commands [s/s].
         delays: Shape ``(K,)``: delays, of all parts together [s].
         share: Shape ``(K,)``: share of the messages that have each of them.
+        jitter: The standard deviation of the commands' delay [s]; as of its mean, a log of motion tells only that of
+            all links between command and motion together.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Link:
     drift: Ranged
     delays: np.ndarray
     share: np.ndarray
+    jitter: Ranged = Ranged(None, None, None)
 
     @property
     def told_apart(self) -> bool:
@@ -60,6 +63,7 @@ class Link:
             (f"{whole}, mean", self.mean, 1e3, "ms"),
             (f"{whole}, 95 % of the messages", self.p95, 1e3, "ms"),
             (f"{own}, deviation", self.deviation, 1e3, "ms"),
+            (f"{' + '.join(self.parts[1:]) or 'commands'}, deviation", self.jitter, 1e3, "ms"),
             (f"{own}, lost", self.lost, 100.0, "%"),
             (f"{own}, lost in a row", self.burst, 1.0, ""),
             (f"{own}, drift of the clock", self.drift, 1e6, "us/s"),

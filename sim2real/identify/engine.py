@@ -42,9 +42,9 @@ class Choice:
 def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any], jacobian: str = "auto") -> Choice:
     """Choose an engine, and take the physics out of the world where it is C.
 
-    C is taken beside an accelerator, too: a dog's 15 s with 12 joints took 8.5 s a generation of 512 candidates on MJX and
-    an H200, and 3.5 s on the 16 processors beside it; refined, more than 58 s and 13 s. MJX's solver steps on until the
-    slowest of all copies is done.
+    C is taken beside an accelerator, too: a dog's 15 s with 12 joints took 8.4 s a generation of 512 candidates on MJX
+    and an H200, and 3.5 s on the 16 processors beside it; refined, more than 58 s and 13 s. MJX's solver steps on until
+    the slowest of all copies is done.
 
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.

@@ -2,8 +2,8 @@
 
 What is hidden: how long each measurement was under way, and so the motion that it shows. It is summed out, with the
 shares of all delays as unknowns beside the dynamics, the initial states and the noise (``hidden``). The commands' own
-delay moves the motion as a whole. Its mean adds to that of the measurements, and only the sum is known; its jitter is
-no part of the model: it makes the motion differ from the prediction, which widens the intervals.
+delay moves the motion as a whole. Its mean adds to that of the measurements, and only the sum is known; its deviation
+is found afterwards, from what late commands do to the motion (``jitter``).
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import numpy as np
 
 from sim2real.artifacts.links import Link, Ranged
 from sim2real.errors import UsageError
+from sim2real.identify import jitter
 from sim2real.identify.hidden import Hidden, Linearise, hidden
 from sim2real.identify.likelihood import Likelihood, Seen
 from sim2real.identify.losses import Losses, losses
+from sim2real.identify.motion import Watched, motion
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Data
@@ -81,13 +83,23 @@ def links(problem: Problem, z: np.ndarray, data: Data | None = None) -> tuple[Li
     Raises:
         UsageError: When no delay of the measurements is identified.
     """
-    from sim2real.identify.motion import motion
-
     late = measured(problem.table)
     seen = motion(problem, z, late, data)
     found = find(seen.linearise, seen.x, seen.delay_s, seen.again, seen.quantum)
     held, parts = _commands(problem.table, z)
-    return (describe(late, (late, *parts), found, held),)
+    link = describe(late, (late, *parts), found, held)
+    return (replace(link, jitter=_jitter(problem, z, seen, found)) if data is None else link,)
+
+
+def _jitter(problem: Problem, z: np.ndarray, watched: Watched, found: Found) -> Ranged:
+    """Return the deviation of the commands' delays."""
+    counts = watched.counts.copy()
+    counts[watched.counts] = ~watched.again
+    own, delay_s = found.hidden, found.hidden.mean[0]
+    late = jitter.late_commands(problem, z, watched.pick, counts)
+    seen = watched.linearise(own.x, delay_s).rows(~watched.again)
+    delays = delay_s + own.drift * seen.stamps
+    return jitter.deviation(seen, delays, own.deviation[0], own.noise, late)
 
 
 def measured(table: ParameterTable) -> str:

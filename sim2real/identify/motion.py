@@ -32,6 +32,8 @@ class Watched:
         delay_s: The measurements' delay at the estimate [s].
         again: Shape ``(N,)``, bool: whether a measurement has the values of the one before.
         quantum: Shape ``(F,)``: resolution of the measurements, in deviations.
+        pick: Shape ``(E,)``: the segments that are looked at.
+        counts: Shape ``(E, C)``, bool: which of their measurements are the ``N`` that count.
     """
 
     linearise: Linearise
@@ -39,6 +41,8 @@ class Watched:
     delay_s: float
     again: np.ndarray
     quantum: np.ndarray
+    pick: np.ndarray
+    counts: np.ndarray
 
 
 def motion(problem: Problem, z: np.ndarray, late: str, data: Data | None = None) -> Watched:
@@ -77,7 +81,7 @@ def motion(problem: Problem, z: np.ndarray, late: str, data: Data | None = None)
         return Seen(stamps[counts], delays, np.moveaxis(errors, 0, -1)[counts], jacobian[counts], prior)
 
     again, quantum = _again(problem, data, pick)
-    return Watched(linearise, x, delay_s, again[counts], quantum)
+    return Watched(linearise, x, delay_s, again[counts], quantum, pick, counts)
 
 
 def _programs(

@@ -24,7 +24,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.programs import program
 from sim2real.identify.robust import tamed
-from sim2real.identify.segments import Data, Span, cut
+from sim2real.identify.segments import Data, Retimed, Span, cut
 from sim2real.runtime.bursts import make_room
 from sim2real.runtime.compiled import CompiledGraph
 
@@ -39,6 +39,7 @@ class Problem:
         length_s: Their length [s].
         config: How residuals are made.
         table: The parameters; default: the model's.
+        moved: Changes the recorded timing of the segments before it is simulated.
 
     Raises:
         Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
@@ -53,8 +54,9 @@ class Problem:
         length_s: float,
         config: FitConfig = FitConfig(),  # noqa: B008 - frozen
         table: ParameterTable | None = None,
+        moved: Retimed = lambda recorded: recorded,
     ) -> None:
-        self.model, self.config, self._recordings = model, config, recordings
+        self.model, self.config, self.recordings = model, config, recordings
         self.table = (table or model.parameters).for_recordings(len(recordings))
         self.channels = model.channels
         nodes = model.nodes(config.max_delay_s)
@@ -62,7 +64,7 @@ class Problem:
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s = cuts.spans, length_s
-        timeline = draw(nodes, length_s + model.ahead_s, recorded=cuts.timeline)
+        timeline = draw(nodes, length_s + model.ahead_s, recorded=moved(cuts.timeline))
         make_room(nodes, timeline)  # after a hiccup commands leave in a burst
         self.graph = CompiledGraph(nodes, model.sensor, timeline, cuts.given)
         check_devices(config.devices, self.engine)
@@ -361,11 +363,16 @@ class Problem:
         kept = np.ones(len(self.table), bool) if kept is None else np.asarray(kept)
         return self.data._replace(weight=jnp.asarray(weight), kept=jnp.asarray(kept))
 
-    def cut_anew(self, spans: Sequence[Span], length_s: float) -> Problem:
-        """Return the same recordings, cut into other segments [s]."""
-        # Whether there are derivatives is known: to find out takes a second.
-        config = replace(self.config, jacobian="forward" if self.forward else "finite")
-        return Problem(self.model, self._recordings, spans, length_s, config, self.table)
+    def cut_anew(self, spans: Sequence[Span], length_s: float, moved: Retimed = lambda recorded: recorded) -> Problem:
+        """Return the same recordings, cut anew.
+
+        Args:
+            spans: The segments.
+            length_s: Their length [s].
+            moved: Changes their recorded timing.
+        """
+        config = replace(self.config, jacobian="forward" if self.forward else "finite")  # to find out takes a second
+        return Problem(self.model, self.recordings, spans, length_s, config, self.table, moved)
 
     def start(self, eps: Any, delay_s: Any, data: Data) -> Any:
         """Return the initial state ``(2 * channels,)`` as measured around the start.

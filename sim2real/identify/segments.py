@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +16,9 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import IdentifiableModel
+
+Retimed = Callable[[Timeline], Timeline]
+"""From segments' recorded timing to another."""
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ def columns(start, stamp, end):
     return Steps(scheduled=start, start=start, woken=start, ts_overwrite=stamp, end=end, drift=none)
 
 
-def synthetic_log(rng):
+def synthetic_log(rng, late_s=0.0):
     """Simulate the embedded robot's plant: commands held from an actuator's end plus its delay, samples read late.
 
-    Sensor and actuator run at times of their own, off any grid.
+    The actuator's delay deviates by ``late_s``. Sensor and actuator run at times of their own, off any grid.
     """
     plant = load_pipeline("pendulum").load("plant").PendulumPlant()
     count, step_s = round(DURATION_S * RATE_HZ), plant.model.opt.timestep
@@ -39,7 +39,8 @@ def synthetic_log(rng):
     actuator = slots + 2300 + rng.integers(0, 1500, count)
     done = actuator + 700 + rng.integers(0, 300, count)
     voltage = excitation(RecordConfig(duration_s=DURATION_S, amplitude=2.0, low_hz=0.7, high_hz=2.0, seed=3), RATE_HZ)
-    effect = np.round((done * 1e-6 + ACTUATOR_DELAY_S) / step_s).astype(int)
+    delays = ACTUATOR_DELAY_S + (rng.normal(0.0, late_s, count) if late_s else 0.0)
+    effect = np.maximum.accumulate(np.round((done * 1e-6 + delays) / step_s).astype(int))
     steps = round((DURATION_S + 0.1) / step_s)
     states = np.empty((steps, 2))
     plant.command(1, 16, 0.0)
@@ -85,3 +86,9 @@ def fitted():
         loss=jax.jit(lambda z: problem.losses(z[None], z, None)[0]),
         make_problem=make_problem,
     )
+
+
+@pytest.fixture
+def late_problem():
+    """A log of the same pendulum, whose actuator's delay deviates by 4 ms."""
+    return make_problem(synthetic_log(np.random.default_rng(1), 0.004)[0])

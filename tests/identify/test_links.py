@@ -147,6 +147,8 @@ def test_a_problem_knows_its_links(fitted):
     assert link.parts == ("sensor_delay", "actuator_delay")
     assert link.mean.value == pytest.approx(delay_s, abs=0.5e-3)
     assert link.deviation.value < 0.5e-3
+    assert link.jitter.low95 == 0.0
+    assert link.jitter.high95 < 1.5e-3
     assert abs(link.drift.value) < 1e-4
 
 
