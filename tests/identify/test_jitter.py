@@ -7,7 +7,9 @@ import pytest
 from scipy.optimize import check_grad
 from test_links import COMMAND_DELAY_S, COUNT_RAD, GAIN, GRID, NOISE_RAD, PERIOD_S, RATE, STEP_S, turned
 
-from sim2real.identify.jitter import LateCommands, Variances, deviation
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Vertex
+from sim2real.identify.jitter import LateCommands, Variances, deviation, one_later
 from sim2real.identify.likelihood import Seen
 from sim2real.identify.links import find, links
 
@@ -135,3 +137,22 @@ def test_a_problem_knows_the_jitter_of_its_commands(fitted, late_problem):
     assert link.jitter.low95 <= 0.004 <= link.jitter.high95
     assert link.jitter.low95 > 0.001
     assert ("actuator_delay, deviation", link.jitter, 1e3, "ms") in link.rows()
+
+
+def test_a_command_is_moved_no_further_than_to_the_next():
+    start = np.array([[0, 20_000, 20_500, 40_000]] * 5)  # [us]; the second and third in a burst
+    vertex = Vertex(start, start + 450, np.full(5, 4))
+    later_s = np.zeros(5)
+    moved = one_later(Timeline({"actuator": vertex}, {}), ("actuator",), 4, later_s).vertices["actuator"]
+    assert later_s == pytest.approx([0.002, 0.0, 0.002, 0.002, 0.0])
+    assert (moved.start - start == 2000 * np.eye(5, 4) * (later_s > 0)[:, None]).all()
+    assert (moved.end[:, :-1] <= moved.start[:, 1:]).all()
+
+
+def test_where_commands_tell_nothing_their_deviation_is_not_known():
+    record = log(3.0, 0, 1e-3)
+    linearise, moved, _, unknowns = watch(record)
+    x = np.zeros(unknowns)
+    seen, late = linearise(x, 0.006), moved(x, 0.006)
+    weak = [LateCommands(own.rows, 1e-6 * own.slopes, own.sizes) for own in late]
+    assert deviation(seen, np.full(len(seen.stamps), 0.006), 1e-3, np.ones(1), weak).value is None
