@@ -77,7 +77,9 @@ BENCHES = {
         ("sim2real/hardware", "sim2real/runtime", "sim2real/robots", "sim2real/stages", "sim2real/policy"),
     ),
     "graph": Bench(
-        "graph", "the compiled graph against a robot written by hand", (*_GRAPH, "scripts/benches/graph_mjx.py")
+        "graph",
+        "the compiled graph against a robot written by hand",
+        (*_GRAPH, "scripts/benches/graph_mjx.py", "scripts/benches/graph_shared.py"),
     ),
     "identify": Bench(
         "identify",

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benches.figures import compare, row
+from benches.graph_shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
@@ -25,11 +26,8 @@ from sim2real.graph.timeline import Timeline
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.runtime.wiring import wire
-from sim2real.stages.pipeline import load_pipeline
 
-MODEL = load_pipeline("pendulum").load("model")
 DURATION_S = 4.0
-EPISODES = 32
 CASES = {
     "plain": ((50.0, 50.0, 0.01), (1,)),
     "hiccups": ((50.0, 50.0, 0.01), (1,)),
@@ -193,11 +191,6 @@ def bare_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any
         return jax.lax.scan(row, (x, jnp.float32(0.0)), length=rows)[0][1]
 
     return run
-
-
-def unroll_of(ticks: int) -> int:
-    """Return how many ticks a pass of a yardstick's loop holds: as many as the graph's, of two rows on a GPU."""
-    return ticks if jax.default_backend() == "cpu" else 2 * ticks
 
 
 def tick(world: Any, p: Any, x: Any, cost: Any, u: Any) -> tuple[Any, Any]:
