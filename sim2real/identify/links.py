@@ -21,7 +21,6 @@ from sim2real.identify.losses import Losses, losses
 from sim2real.identify.motion import Watched, motion
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Data
 
 _AT_REST, _MOVES = 0.02, 2.0
 """Where the value before is as probable as this, or the joint moves less than this many counts and deviations of the
@@ -72,23 +71,21 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray,
     return Found(found, losses(again, chance))
 
 
-def links(problem: Problem, z: np.ndarray, data: Data | None = None) -> tuple[Link, ...]:
+def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
     """Return the links of a problem.
 
     Args:
         problem: The residuals.
         z: Shape ``(P,)``: the estimate of a fit, from which dynamics and delays are found anew together.
-        data: What was measured; default: the logs.
 
     Raises:
         UsageError: When no delay of the measurements is identified.
     """
     late = measured(problem.table)
-    seen = motion(problem, z, late, data)
+    seen = motion(problem, z, late)
     found = find(seen.linearise, seen.x, seen.delay_s, seen.again, seen.quantum)
     held, parts = _commands(problem.table, z)
-    link = describe(late, (late, *parts), found, held)
-    return (replace(link, jitter=_jitter(problem, z, seen, found)) if data is None else link,)
+    return (replace(describe(late, (late, *parts), found, held), jitter=_jitter(problem, z, seen, found)),)
 
 
 def _jitter(problem: Problem, z: np.ndarray, watched: Watched, found: Found) -> Ranged:

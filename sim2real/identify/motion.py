@@ -45,16 +45,15 @@ class Watched:
     counts: np.ndarray
 
 
-def motion(problem: Problem, z: np.ndarray, late: str, data: Data | None = None) -> Watched:
+def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
     """Return the motion of a problem.
 
     Args:
         problem: The residuals.
         z: Shape ``(P,)``: the estimate.
         late: Name of the measurements' delay.
-        data: What was measured; default: the logs.
     """
-    data, table = data or problem.data, problem.table
+    data, table = problem.data, problem.table
     pick = _apart(problem)
     own = np.array([i for i, c in enumerate(table.columns) if c.parameter.kind != "delay"], int)
     delays = np.linspace(0.0, table[late].high, max(2, round(table[late].high / _STEP_S) + 1))

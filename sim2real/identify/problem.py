@@ -56,7 +56,7 @@ class Problem:
         table: ParameterTable | None = None,
         moved: Retimed = lambda recorded: recorded,
     ) -> None:
-        self.model, self.config, self.recordings = model, config, recordings
+        self.model, self.config, self._recordings = model, config, recordings
         self.table = (table or model.parameters).for_recordings(len(recordings))
         self.channels = model.channels
         nodes = model.nodes(config.max_delay_s)
@@ -372,7 +372,7 @@ class Problem:
             moved: Changes their recorded timing.
         """
         config = replace(self.config, jacobian="forward" if self.forward else "finite")  # to find out takes a second
-        return Problem(self.model, self.recordings, spans, length_s, config, self.table, moved)
+        return Problem(self.model, self._recordings, spans, length_s, config, self.table, moved)
 
     def start(self, eps: Any, delay_s: Any, data: Data) -> Any:
         """Return the initial state ``(2 * channels,)`` as measured around the start.

@@ -269,9 +269,8 @@ class MjcfRobot(LoggedRobot):
             value = float(values[p.parameter.name])
             for i in p.at:
                 if p.what == "payload":
-                    name = self.model.body(
-                        i
-                    ).name  # by name: a body that hangs on a held joint may be fused in one of both
+                    # By name: a body that hangs on a held joint may be fused in one of both models.
+                    name = self.model.body(i).name
                     model.body_mass[model.body(name).id if name else i] += value
                 elif p.what == "speed":
                     model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value

@@ -127,7 +127,8 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 
 def test_without_commands_that_act_nothing_is_known():
-    seen = watch(log(3.0, 0))[0](np.zeros(6), 0.006)
+    linearise, _, _, unknowns = watch(log(3.0, 0))
+    seen = linearise(np.zeros(unknowns), 0.006)
     none = LateCommands(np.arange(3), np.zeros((3, 1, 0)), np.zeros(0))
     assert deviation(seen, np.full(len(seen.stamps), 0.006), 1e-3, np.ones(1), [none]).value is None
 

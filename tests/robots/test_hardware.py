@@ -121,12 +121,14 @@ def test_the_sensor_shows_where_the_joints_are_and_when_it_asked(episodes):
     assert (steps.ts_overwrite <= steps.end).all()
     t_ns, states = truth.states()
     t_s = (t_ns - episodes.summaries[0]["monotonic_ns"]) / 1e9
-    measured_s = steps.ts_overwrite / 1e6 - 0.006
+    # A reading is 6 ms old, give or take one, between being asked for and the end of its step: however busy the machine
+    # is, it lies where the joint was then, within a count.
+    begin_s, end_s = steps.ts_overwrite / 1e6 - 0.007, steps.end / 1e6 - 0.005
     for i in range(3):
-        true = np.interp(measured_s, t_s, states[f"position[{i}]"])
-        off = np.abs(log.outputs["sensor"]["position"][:, i] - true)
-        # A millisecond of jitter at a few rad/s, and half a count; a busy machine may hold up a few readings.
-        assert np.sort(off)[:-3].max() < 0.02
+        true = np.stack([np.interp(t, t_s, states[f"position[{i}]"]) for t in np.linspace(begin_s, end_s, 50)])
+        measured = log.outputs["sensor"]["position"][:, i]
+        assert (measured >= true.min(axis=0) - 0.002).all()
+        assert (measured <= true.max(axis=0) + 0.002).all()
     assert np.ptp(log.outputs["sensor"]["position"], axis=0).min() > 0.2
 
 
