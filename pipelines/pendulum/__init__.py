@@ -3,7 +3,7 @@
 from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig
 from sim2real.stages.pipeline import Pipeline
 
-GATE = GateLimits(freeze_rad_s=0.7)
+GATE = GateLimits(freeze_rad_s=0.5)
 """It swings freely: nothing but a frozen encoder stops it dead; friction alone brakes it by 0.2 rad/s a sample."""
 
 PIPELINE = Pipeline(

@@ -28,7 +28,7 @@ class GateLimits:
     """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
     stuck_effort: float = 0.2
     """A joint driven both ways with more than this fraction of its torque must move, or the robot is stopped [1]."""
-    freeze_rad_s: float = 3.0
+    freeze_rad_s: float = 2.0
     """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
     """Joint angles outside of which the robot is stopped, lowest and highest; default: not checked [rad]."""

@@ -47,7 +47,7 @@ class GateConfig:
     joints: tuple[str, ...] = ()
     stuck_effort: float | Sequence[float] = 0.2
     stuck_s: float = 0.2
-    freeze_rad_s: float = 3.0
+    freeze_rad_s: float = 2.0
     freeze_s: float = 0.05
     envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
     max_sample_age_s: float = 0.25

