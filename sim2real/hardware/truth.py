@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import queue
 import struct
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -65,7 +67,7 @@ def _dtype(values: int) -> np.dtype:
 
 
 class TruthLog:
-    """Appends rows to a truth file.
+    """Appends rows to a truth file, from a thread of its own: a disk that is busy must not hold up a servo's answers.
 
     Args:
         path: The file; an existing one is replaced.
@@ -78,10 +80,12 @@ class TruthLog:
         self._padding = (0.0,) * self._values
         self._rows: list[bytes] = []
         self._flushed_ns = 0
-        self._full = False
         self._file = path.open("wb")
         self._file.write(json.dumps({**header, "values": self._values}).encode() + b"\n")
         self._file.flush()
+        self._batches: queue.SimpleQueue[list[bytes] | None] = queue.SimpleQueue()
+        self._writer = threading.Thread(target=self._write_batches, name="sim2real:truth", daemon=True)
+        self._writer.start()
 
     def write(
         self,
@@ -108,29 +112,31 @@ class TruthLog:
         self._rows.append(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Pass the buffered rows to the operating system if the last time was at least 0.25 s ago."""
+        """Pass the buffered rows on, to the operating system in the end, if the last time was at least 0.25 s ago."""
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._flushed_ns = now_ns
             self._flush()
 
     def close(self) -> None:
         """Write the remaining rows and close the file; may be called twice."""
-        if not self._file.closed:
+        if self._writer.is_alive():
             self._flush()
-            with contextlib.suppress(OSError):
-                self._file.close()
+            self._batches.put(None)
+            self._writer.join()
 
     def _flush(self) -> None:
-        """Write the buffered rows; if that fails, the log ends there, and the emulated robot goes on."""
-        if self._full:
-            self._rows.clear()
-            return
-        try:
-            self._file.write(b"".join(self._rows))
-            self._file.flush()
-        except OSError:
-            self._full = True
-        self._rows.clear()
+        if self._writer.is_alive():
+            self._batches.put(self._rows)
+        self._rows = []
+
+    def _write_batches(self) -> None:
+        """Write what comes; if that fails, the log ends there, and the emulated robot goes on."""
+        with contextlib.suppress(OSError):
+            while (rows := self._batches.get()) is not None:
+                self._file.write(b"".join(rows))
+                self._file.flush()
+        with contextlib.suppress(OSError):
+            self._file.close()
 
 
 @dataclass(frozen=True)

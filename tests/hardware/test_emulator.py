@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -315,14 +316,38 @@ def test_plants_that_cannot_be_found(spec, message):
 def test_an_account_that_cannot_be_written_does_not_stop_the_robot(tmp_path):
     log = TruthLog(tmp_path / "truth.bin", {"state_names": ["q"]})
     log.write(Kind.STATE, 0, 0, 1, 0, 0, (1.0,))
+    path, empty = tmp_path / "truth.bin", (tmp_path / "truth.bin").stat().st_size
     log.flush_if_due(10**9)
+    while path.stat().st_size == empty:
+        time.sleep(0.001)
     log._file.close()
     log._file = open("/dev/full", "wb")  # noqa: SIM115 - the log closes it
     for second in range(2, 5):
         log.write(Kind.STATE, 0, 0, second, 0, 0, (1.0,))
         log.flush_if_due(second * 10**9)
     log.close()
-    assert read_truth(tmp_path / "truth.bin").rows["t_ns"].tolist() == [1]
+    assert read_truth(path).rows["t_ns"].tolist() == [1]
+
+
+def test_a_disk_that_is_busy_holds_up_nobody(tmp_path):
+    log = TruthLog(tmp_path / "truth.bin", {"state_names": ["q"]})
+    written, disk = threading.Event(), log._file
+
+    class Slow:
+        def write(self, data):
+            assert written.wait(20.0)
+            return disk.write(data)
+
+        def __getattr__(self, name):
+            return getattr(disk, name)
+
+    log._file = Slow()
+    for second in range(1, 4):
+        log.write(Kind.STATE, 0, 0, second, 0, 0, (1.0,))
+        log.flush_if_due(second * 10**9)  # returns, though nothing has been written
+    written.set()
+    log.close()
+    assert read_truth(tmp_path / "truth.bin").rows["t_ns"].tolist() == [1, 2, 3]
 
 
 def test_the_embedded_robot_imports_nothing_from_the_working_directory(tmp_path, monkeypatch):
