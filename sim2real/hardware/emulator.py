@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
-_REAL_TIME_PRIORITY: Final = 1
+_REAL_TIME_PRIORITY: Final = 2  # a servo does not wait for the computer that commands it, whose threads have 1
 _TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
 
 

@@ -17,6 +17,7 @@ READY, BEAT, REST, LEAVE = b"r", b"+", b"-", b"q"
 TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
 GIVE_UP_S = 10.0
 _QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
+_PRIORITY = 3  # above the threads that it watches, which have 1: should one never rest, this must not wait for it
 
 
 class Guard:
@@ -143,7 +144,7 @@ def main(arguments: list[str]) -> None:
         signal.signal(number, signal.SIG_IGN)
     try:  # noqa: SIM105 - as above
         # Real-time priority, if allowed: on a busy machine this process, which is almost always idle, must not wait.
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except (AttributeError, OSError):
         pass
     port_fd, link, silence_s, answer_s, off, *rest = arguments

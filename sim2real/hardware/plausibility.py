@@ -48,6 +48,7 @@ class Plausibility:
 
     def __init__(self, config: GateConfig) -> None:
         self._config = config
+        self._enough_s = config.stuck_s * np.array([[1.0], [1.0], [1.0], [_HARD], [_HARD]])
         self.reset()
 
     def reset(self) -> None:
@@ -94,6 +95,9 @@ class Plausibility:
         # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
         # differs from that at the start of the standstill, pushed hard up, pushed hard down.
         self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+        fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
+        self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
+        self._stuck = np.broadcast_to(np.asarray(self._config.stuck_effort, np.float64), n)
 
     def _require_inside(self, position_rad: np.ndarray) -> None:
         if self._config.envelope_rad is None:
@@ -109,13 +113,11 @@ class Plausibility:
             )
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
-        if self._config.max_speed_rad_s is None:
-            return
-        limit = np.broadcast_to(np.asarray(self._config.max_speed_rad_s, np.float64), position_rad.shape)
+        limit = self._fastest
         most = limit * (elapsed_s + _STAMP_S) + _PLAY_RAD
         leap = np.abs(position_rad - self._position)
-        worst = int(np.argmax(leap - most))
-        if leap[worst] > most[worst]:
+        if (leap > most).any():
+            worst = int(np.argmax(leap - most))
             raise SafetyStop(
                 f"{self._config.joint(worst)} reads {position_rad[worst]:.6g} rad, {leap[worst]:.6g} rad from the last "
                 f"reading: at its fastest, {limit[worst]:.4g} rad/s, it can have moved by {most[worst]:.3g} rad",
@@ -123,7 +125,10 @@ class Plausibility:
             )
 
     def _require_no_freeze(self, t_s: float, effort: np.ndarray) -> None:
-        fast, still = self._speed > self._config.freeze_rad_s, t_s - self._since_s >= self._config.freeze_s
+        fast = self._speed > self._config.freeze_rad_s
+        if not fast.any():
+            return
+        still = t_s - self._since_s >= self._config.freeze_s
         for i in np.flatnonzero(fast & still & (effort != 0.0)):
             raise SafetyStop(
                 f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s or more just before",
@@ -131,16 +136,16 @@ class Plausibility:
             )
 
     def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
-        config = self._config
-        limit = np.broadcast_to(np.asarray(config.stuck_effort, np.float64), effort.shape)
-        more = 2.0 * limit
+        limit, more = self._stuck, 2.0 * self._stuck
         other = np.abs(effort - self._start) >= more
         pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
-        self._held_s = np.where(pushed, self._held_s + elapsed_s, 0.0)
+        self._held_s = (self._held_s + elapsed_s) * pushed
         before = self._longest_s
         self._longest_s = np.maximum(before, self._held_s)
-        enough_s = config.stuck_s * np.array([[1.0], [1.0], [1.0], [_HARD], [_HARD]])
-        was_long, long = before >= enough_s, self._longest_s >= enough_s
+        long = self._longest_s >= self._enough_s
+        if not long.any():
+            return
+        was_long = before >= self._enough_s
         for i in np.flatnonzero(long[0] & long[1]):
             raise SafetyStop(
                 f"{self._standing(int(i))}, though it was pushed both ways with more than {limit[i]:.0%} of its torque",

@@ -16,6 +16,7 @@ from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.gate import GateConfig, SafetyGate
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.plausibility import Plausibility
+from sim2real.runtime.clock import keep_time
 
 _CHECK_PERIOD_S: Final = 0.5
 _STILL_RAD_S: Final = 0.05
@@ -286,6 +287,7 @@ class Rig:
 
     def _watch(self, done: threading.Event) -> None:
         """Send what is safe while no command has come yet, and when the last one is too old: its loop may hang."""
+        keep_time()
         timeout_s = self.gate.config.command_timeout_s
         period_s = min(timeout_s, self.device.silence_s or timeout_s) / 5
         while not done.is_set():

@@ -10,3 +10,4 @@ from sim2real.policy.contract import ObservationTerm as ObservationTerm
 from sim2real.policy.contract import PolicyContract as PolicyContract
 from sim2real.policy.network import NetworkSpec as NetworkSpec
 from sim2real.policy.runner import PolicyRunner as PolicyRunner
+from sim2real.policy.upright import UprightRunner as UprightRunner

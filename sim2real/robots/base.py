@@ -191,6 +191,15 @@ class Robot(RecordedRobot):
         """Return an excitation ``(N, actions)`` as this robot plays it; default: around 0, as it is."""
         return signal
 
+    def tilt_rad(self, observation: np.ndarray) -> float:
+        """Return how far the robot leans, for ``deploy --max-tilt-rad`` [rad]; NaN, the default: it does not see that.
+
+        Args:
+            observation: Shape ``(O,)``: what the policy sees.
+        """
+        del observation
+        return math.nan
+
     @abstractmethod
     def deployment_nodes(self, session: Any, policy: Any, trial: int = 0) -> tuple[dict[str, BaseNode], dict[str, Any]]:
         """Return the graph on hardware that runs a policy, and parameters of its nodes.

@@ -13,7 +13,7 @@ from sim2real.graph.episode import Recorder, StepRecord
 from sim2real.graph.node import phase_ticks
 from sim2real.graph.rules import next_drift, slot, start, waits_for_schedule
 from sim2real.runtime.channel import MessageChannel, Table
-from sim2real.runtime.clock import MonotonicClock
+from sim2real.runtime.clock import MonotonicClock, keep_time
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import Stopped, named
 from sim2real.runtime.handover import Handover, Reply
@@ -145,6 +145,7 @@ class NodeThread(threading.Thread):
             self.since_s = None
             self.ready.set()
             self.shared.go.wait()
+            keep_time()  # not before: a startup may compute for long
             self._loop()
         except Stopped:
             pass
@@ -173,8 +174,8 @@ class NodeThread(threading.Thread):
             self.during = f"step {k}"
             scheduled = slots[k]
             blocked = max((channel.wait_group(k) for channel in self.inputs.values()), default=0)
-            begin = int(start(scheduled, drift, end, blocked, waits))
-            later = int(next_drift(node.scheduling, scheduled, drift, end))
+            begin = start(scheduled, drift, end, blocked, waits)
+            later = next_drift(node.scheduling, scheduled, drift, end)
             overrun = end > max(scheduled + drift, blocked)
             if not clock.sleep_past(begin, shared.stopping, shared.spin):
                 return

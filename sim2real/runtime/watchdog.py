@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Mapping
 
 from sim2real.graph.node import BaseNode
+from sim2real.runtime.clock import keep_time
 from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.nodethread import NodeThread, Shared
 
@@ -45,6 +46,7 @@ class Watchdog(threading.Thread):
 
     def run(self) -> None:
         """Check the threads; sleep between checks until the earliest time at which one could exceed its limit."""
+        keep_time()
         shared, stopped_s = self._shared, 0.0
         while not self._quit.is_set():
             now = time.monotonic()

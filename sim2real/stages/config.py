@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -168,12 +169,16 @@ class DeployConfig:
     """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
+    max_tilt_rad: float | None = None
+    """How far the robot may lean before it is stopped, of one that sees its tilt; default: not checked [rad]."""
     gate: GateLimits = field(default_factory=GateLimits)
     """Limits on every command."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
         check_seed(self.seed)
+        if self.max_tilt_rad is not None and not 0.0 < self.max_tilt_rad <= math.pi:
+            raise UsageError(f"max_tilt_rad must lie in (0, pi] rad, got {self.max_tilt_rad}")
         if not (0.0 <= self.blend_s <= 60.0 and 0.0 < self.delay_tolerance_s <= 1.0):
             raise UsageError(
                 "blend_s must lie in [0, 60] s and delay_tolerance_s in (0, 1] s, "

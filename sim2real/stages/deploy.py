@@ -15,6 +15,7 @@ from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, finished, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.policy.blended import BlendedRunner
+from sim2real.policy.upright import UprightRunner
 from sim2real.robots.base import Robot, Session
 from sim2real.robots.probe import Witness
 from sim2real.stages.admission import check_delay, require_fit, require_untouched
@@ -54,7 +55,8 @@ def deploy(
     config = config or pipeline.deploy
     robot = moving_robot(pipeline)
     require_fit(robot, bundle)
-    policy = BlendedRunner(bundle.runner(config.backend), config.blend_s)
+    _require_tilt(robot, config)
+    policy = _careful(bundle, robot, config)
     if identification is not None:
         check_parameters(identification, pipeline)
     logs = [log_of(folder, i) for i in range(config.episodes)]
@@ -94,6 +96,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     path, run_dir = _find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
     require_fit(robot, bundle)  # one of another robot is refused before a folder is made
+    _require_tilt(robot, config)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
         for i in range(config.episodes):
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
@@ -129,6 +132,17 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
+def _careful(bundle: Bundle, robot: Robot, config: DeployConfig) -> BlendedRunner | UprightRunner:
+    """Return what runs the policy: let in slowly, and stopped by a robot that leans too far, as far as asked for."""
+    blended = BlendedRunner(bundle.runner(config.backend), config.blend_s)
+    return blended if config.max_tilt_rad is None else UprightRunner(blended, robot.tilt_rad, config.max_tilt_rad)
+
+
+def _require_tilt(robot: Robot, config: DeployConfig) -> None:
+    if config.max_tilt_rad is not None and type(robot).tilt_rad is Robot.tilt_rad:
+        raise UsageError("this robot does not see its tilt", hint="leave out --max-tilt-rad, or define tilt_rad")
+
+
 def _measured_delay(
     pipeline: Pipeline, robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
 ) -> dict[str, Any]:
@@ -162,7 +176,7 @@ def _episode(
     pipeline: Pipeline,
     robot: Robot,
     session: Session,
-    policy: BlendedRunner,
+    policy: BlendedRunner | UprightRunner,
     trial: int,
     log: Path,
     config: DeployConfig,

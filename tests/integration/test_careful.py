@@ -131,6 +131,26 @@ def test_a_robot_that_would_fall_is_held_until_it_is_let_go(tmp_path, start_cli)
     assert modes[-1] == OperatingMode.OFF
 
 
+def test_a_robot_that_leans_too_far_is_stopped(make_pipeline, tmp_path, capsys):
+    body = "\ndef tilt_rad(observation):\n    return float(np.arctan2(abs(observation[1]), -observation[0]))\n"
+    name = make_pipeline("leaning_pendulum", body)  # from hanging down
+    bundle = faults.swinging_bundle(tmp_path / "bundle")
+    code, folder = deploy(name, bundle, tmp_path, "--max-tilt-rad", "1", "--duration-s", "10", "--no-measure-delay")
+    assert code == errors.SAFETY_STOP
+    said = capsys.readouterr().err
+    assert "the robot leans by 1." in said
+    assert "1 rad are allowed" in said
+    assert_torque_ends_off(read_truth(folder / "truth.bin"))
+    assert read_log(folder / "episode_0.mcap").complete
+
+
+def test_a_tilt_that_the_robot_does_not_see_is_refused(tmp_path, resting, capsys):
+    flags = ["--bundle", str(resting), "--max-tilt-rad", "1", "--runs", str(tmp_path)]
+    assert cli.main(["deploy", "pendulum", *flags]) == errors.USAGE
+    assert "does not see its tilt" in capsys.readouterr().err
+    assert not (tmp_path / "pendulum").exists()
+
+
 def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
     code, folder = deploy("pendulum", resting, tmp_path, "--hold")
     assert code == errors.USAGE

@@ -11,7 +11,15 @@ import pytest
 import safetensors.numpy
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
-from sim2real.policy import BlendedRunner, PolicyReference, PolicyRunner, load_bundle, read_weights, save_bundle
+from sim2real.policy import (
+    BlendedRunner,
+    PolicyReference,
+    PolicyRunner,
+    UprightRunner,
+    load_bundle,
+    read_weights,
+    save_bundle,
+)
 
 
 @pytest.fixture
@@ -68,6 +76,17 @@ def test_a_policy_is_let_in_slowly_in_every_episode(bundle, observations):
 def test_without_blending_the_first_action_is_the_policys(bundle, observations):
     policy = load_bundle(bundle)
     assert np.array_equal(BlendedRunner(policy, 0.0)(observations[0]), policy.act(observations[0]))
+
+
+def test_a_robot_that_leans_too_far_is_stopped(bundle, observations):
+    policy = load_bundle(bundle)
+    leaning = UprightRunner(policy, lambda seen: float(seen[0]), 0.5)
+    leaning.reset()
+    upright, policy_says = np.zeros(5, np.float32), policy.act(np.zeros(5, np.float32))
+    np.testing.assert_array_equal(leaning(upright), policy_says)
+    for tilt, said in ((0.6, "0.6 rad"), (-0.6, "-0.6 rad"), (np.nan, "nan rad")):
+        with pytest.raises(SafetyStop, match=f"leans by {said}, 0.5 rad are allowed"):
+            leaning(np.array([tilt, 0, 0, 0, 0], np.float32))
 
 
 def test_actions_stay_within_the_contract(runner):

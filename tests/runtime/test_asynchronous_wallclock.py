@@ -1,6 +1,7 @@
 """The wall clock: the rules with measured times, the hand-over of steps, warm-up."""
 
 import gc
+import os
 import sys
 import threading
 import time
@@ -263,6 +264,43 @@ def test_episodes_leave_the_interpreter_as_it_was():
     with realtime():
         pass
     assert gc.get_freeze_count() > 0  # the caller's own stay frozen
+
+
+def real_time_is_allowed():
+    """Whether this process may have a real-time priority, found out in a thread that ends."""
+    found = []
+
+    def try_it():
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            found.append(True)
+        except OSError:
+            found.append(False)
+
+    thread = threading.Thread(target=try_it)
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="priorities of Linux")
+def test_steps_have_real_time_priority_where_that_is_allowed():
+    class Asks(Plain):
+        def step(self, step_state):
+            self.policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            if len(self.policies) == 1:
+                inner = threading.Thread(target=lambda: self.inherited.append(os.sched_getscheduler(0)))
+                inner.start()
+                inner.join()
+            return super().step(step_state)
+
+    agent = Asks("agent", 100)
+    agent.policies, agent.inherited = [], []
+    before = os.sched_getscheduler(0)
+    record([agent], agent, 0.05)
+    assert set(agent.policies) == {os.SCHED_FIFO if real_time_is_allowed() else before}
+    assert agent.inherited == [os.SCHED_OTHER if real_time_is_allowed() else before], "what a step starts has none"
+    assert os.sched_getscheduler(0) == before, "nor has what runs the graph"
 
 
 def test_steps_leave_no_cyclic_garbage():
