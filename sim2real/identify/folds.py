@@ -21,6 +21,8 @@ from sim2real.identify.uncertainty import linearise
 
 _GAIN = 1e-3
 """On C, a step that gains a smaller share of a part's loss is its last: errors are told with two digits."""
+MOVES = 10.0
+"""A joint moves where its positions spread over so many deviations of a measurement."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +59,17 @@ class LeftOut:
         values: The estimate without it, by name.
         kept: Names of the optional terms that the rest of the data chose.
         share: Label of a free parameter -> share of what all recordings say about it that this part says, in [0, 1].
-        ahead: Field -> root mean square error up to the horizon of the windows.
-        free: Field -> root mean square error when the part is simulated in one go, from its first samples.
+        ahead: Field -> root mean square error up to the horizon of the windows; None where its joint did not move:
+            to say that what rests will rest is easy, and tells nothing of parts in which it moves.
+        free: The same when the part is simulated in one go, from its first samples.
     """
 
     fold: Fold
     values: Mapping[str, Any]
     kept: tuple[str, ...]
     share: Mapping[str, float]
-    ahead: Mapping[str, float]
-    free: Mapping[str, float]
+    ahead: Mapping[str, float | None]
+    free: Mapping[str, float | None]
 
 
 def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: int = 2) -> list[Fold]:
@@ -143,16 +146,15 @@ def leave_out(
 
 def _ahead(
     windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float
-) -> list[dict[str, float]]:
+) -> list[dict[str, float | None]]:
     """Return the errors of the windows of each part, predicted from the first part of each."""
     fold, segment = np.nonzero(masks(windows, parts))
-    errors = _predicted(windows, stacked, fold, windows.train[segment], settle_s)
-    return [_rmse(windows, [e for e, k in zip(errors, fold, strict=True) if k == own]) for own in range(len(parts))]
+    return _errors(windows, stacked, fold, windows.train[segment], settle_s, len(parts))
 
 
 def _free(
     problem: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float, longest_s: float
-) -> list[dict[str, float]]:
+) -> list[dict[str, float | None]]:
     """Return the errors of each part, simulated in one go."""
     fitted = [problem.spans[i] for i in problem.train]
     where = []
@@ -164,19 +166,30 @@ def _free(
     length_s = min(longest_s, *(w[2] for w in where))
     runs = problem.cut_anew([w[1] for w in where], length_s)
     fold = np.array([w[0] for w in where])
-    errors = _predicted(runs, stacked, fold, np.arange(len(where)), settle_s)
-    return [_rmse(runs, [e for e, k in zip(errors, fold, strict=True) if k == own]) for own in range(len(parts))]
+    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts))
 
 
-def _predicted(
-    problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float
-) -> list[np.ndarray]:
-    """Return the errors ``(N, fields)`` of segments beyond their first part, in deviations of the measurement."""
+def _errors(
+    problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float, parts: int
+) -> list[dict[str, float | None]]:
+    """Return the errors of each part's segments beyond the first part of each."""
     errors, ts = simulated(problem, {n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
-    return [e[t > settle_s] for e, t in zip(errors, ts, strict=True)]
-
-
-def _rmse(problem: Problem, errors: Sequence[np.ndarray]) -> dict[str, float]:
+    beyond = [e[t > settle_s] for e, t in zip(errors, ts, strict=True)]
     sigmas = [sigma for _, sigma, _ in problem.fields]
-    whole = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0)) * sigmas
-    return dict(zip(labels(problem), whole.tolist(), strict=True))
+    found = []
+    for k in range(parts):
+        whole = np.sqrt(np.mean(np.concatenate([beyond[i] for i in np.flatnonzero(fold == k)]) ** 2, axis=0)) * sigmas
+        each = zip(labels(problem), whole.tolist(), _moved(problem, segment[fold == k]), strict=True)
+        found.append({label: error if moved else None for label, error, moved in each})
+    return found
+
+
+def _moved(problem: Problem, segments: np.ndarray) -> list[bool]:
+    """Return of each column whether its joint moves in one of some segments."""
+    there, column, found = problem.places[segments] >= 0, 0, list[bool]()
+    for channel in problem.channels:
+        read = problem.measured(column)[segments]  # the position comes first
+        spread = np.max(read, axis=1, where=there, initial=-np.inf) - np.min(read, axis=1, where=there, initial=np.inf)
+        found += [bool(spread.max() > MOVES * channel.position_sigma)] * len(channel.fields)
+        column += len(channel.fields)
+    return found

@@ -14,6 +14,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify import drift, prediction
+from sim2real.identify.folds import MOVES
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
@@ -32,9 +33,6 @@ _SEGMENT_S = 0.4
 """Length of a segment at least [s]; a balanced pendulum's errors grow tenfold in 0.2 s: longer ones say little."""
 _LEAST, _LEAST_S = 4, 5.0
 """Segments with motion that a test needs at least, and length of all logs [s]."""
-_MOVES = 10.0
-"""A joint moves where its positions spread over so many deviations of a measurement. Segments without motion do not
-count: all are alike, so that they are one, and where a joint sticks a model with smooth friction creeps."""
 _STEPS = 5
 """Most steps of a round that refines all parameters: of an SO-101 errors are within 5 % of those after 15."""
 _NOISE = 2.0
@@ -132,12 +130,16 @@ def known_table(parameters: ParameterTable, found: Identification) -> ParameterT
 
 
 def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s: float) -> bool:
-    """Return whether any joint moves in a part of a log [s]."""
+    """Return whether any joint moves in a part of a log [s].
+
+    Segments without motion do not count: all are alike, so that they are one, and where a joint sticks a model with
+    smooth friction creeps.
+    """
     t = episode.steps[model.sensor].begun_s
     inside = (t >= begin_s) & (t <= begin_s + length_s)
     read = episode.outputs[model.sensor]
     return any(
-        inside.any() and float(np.ptp(c.of(read[c.position][inside]))) > _MOVES * c.position_sigma
+        inside.any() and float(np.ptp(c.of(read[c.position][inside]))) > MOVES * c.position_sigma
         for c in model.channels
     )
 

@@ -186,7 +186,11 @@ def _parts(found: Identification) -> list[Block]:
     errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
     with_terms = bool(found.terms) or any(r.terms for r in rows)
     table = []
-    summed = [("mean", errors.mean(axis=0)), ("worst", errors.max(axis=0))]
+    moved = [own[np.isfinite(own)] for own in errors.T]  # of a part in which a joint rests there is no error
+    summed = [
+        (name, [of(own) if own.size else np.nan for own in moved])
+        for name, of in (("mean", np.mean), ("worst", np.max))
+    ]
     for name, own, terms in [
         *((r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)),
         *((name, e, "") for name, e in summed),

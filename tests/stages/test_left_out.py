@@ -48,7 +48,7 @@ def test_parts_that_differ_too_much_for_a_promise_are_said_to():
 
 
 def test_what_is_promised_of_a_field_is_the_bound_on_one_more_part():
-    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=float("nan"))]
+    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=float("nan")), left("rests", ahead=None)]
     assert promises(rows) == {"th": pytest.approx(further(np.array([0.1, 0.2])))}
     assert promises(rows[:1]) == {}
     assert promises([]) == {}
