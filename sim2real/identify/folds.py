@@ -179,13 +179,18 @@ def _errors(
     found = []
     for k in range(parts):
         whole = np.sqrt(np.mean(np.concatenate([beyond[i] for i in np.flatnonzero(fold == k)]) ** 2, axis=0)) * sigmas
-        each = zip(labels(problem), whole.tolist(), _moved(problem, segment[fold == k]), strict=True)
+        each = zip(labels(problem), whole.tolist(), moving(problem, segment[fold == k]), strict=True)
         found.append({label: error if moved else None for label, error, moved in each})
     return found
 
 
-def _moved(problem: Problem, segments: np.ndarray) -> list[bool]:
-    """Return of each column whether its joint moves in one of some segments."""
+def moving(problem: Problem, segments: np.ndarray) -> list[bool]:
+    """Return of each column of the residuals whether its joint moves in one of some segments.
+
+    Args:
+        problem: The recordings.
+        segments: Shape ``(S,)``: numbers of segments.
+    """
     there, column, found = problem.places[segments] >= 0, 0, list[bool]()
     for channel in problem.channels:
         read = problem.measured(column)[segments]  # the position comes first

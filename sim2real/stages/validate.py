@@ -15,6 +15,7 @@ from sim2real.artifacts.manifest import plain
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify import prediction
+from sim2real.identify.folds import moving
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, check_log
@@ -107,18 +108,26 @@ def score(
         columns = prediction.samples(windows, models, fitting.settle_s)
         errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
         judged = scores(errors, identified.positions(windows, robot.units))
+        moves = dict(zip(prediction.labels(windows), moving(windows, np.arange(windows.segments)), strict=True))
         whole = _problem(model, episodes, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
         columns = prediction.samples(whole, models, fitting.settle_s)
         free = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
     for s in judged:
-        at = [r.rmse or np.inf for r in free if r.field == s.position.column and r.model == "identified"]
-        rows[s.position.name] = _row(s, promised.get(s.position.column), float(np.mean(at)))
+        at = [
+            np.inf if r.rmse is None else r.rmse
+            for r in free
+            if r.field == s.position.column and r.model == "identified"
+        ]
+        own = moves[s.position.column]
+        rows[s.position.name] = _row(s, promised.get(s.position.column) if own else None, float(np.mean(at)), own)
+    if not any(row["moves"] for row in rows.values()):
+        raise UsageError("no joint moves in this log: it tells nothing", hint="take a log of motion")
     kept = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
     return {
         "pipeline": pipeline.name,
         "horizon_s": horizon_s,
         "positions": rows,
-        "better": not any(s.beaten_by for s in judged),
+        "better": not any(row["beaten_by"] for row in rows.values()),
         "promise_kept": all(k <= _KEPT for k in kept) if kept else None,
         "rmse": float(np.sqrt(np.mean([s.own**2 for s in judged]))),
         "free_run_rmse": float(np.sqrt(np.mean([r[_FREE] ** 2 for r in rows.values()]))),
@@ -137,6 +146,8 @@ def show(result: dict[str, Any]) -> None:
         f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
         f"{result['free_run_rmse']:.4g} in free runs"
     )
+    if resting := [name for name, row in result["positions"].items() if not row["moves"]]:
+        note(f"{', '.join(resting)} did not move here, which neither keeps a promise nor breaks one")
     if not result["better"]:
         beaten = {n: row["beaten_by"] for n, row in result["positions"].items() if row["beaten_by"]}
         listed = "; ".join(f"{n} by {', '.join(by)}" for n, by in list(beaten.items())[:3])
@@ -147,11 +158,13 @@ def show(result: dict[str, Any]) -> None:
         note("verdict: holds on this log")
 
 
-def _row(s: Score, promised: float | None, free_run: float) -> dict[str, Any]:
+def _row(s: Score, promised: float | None, free_run: float, moves: bool) -> dict[str, Any]:
+    """Return the row of a position; one that rests is beaten by nobody, for that it rests is no prediction."""
     return {
+        "moves": moves,
         "unit": s.position.unit,
         "rmse": {"identified": s.own, **s.others},
-        "beaten_by": s.beaten_by,
+        "beaten_by": s.beaten_by if moves else [],
         "promised": promised,
         "over_promised": s.own / promised if promised else None,
         _FREE: free_run,

@@ -15,7 +15,7 @@ from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit, refit
-from sim2real.identify.folds import Fold, _moved, folds_of, leave_out
+from sim2real.identify.folds import Fold, folds_of, leave_out, moving
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.segments import Span
@@ -196,10 +196,10 @@ def test_errors_are_of_parts_in_which_the_joint_moves():
     places = np.array([[0, 1, 2, -1], [0, 1, 2, 3]])  # the first segment has three measurements
     read = {0: [[0.0, 0.01, 0.02, 9.0], [0.0, 0.0, 0.0, 0.0]], 2: [[0.0, 0.01, 0.03, 0.0], [0.5, 0.5, 0.51, 0.5]]}
     problem = SimpleNamespace(places=places, channels=(pan, tilt), measured=lambda column: np.array(read[column]))
-    assert _moved(problem, np.array([0])) == [False, False, True]
-    assert _moved(problem, np.array([1])) == [False, False, False]
+    assert moving(problem, np.array([0])) == [False, False, True]
+    assert moving(problem, np.array([1])) == [False, False, False]
     read[0][1][3] = 0.021  # more than ten deviations of a measurement, in one of the segments
-    assert _moved(problem, np.array([0, 1])) == [True, True, True]
+    assert moving(problem, np.array([0, 1])) == [True, True, True]
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,20 @@
+"""What a later log says of an identification: a joint that rests there says nothing."""
+
+import pytest
+
+from sim2real.identify.verdict import Position, Score
+from sim2real.stages import validate
+
+SCORE = Score(Position("q", "elbow", "rad", 0.001), 8.0, 0.004, {"nominal": 0.05, "hold": 0.0})
+
+
+@pytest.mark.parametrize(("moves", "beaten_by"), [(True, ["hold"]), (False, [])])
+def test_that_a_joint_rests_beats_no_model_of_how_it_moves(moves, beaten_by, capsys):
+    row = validate._row(SCORE, 0.02 if moves else None, 0.004, moves)
+    assert row["beaten_by"] == beaten_by
+    assert row["over_promised"] == (pytest.approx(0.2) if moves else None)
+    result = {"positions": {"elbow": row}, "horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004}
+    validate.show({**result, "better": not beaten_by, "promise_kept": None})
+    said = capsys.readouterr().err
+    assert ("elbow did not move here" in said) == (not moves)
+    assert ("beaten are elbow by hold" in said) == moves
