@@ -10,10 +10,16 @@ import numpy as np
 from sim2real.errors import SafetyStop
 
 
-class _Runner(Protocol):
-    def reset(self) -> None: ...
+class Runner(Protocol):
+    """What runs a policy; see ``sim2real.policy.PolicyRunner``."""
 
-    def __call__(self, observation: np.ndarray) -> np.ndarray: ...
+    def reset(self) -> None:
+        """Begin an episode."""
+        ...
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action ``(A,)`` for the next observation ``(O,)``."""
+        ...
 
 
 class UprightRunner:
@@ -25,7 +31,7 @@ class UprightRunner:
         limit_rad: How far it may [rad].
     """
 
-    def __init__(self, runner: _Runner, tilt_rad: Callable[[np.ndarray], float], limit_rad: float) -> None:
+    def __init__(self, runner: Runner, tilt_rad: Callable[[np.ndarray], float], limit_rad: float) -> None:
         self._runner, self._tilt_rad, self._limit_rad = runner, tilt_rad, limit_rad
 
     def reset(self) -> None:

@@ -21,12 +21,13 @@ from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.joint import Joint
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
+from sim2real.policy.upright import Runner
 from sim2real.robots.base import Datum, Robot, positive, tuple_of
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.robots.hardware import Embedded, Excitation, ServoActuator, ServoSensor, ServoSession
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import control_nodes, delay_bounds, drawn_in_a_loop, in_a_loop, simulated_loop
-from sim2real.robots.policy_node import PolicyNode, Runner, in_numpy
+from sim2real.robots.policy_node import PolicyNode, in_numpy
 from sim2real.robots.training import Draw, LoopTask
 from sim2real.train.env import TrainingTask
 from sim2real.train.tasks import Rewards

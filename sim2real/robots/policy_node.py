@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
-
-
-class Runner(Protocol):
-    """What runs a policy; see ``sim2real.policy.PolicyRunner``."""
-
-    def reset(self) -> None:
-        """Begin an episode."""
-        ...
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action ``(A,)`` for the next observation ``(O,)``."""
-        ...
+from sim2real.policy.upright import Runner
 
 
 class PolicyNode(BaseNode):
