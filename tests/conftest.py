@@ -1,5 +1,6 @@
 """One JAX configuration for all tests; set in the environment, before anything imports JAX."""
 
+import contextlib
 import functools
 import gc
 import os
@@ -105,7 +106,8 @@ def step_back():
     os.setpriority(os.PRIO_PROCESS, 0, 10)
     if hasattr(os, "SCHED_IDLE"):  # Linux
         for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SAFETY_STOP, SafetyStop
-from sim2real.hardware import guardian_process
+from sim2real.hardware import emulator, guardian_process
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind
+from sim2real.runtime import clock
 
 pytestmark = pytest.mark.realtime
 
@@ -51,6 +52,11 @@ except Sim2RealError as error:
     print(error, flush=True)
     sys.exit(error.exit_code)
 """
+
+
+def test_it_never_waits_for_the_threads_that_it_watches():
+    """An emulated servo comes between: a real one waits for nobody. Where its priority is not allowed none is taken."""
+    assert clock._PRIORITY < emulator._REAL_TIME_PRIORITY < guardian_process._PRIORITY == clock._HIGHEST
 
 
 @pytest.fixture

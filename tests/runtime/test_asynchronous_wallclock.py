@@ -272,7 +272,7 @@ def real_time_is_allowed():
 
     def try_it():
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))
             found.append(True)
         except OSError:
             found.append(False)
@@ -287,7 +287,8 @@ def real_time_is_allowed():
 def test_steps_have_real_time_priority_where_that_is_allowed():
     class Asks(Plain):
         def step(self, step_state):
-            self.policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+            self.policies.append((policy, os.sched_getparam(0).sched_priority))
             if len(self.policies) == 1:
                 inner = threading.Thread(target=lambda: self.inherited.append(os.sched_getscheduler(0)))
                 inner.start()
@@ -298,7 +299,7 @@ def test_steps_have_real_time_priority_where_that_is_allowed():
     agent.policies, agent.inherited = [], []
     before = os.sched_getscheduler(0)
     record([agent], agent, 0.05)
-    assert set(agent.policies) == {os.SCHED_FIFO if real_time_is_allowed() else before}
+    assert set(agent.policies) == {(os.SCHED_FIFO, 1) if real_time_is_allowed() else (before, 0)}
     assert agent.inherited == [os.SCHED_OTHER if real_time_is_allowed() else before], "what a step starts has none"
     assert os.sched_getscheduler(0) == before, "nor has what runs the graph"
 
