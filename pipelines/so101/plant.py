@@ -183,6 +183,7 @@ class SO101Plant:
             **{f"damping_{j}": d for j, d in zip(joints, _DAMPING, strict=True)},
             **{f"friction_{j}": f for j, f in zip(joints, self._levels, strict=True)},
             **{f"goal_offset_{j}": b for j, b in zip(joints, _BIAS_RAD, strict=True)},
+            "saturation": _SATURATION_RAD[0],
             **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},
         }
 

@@ -38,7 +38,7 @@ LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5
 CALIBRATION = "SO101_CALIBRATION"
 """Environment variable that names the calibration of the arm on the port."""
 SATURATES = ("wrist_roll", "gripper")
-"""Joints whose servos may push no harder from a smaller error on than the data sheet says."""
+"""Joints whose servos may push no harder from a smaller error on than the others: each has a limit of its own."""
 
 HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5)
 """Between the jaws."""
@@ -92,9 +92,9 @@ class SO101Robot(ServoRobot):
         """Return what may be identified: servos of one model, each with friction and brake of its own."""
         found = standard.parameters(SHEET, JOINTS, own=("damping", "friction")) + standard.offsets(JOINTS)
         full, about = SHEET.full_rad, "error from which on it pushes no harder"
+        limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
         # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
-        limit = Parameter("", "rad", full, full / 10, full * 2, about=about, begin=full / 4)
-        return found + [replace(limit, name=f"saturation_{j}") for j in SATURATES]
+        return [*found, limit, *(replace(limit, name=f"saturation_{j}", begin=full / 4) for j in SATURATES)]
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
         """Open the arm with the calibration of the one on this port, with torque off; see ``Robot.connect``."""

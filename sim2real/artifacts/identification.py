@@ -43,7 +43,8 @@ class Estimate:
         high95: Its upper end.
         lower: Lower bound of the search.
         upper: Upper bound.
-        verdict: ``accepted``, ``negligible``, ``fixed``, ``at a bound``, ``not identifiable`` or ``interrupted``.
+        verdict: ``accepted``, ``negligible``, ``not reached``, ``fixed``, ``at a bound``, ``not identifiable`` or
+            ``interrupted``.
         truth: The embedded robot's own value.
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.identify.fit import Fit
-from sim2real.identify.negligible import NEGLIGIBLE
+from sim2real.identify.negligible import ABSENT, NOT_REACHED
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.refine import effort, refine
 from sim2real.identify.terms import Selection, statistics
@@ -29,7 +29,8 @@ def posterior(found: Fit, at: Linearised, spread: Uncertainty, every: Fit, choic
         every: The estimate with all optional terms, from which the estimate's were chosen.
         choice: What was chosen; None: nothing was to be chosen.
     """
-    own = found.problem.table.posterior(found.z, spread.scale_covariance)
+    table = found.problem.table
+    own = _possible(table.posterior(found.z, spread.scale_covariance), table, spread)
     optima = _optima(found, at, spread)
     models = [] if choice is None else _models(every, found, spread, choice)
     if not optima and not models:
@@ -53,8 +54,8 @@ def _optima(found: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative
     """
     problem, table = found.problem, found.problem.table
     near, score, kept = [at.x], _by_segment(at.residuals), []
-    # Of what may as well be absent, any small value is the same.
-    told = np.flatnonzero([v != NEGLIGIBLE for v in spread.verdict])
+    # Of what may as well be absent, any value on its side of the bound is the same.
+    told = np.flatnonzero([v not in ABSENT for v in spread.verdict])
     precision = np.linalg.pinv(spread.scale_covariance[np.ix_(told, told)])
 
     def apart(x: np.ndarray) -> bool:
@@ -102,8 +103,25 @@ def _models(every: Fit, found: Fit, spread: Uncertainty, choice: Selection) -> l
         z, rest = centred(problem, ended.z), np.flatnonzero(own)
         fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, kept))
         covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, found.problem.table, spread)
-        models.append(Alternative(_about(table, kept), float(weight), fewer.posterior(z[rest], covariance)))
+        drawn = _possible(fewer.posterior(z[rest], covariance), found.problem.table, spread)
+        models.append(Alternative(_about(table, kept), float(weight), drawn))
     return models
+
+
+def _possible(posterior: Posterior, table: ParameterTable, spread: Uncertainty) -> Posterior:
+    """Return a posterior without those values of limits that the recordings rule out.
+
+    Args:
+        posterior: Of some of the parameters.
+        table: Those of the estimate.
+        spread: Its uncertainty.
+    """
+    low = posterior.low.copy()
+    for name, column, verdict, bound in zip(table.names, table.columns, spread.verdict, spread.low, strict=True):
+        if verdict == NOT_REACHED and name in posterior.names:
+            i = posterior.names.index(name)
+            low[i] = min(column.parameter.to_scale(float(bound)), posterior.mean[i])
+    return replace(posterior, low=low)
 
 
 def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTable, spread: Uncertainty) -> np.ndarray:
@@ -121,7 +139,7 @@ def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTabl
         if name in known.names:
             j = known.names.index(name)
             ratio = float(np.sqrt(spread.scale_covariance[j, j]) / deviation[i])
-            factor[i] = min(ratio, usual) if spread.verdict[j] == NEGLIGIBLE else spread.widening[j]
+            factor[i] = min(ratio, usual) if spread.verdict[j] in ABSENT else spread.widening[j]
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / deviation))
     return covariance * np.outer(factor, factor)
 

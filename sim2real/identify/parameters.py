@@ -42,6 +42,8 @@ class Parameter:
         off: Its value where that term is left out; default: the nominal one.
         vanishes: Whether nothing lies below 0, and 0 is possible, as for a friction: on a logarithmic scale an estimate
             only comes near, and counts as negligible where the model without it is as good.
+        limits: Whether it limits what no motion need reach, as a torque: where the recordings do not feel it, it counts
+            as not reached, and only a lower bound is said.
         begin: Where a search begins; None: at the nominal value. A limit that no motion reaches at the data sheet's
             value is found from below: there the data feel it.
         narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
@@ -63,6 +65,7 @@ class Parameter:
     term: str = ""
     off: float | None = None
     vanishes: bool = False
+    limits: bool = False
     begin: float | None = None
     narrowed: bool = False
     excite: str = ""

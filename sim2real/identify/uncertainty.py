@@ -64,7 +64,7 @@ class Uncertainty:
         standard_error: Shape ``(P,)``.
         low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
         high: Shape ``(P,)``: upper end.
-        verdict: One a parameter: ``accepted``, ``negligible``, ``not identifiable`` or ``at a bound``.
+        verdict: One a parameter: ``accepted``, ``negligible``, ``not reached``, ``not identifiable`` or ``at a bound``.
         correlation: Shape ``(P, P)``.
         inflation: Factor on the variance for residuals that are correlated in time.
         misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the

@@ -169,6 +169,12 @@ def judge(
         for i, name in enumerate(table.names)
         if spread.verdict[i] == "negligible"
     ]
+    reasons += [
+        f"{name} is not reached: it is at least {spread.low[i]:.2g} {table.columns[i].parameter.unit} (95 %), and no "
+        "value above that changes what the model says of these recordings"
+        for i, name in enumerate(table.names)
+        if spread.verdict[i] == "not reached"
+    ]
     reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)

@@ -334,7 +334,8 @@ def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: floa
         low, high = nominal / below, nominal * above
     low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
     return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
-        vanishes=term.what in _VANISHING, term=term.term, off=nominal if term.term and not term.free else None,
+        vanishes=term.what in _VANISHING, limits=term.what == "torque", term=term.term,
+        off=nominal if term.term and not term.free else None,
     )  # fmt: skip
 
 

@@ -1,10 +1,11 @@
-"""What may be absent: textbook upper bounds where the model is linear, and refusals where the data bounds nothing."""
+"""What may be absent: textbook bounds where the model is linear, and refusals where the data bounds nothing."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sim2real.identify.ensemble import posterior
 from sim2real.identify.identifiability import from_linearised as judged
 from sim2real.identify.model import Channel
 from sim2real.identify.negligible import negligible
@@ -125,3 +126,75 @@ def test_intervals_of_others_allow_for_all_that_it_may_be():
     assert spread.low[k] < best[k] < spread.high[k]
     # What training draws of it stays below its bound, but for one in twenty.
     assert np.log(best[0]) + 1.645 * np.sqrt(spread.scale_covariance[0, 0]) == pytest.approx(np.log(spread.high[0]))
+
+
+def limited(pushes, limit, estimate, seed=0):
+    """Return what is judged of ``y = min(gain push, limit)``, with noise of deviation 0.1, at an estimate of the limit.
+
+    Args:
+        pushes: Shape ``(N,)``.
+        limit: The true one, with a gain of 1.
+        estimate: Where the fit has ended.
+        seed: Of the noise.
+    """
+    table = ParameterTable(
+        [Parameter("gain", "1", 1.0, 0.1, 10.0), Parameter("most", "N m", 1.5, 0.1, 8.0, limits=True)]
+    )
+    y = (np.minimum(pushes, limit) + 0.1 * np.random.default_rng(seed).normal(size=len(pushes))) / 0.1
+    free = pushes < min(limit, estimate)
+    gain = max(0.1 * pushes[free] @ y[free] / (pushes[free] @ pushes[free]), 0.11)
+    best, shape = np.array([gain, estimate]), (SEGMENTS, SAMPLES, 1)
+    x = np.array([p.to_scale(v) for p, v in zip(table, best, strict=True)])
+
+    def off(values):
+        return np.minimum(values[0] * pushes, values[1]) / 0.1 - y
+
+    J = np.stack([np.where(gain * pushes < estimate, gain * pushes, 0.0), (gain * pushes >= estimate) * estimate], -1)
+    r = off(best).reshape(shape)
+    at = Linearised(r, J.reshape(*shape, 2) / 0.1, np.diag(12.0 / table.span**2), x, r)
+    problem = SimpleNamespace(
+        table=table, config=SimpleNamespace(initial_state="rest"), channels=(Channel("q", None, 1.0, 1.0),),
+        segment_s=1.0, train=np.arange(SEGMENTS), at=lambda z: (None, 0.0),
+        programs={"given": lambda z, columns, rows: np.stack(
+            [off(np.where(np.isnan(row), best, row)).reshape(shape) for row in rows])},
+    )  # fmt: skip
+    spread, check = from_linearised(problem, at), judged(problem, at)
+    return problem, at, spread, check, *negligible(problem, x, at, spread, check)
+
+
+PUSHES = np.abs(np.random.default_rng(3).uniform(-1.0, 1.0, SEGMENTS * SAMPLES))
+
+
+@pytest.mark.parametrize("seed", [0, 5, 9])
+@pytest.mark.parametrize("estimate", [1.2, 3.0, 7.99])
+def test_of_a_limit_that_no_motion_reaches_only_a_lower_bound_is_said(estimate, seed):
+    problem, at, before, open_before, spread, check = limited(PUSHES, 4.0, estimate, seed)
+    assert before.verdict[1] in ("not identifiable", "at a bound")
+    assert "most" in open_before.undetermined[0]
+    assert spread.verdict == ("accepted", "not reached")
+    assert check.undetermined == ()
+    assert spread.high[1] == pytest.approx(8.0)
+    assert 0.8 < spread.low[1] <= 1.01, "more than was reached cannot be said; much less would be a waste"
+    found = SimpleNamespace(problem=problem, z=problem.table.encode({"gain": 1.0, "most": estimate}), refined=())
+    drawn = posterior(found, at, spread, found, None).sample(np.random.default_rng(0), 500)["most"]
+    assert drawn.min() >= spread.low[1] * (1 - 1e-9)
+    assert drawn.max() <= 8.0
+    assert np.percentile(drawn, 90) > 2.0, "any higher limit explains the recordings as well"
+
+
+def test_a_limit_that_is_reached_stays_as_it_was():
+    _, _, before, _, spread, _ = limited(PUSHES, 0.7, 0.7)
+    assert spread is before
+    assert spread.verdict == ("accepted", "accepted")
+    assert spread.low[1] < 0.7 < spread.high[1]
+
+
+def test_a_limit_of_what_never_moves_is_not_bounded():
+    _, _, before, check, spread, _ = limited(1e-4 * PUSHES, 4.0, 3.0)
+    assert spread is before
+    assert any("most" in group for group in check.undetermined)
+
+
+def test_a_limit_that_is_contradicted_is_not_taken_for_one_that_is_not_reached():
+    _, _, _, _, spread, _ = limited(PUSHES, 4.0, 0.101)
+    assert spread.verdict[1] == "at a bound"
