@@ -24,8 +24,7 @@ NEGLIGIBLE, NOT_REACHED = "negligible", "not reached"
 ABSENT = (NEGLIGIBLE, NOT_REACHED)
 """Verdicts on parameters that may as well be absent."""
 _SMALL = VAGUE * ONE_SIDED
-"""An upper bound above this share of the highest value says too little: as for estimates, on a linear scale. Of limits
-their inverses are compared."""
+"""An upper bound above this share of the highest value says too little: as for estimates, on a linear scale."""
 _NEEDED = {False: 0.05, True: 0.0027}
 """How sure it must be that a parameter is needed, and of a limit, that it was reached: of many robots' limits none is,
 and each time that chance says otherwise, an identification that lacks nothing is said to lack something.
@@ -70,6 +69,16 @@ def negligible(
     return _judged(problem, at, spread, found)
 
 
+def indifferent(p: Parameter, bound: float) -> float:
+    """Return the value of a limit that is not reached: any is as good, so the data sheet's, or the nearest there is.
+
+    Args:
+        p: The limit.
+        bound: What it is at least.
+    """
+    return min(max(p.nominal, bound), p.high)
+
+
 def _judged(problem: Problem, at: Linearised, spread: Uncertainty, found: Found) -> tuple[Uncertainty, Check]:
     """Return the uncertainty with the bounds that were found, and the check of what is left."""
     table, size = problem.table, len(at.x)
@@ -88,7 +97,8 @@ def _judged(problem: Problem, at: Linearised, spread: Uncertainty, found: Found)
     low, high = np.where(absent, low, wider.low), np.where(absent, high, wider.high)
     for i, (bound, *_) in found.items():
         p = table.columns[i].parameter
-        value, verdicts[i] = float(table.unscale(at.x)[i]), NOT_REACHED if p.limits else NEGLIGIBLE
+        value = indifferent(p, bound) if p.limits else float(table.unscale(at.x)[i])
+        verdicts[i] = NOT_REACHED if p.limits else NEGLIGIBLE
         # What training draws stays below the bound: on the scale, 95 % of it. Of a limit any value above is as good.
         far = p.high if p.limits else bound
         reach = abs(p.to_scale(far) - p.to_scale(value)) / ONE_SIDED
@@ -111,7 +121,11 @@ def _bounded(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertaint
     found: Found = {}
     for i, own in profiles.items():
         bound, p = own.bound(), table.columns[i].parameter
-        if bound is None or own.worse[0] > float(chdtri(1, 2 * _NEEDED[p.limits])) or _vague(p, bound):
+        if (
+            bound is None
+            or own.worse[0] > float(chdtri(1, 2 * _NEEDED[p.limits]))
+            or (p.vanishes and bound > _SMALL * p.high)
+        ):
             continue
         value = float(table.unscale(at.x)[i])
         said = min(bound, value) if p.limits else max(bound, value)
@@ -144,8 +158,3 @@ def _far(p: Parameter, x: float) -> bool:
     """Return whether a place on a parameter's scale is in the half in which it has the more effect."""
     upper = x > (p.to_scale(p.low) + p.to_scale(p.high)) / 2
     return not upper if p.limits else upper
-
-
-def _vague(p: Parameter, bound: float) -> bool:
-    """Return whether the one bound of a parameter says too little."""
-    return p.low / bound > _SMALL if p.limits else bound / p.high > _SMALL

@@ -26,7 +26,7 @@ from sim2real.artifacts.links import Link
 from sim2real.artifacts.posterior import Posterior
 from sim2real.identify import identifiability, noise, uncertainty
 from sim2real.identify.fit import Fit
-from sim2real.identify.negligible import negligible
+from sim2real.identify.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
@@ -73,8 +73,21 @@ class Findings:
         spread = left_out.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
         spread, check = negligible(fit.problem, fit.z, at, spread, check)
+        fit, at = _where_nothing_is_said(fit, at, spread)
         trip = round_trip(fit.problem.table, at.x, spread)
         return Findings(fit, at, spread, check, trip, noise.widening(fit.problem.table, at, spread))
+
+
+def _where_nothing_is_said(
+    fit: Fit, at: uncertainty.Linearised, spread: uncertainty.Uncertainty
+) -> tuple[Fit, uncertainty.Linearised]:
+    """Return a fit with limits that no motion reaches where the data sheet has them: the search left them anywhere."""
+    table, x = fit.problem.table, at.x.copy()
+    for i in np.flatnonzero([v == NOT_REACHED for v in spread.verdict]):
+        p = table.columns[i].parameter
+        x[i] = p.to_scale(indifferent(p, float(spread.low[i])))
+    z = np.where(x == at.x, fit.z, table.at_scale(x))
+    return replace(fit, z=z), replace(at, x=x)
 
 
 def document(

@@ -90,6 +90,7 @@ def identify(
     with progress(None, "identify: errors, predictions and baselines"):
         without = patiently(lambda: left_out.examined(every, config, names)) if config.folds else ()
         findings = patiently(lambda: identified.Findings.of(found, without))
+        found = findings.fit
         terms = found.problem.table.terms if every.problem.table.terms else None
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
         posterior = patiently(lambda: ensemble.posterior(found, findings.at, findings.spread, every, choice))

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_folds import CONFIG, LENGTH_S, Model, lag_log, spans
+from test_folds import CONFIG, LENGTH_S, PERIOD_S, TICK_S, Actuator, Lag, Level, Model, Sensor, lag_log, spans
 
 from sim2real.identify import ensemble
 from sim2real.identify.fit import fit
@@ -12,6 +13,7 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.refine import refine
 from sim2real.identify.terms import Selection
 from sim2real.identify.uncertainty import from_linearised, linearise
+from sim2real.stages.identified import Findings
 
 
 def of(found, every=None, choice=None):
@@ -69,3 +71,48 @@ def test_another_optimum_that_is_as_good_joins_and_one_that_is_worse_or_the_same
     np.testing.assert_allclose(np.abs(root), np.sqrt(1.7), atol=0.01)
     ends = ((whole.z, whole.loss), (both.ends[1][0], 2.0 * whole.loss))
     assert of(replace(whole, refined=(replace(both, ends=ends),))).others == ()
+
+
+class Clipped(Lag):
+    """A lag whose input is cut at a limit, which stands where the square does."""
+
+    def step(self, step_state):
+        p, command = step_state.params, step_state.inputs["actuator"][-1].data.u
+        steady = p.gain * (jnp.clip(command, -p.square, p.square) + p.bias)
+        new = Level(y=steady + (step_state.state.y - steady) * jnp.exp(-TICK_S / p.tau))
+        return step_state.replace(state=new), new
+
+
+class Limited(Model):
+    """Inputs go up to 1; the data sheet says that its limit is 1.5."""
+
+    parameters = ParameterTable(
+        [
+            *(p for p in Model.parameters if p.name != "square"),
+            Parameter("most", "1", 1.5, 0.3, 3.0, begin=0.5, limits=True, leaf="world.square"),
+        ]
+    )
+
+    def nodes(self, max_delay_s):
+        world, sensor, actuator = (
+            Clipped("world", 1 / TICK_S),
+            Sensor("sensor", 1 / PERIOD_S),
+            Actuator("actuator", 1 / PERIOD_S),
+        )
+        world.connect(actuator, skip=True)
+        sensor.connect(world)
+        return {n.name: n for n in (sensor, actuator, world)}
+
+
+def test_a_limit_that_no_motion_reaches_is_the_data_sheets_and_draws_are_above_what_was_reached():
+    found = Findings.of(fit(Limited(), [lag_log(0)], spans(0), LENGTH_S, CONFIG))
+    names = found.fit.problem.table.names
+    at = names.index("most")
+    assert found.spread.verdict[at] == "not reached"
+    assert found.fit.values["most"] == pytest.approx(1.5, rel=1e-3)
+    assert found.fit.values["gain"] == pytest.approx(1.7, rel=0.01)
+    assert 0.9 < found.spread.low[at] < 1.0
+    drawn = ensemble.posterior(found.fit, found.at, found.spread, found.fit, None)
+    most = drawn.sample(np.random.default_rng(0), 500)["most"]
+    assert most.min() >= found.spread.low[at] * (1 - 1e-9)
+    assert np.mean(most > 1.5) > 0.2
