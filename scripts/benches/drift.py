@@ -21,7 +21,7 @@ from benches import jobs, randomise
 from benches.drift_arms import ReachingArm, ReachingSO101
 from benches.drift_pendulum import Pendulum
 from benches.figures import row
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import Sim2RealError
 
 ROBOTS: dict[str, Any] = {"pendulum": Pendulum, "arm": ReachingArm, "so101": ReachingSO101}
 CHANGES = ("none", "friction", "payload", "delay")
@@ -43,8 +43,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--restore", action="store_true", help="do what the verdict asks for, and judge the new policy")
     parser.add_argument("--trials", type=int, default=10, help="deployments of the new policy")
     parser.add_argument("--volts", type=float, default=2.0, help="most that it may command a pendulum")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps of its training")
-    parser.add_argument("--envs", type=int, default=256, help="copies of its training")
+    parser.add_argument("--steps", type=int, help="policy steps of its training; default: the robot's")
+    parser.add_argument("--envs", type=int, help="copies of its training")
     parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
     parser.add_argument("--within-s", type=float, help="end after this [s]: what was not done is told")
 
@@ -54,8 +54,6 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     for name, value in ROBOTS[options.robot].defaults.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
-    if options.restore and options.robot != "pendulum":
-        raise UsageError("--restore trains a policy in seconds, which the pendulum alone can", hint="leave it out")
     found, failed = jobs.robots(one_robot, range(options.first, options.first + options.runs), options)
     lines = rows(found, options)
     lines.append(row(f"drift/{options.robot}/failed", len(failed), f"of {options.runs}", "", "0"))

@@ -2,7 +2,8 @@
 
 Plants, latencies and the gate are those of the wall clock; in the place of bus and threads stand the times that they
 take. Robots differ in what their servos are like and in how late they are. The policy is written by hand: it moves the
-goals to one target after the other, as fast as a trained one may.
+goals to one target after the other, as fast as a trained one may. Trained ones, after what the verdict asks for was
+done, run as on the robot: by its agent's node, and in numpy.
 """
 
 from __future__ import annotations
@@ -12,15 +13,20 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from benches import hidden_robots as hidden
 from benches.drift_pendulum import DELAY_S, FRICTION
+from sim2real.graph.base import StepState
 from sim2real.hardware.gate import SafetyGate
 from sim2real.hardware.plant import OperatingMode, PlantClock, load_plant
 from sim2real.hardware.truth import TruthLog
+from sim2real.robots.agent import AgentParams, AgentState
+from sim2real.robots.messages import JointReading
 from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
 
@@ -31,8 +37,8 @@ STEP_RAD, STEP_S, STEPS = 0.12, 0.5, 8
 CARRIED = 0.3
 """Payload, as a share of the mass of all links."""
 _STEP_NS = 500_000
-Policy = Callable[[int, np.ndarray], np.ndarray]
-"""Number of a step and goals of the one before [rad] -> goals [rad]."""
+Policy = Callable[[int, np.ndarray, JointReading], np.ndarray]
+"""Number of a step, goals of the one before [rad], and the newest measurement -> goals [rad]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,9 @@ class ReachingArm:
     acting_s: float
     pipeline: ClassVar[str] = "arm"
     links_kg: ClassVar[float] = 0.234
-    defaults: ClassVar[dict[str, float]] = {"record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 30}
+    defaults: ClassVar[dict[str, float]] = {
+        "record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 30, "steps": 1_500_000, "envs": 256
+    }  # fmt: skip
     causes: ClassVar[dict[str, str]] = {"friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 
     @classmethod
@@ -101,7 +109,7 @@ class ReachingArm:
         away = np.asarray(robot.servos.at_rest) - signal[0]
         left = np.abs(away) - np.arange(len(signal))[:, None] / hidden.RATE_HZ
         signal = signal + np.sign(away) * np.maximum(left, 0.0)
-        self._play(path, lambda k, _: signal[k], seconds, session)
+        self._play(path, lambda k, *_: signal[k], seconds, session)
 
     def probe(self, path: Path, session: int) -> None:
         """Write the log of the small steps before a deployment: away from rest and back."""
@@ -109,7 +117,7 @@ class ReachingArm:
         rest, probe = np.asarray(robot.servos.at_rest, float), robot.probe
         away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
         each = round(STEP_S * hidden.RATE_HZ)
-        self._play(path, lambda k, _: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
+        self._play(path, lambda k, *_: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
 
     def deploy(self, path: Path, seconds: float, session: int) -> float:
         """Write the log of an episode of the policy written by hand; nobody judges it: it does not succeed or fail.
@@ -124,12 +132,29 @@ class ReachingArm:
         targets = rng.uniform(low, high, (int(seconds / TARGET_S) + 1, len(low)))
         fastest = robot.servos.speed
 
-        def policy(k: int, goal: np.ndarray) -> np.ndarray:
+        def policy(k: int, goal: np.ndarray, _: JointReading) -> np.ndarray:
             way = targets[int(k / hidden.RATE_HZ / TARGET_S)] - goal
             return goal + np.clip(APPROACH_HZ * way, -fastest, fastest) / hidden.RATE_HZ
 
         self._play(path, policy, seconds, session)
         return float("nan")
+
+    def success(self, bundle: Any, options: Any) -> list[float]:
+        """Return of each deployment of a trained policy whether the robot was at its target in the end: 1 or 0.
+
+        Args:
+            bundle: The policy.
+            options: How many deployments.
+        """
+        robot, seconds = self._robot, load_pipeline(self.pipeline).deploy.duration_s
+        found = []
+        for trial in range(100, 100 + options.trials):
+            aim = np.asarray(robot.draw_aim(jax.random.key(trial)))
+            angles = self._play(Path(os.devnull), trained(robot, bundle, aim), seconds, trial)
+            states = {f"position[{i}]": column for i, column in enumerate(angles.T)}
+            states |= {f"aim[{i}]": np.full(len(angles), value) for i, value in enumerate(aim)}
+            found.append(robot.score(np.arange(len(angles)) / hidden.RATE_HZ, states)["reached"])
+        return found
 
     def targets(self) -> tuple[Any, Any]:
         """Return between which joint angles targets are [rad]."""
@@ -140,8 +165,8 @@ class ReachingArm:
     def _robot(self) -> Any:
         return load_pipeline(self.pipeline).load()
 
-    def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> None:
-        """Run the loop on a simulated clock, from rest, and write its log."""
+    def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> np.ndarray:
+        """Run the loop on a simulated clock, from rest, and write its log; return the true angles ``(N, joints)``."""
         robot, rng = self._robot, np.random.default_rng([self.number, session, 1])
         plant: Any = load_plant(robot.embedded.plant, self.plant)
         sheet, rest = robot.servos.sheet, robot.servos.at_rest
@@ -155,7 +180,7 @@ class ReachingArm:
         gate.reset(rest)
         goal, count, acts_ns = np.asarray(rest, float), int(seconds * hidden.RATE_HZ), 0
         starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
-        readings, commands = [], []
+        readings, commands, angles = [], [], []
         for k in range(count):
             at = k / hidden.RATE_HZ
             for node, took in (("sensor", 1.2e-3), ("agent", 1e-4), ("actuator", 6e-4)):
@@ -168,7 +193,8 @@ class ReachingArm:
             angle = np.round(rows[:, 0] / hidden.COUNT_RAD) * hidden.COUNT_RAD - zero
             speed = np.round(rows[:, 1] / hidden.SPEED_COUNT_RAD_S) * hidden.SPEED_COUNT_RAD_S
             readings.append({"position": np.float32(angle), "velocity": np.float32(speed)})
-            goal = gate.apply(policy(k, goal), 0.0, float(ends["agent"][k]), speed)
+            angles.append(plant.data.qpos.copy())
+            goal = gate.apply(policy(k, goal, JointReading(**readings[-1])), 0.0, float(ends["agent"][k]), speed)
             commands.append({"goal": np.float32(goal)})
             sent_ns = round(1e9 * (ends["actuator"][k] + self.acting_s * rng.uniform(0.85, 1.15)))
             acts_ns = max(acts_ns, sent_ns)
@@ -176,7 +202,31 @@ class ReachingArm:
                 wanted = round((own + offset) / hidden.COUNT_RAD) * hidden.COUNT_RAD
                 clock.schedule(acts_ns, 0, servo_id, OperatingMode.POSITION, wanted)
         truth.close()
-        hidden.write_log(path, self.pipeline, (starts, ends), readings, commands, robot.units)
+        if path != Path(os.devnull):
+            hidden.write_log(path, self.pipeline, (starts, ends), readings, commands, robot.units)
+        return np.array(angles)
+
+
+def trained(robot: Any, bundle: Any, aim: np.ndarray) -> Policy:
+    """Return a policy that was trained, as the robot runs it.
+
+    Args:
+        robot: Its pipeline's.
+        bundle: The policy.
+        aim: What the episode is about.
+    """
+    agent, runner, rest = robot.make_agent(), bundle.runner(), np.asarray(robot.servos.at_rest, np.float32)
+    past = np.zeros((robot.history, 3 * len(rest)), np.float32)
+    step = StepState(params=AgentParams(aim=np.float32(aim), start=rest), state=AgentState(rest, past))
+
+    def act(k: int, goal: np.ndarray, reading: JointReading) -> np.ndarray:
+        nonlocal step
+        del k, goal
+        step = step.replace(inputs={robot.roles.sensor: [SimpleNamespace(data=reading)]})
+        step, decision = agent.act(step, runner.act(agent.observe(step)))
+        return decision.goal
+
+    return act
 
 
 class ReachingSO101(ReachingArm):
@@ -184,7 +234,9 @@ class ReachingSO101(ReachingArm):
 
     pipeline = "so101"
     links_kg = 0.485
-    defaults: ClassVar[dict[str, float]] = {"record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 40}
+    defaults: ClassVar[dict[str, float]] = {
+        "record_s": 40.0, "seconds": 16.0, "episodes": 2, "generations": 40, "steps": 2_000_000, "envs": 256
+    }  # fmt: skip
 
     @classmethod
     def servos(cls, rng: np.random.Generator) -> dict[str, Any]:

@@ -34,7 +34,10 @@ class Pendulum:
     before: hidden.Hidden
     number: int
     pipeline: ClassVar[str] = "pendulum"
-    defaults: ClassVar[dict[str, float]] = {"record_s": 40.0, "seconds": 10.0, "episodes": 2, "generations": 80}
+    defaults: ClassVar[dict[str, float]] = {
+        "record_s": 40.0, "seconds": 10.0, "episodes": 2, "generations": 80,
+        "steps": 1_000_000, "envs": 256,
+    }  # fmt: skip
     causes: ClassVar[dict[str, str]] = {"friction": "friction", "payload": "payload", "delay": "round_trip_delay"}
 
     @staticmethod

@@ -6,10 +6,12 @@ import time
 from argparse import Namespace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from sim2real.log.reader import read_log
+from sim2real.stages.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.drift_arms import ReachingArm, ReachingSO101
@@ -101,3 +103,37 @@ def test_a_robot_whose_process_is_killed_loses_no_other(tmp_path, monkeypatch):
     found, failed = robots(importlib.import_module("killed_task").one, range(3), Namespace(jobs=2))
     assert [robot["number"] for robot in found] == [0, 2]
     assert failed == [{"number": 1, "failed": "its process was killed"}]
+
+
+class Solved:
+    """Stands for a trained policy: it moves the goals to where the model's tip is at the target, or not at all."""
+
+    def __init__(self, robot, aim, still=False):
+        self.robot, self.aim, self.goal, self.still = robot, aim, robot.servos.at_rest, still
+        self.tip = sys.modules[type(robot).__module__].tip_of
+
+    def runner(self):
+        return self
+
+    def act(self, observation):
+        assert observation.dtype == np.float32
+        assert observation.shape == (sum(t.size * t.history for t in self.robot.observation),)
+        servos, small = self.robot.servos, 1e-5
+        off = self.aim[:3] - self.tip(np, self.goal)
+        moved = self.goal + small * np.eye(len(self.goal))
+        J = ((self.tip(np, moved) - self.tip(np, self.goal)) / small).T
+        speed = 4.0 * J.T @ np.linalg.solve(J @ J.T + 1e-4 * np.eye(3), off)
+        if len(self.aim) > 3:
+            speed[-1] = 4.0 * (self.aim[3] - self.goal[-1])
+        speed = np.clip(speed, -servos.speed, servos.speed) * (not self.still)
+        self.goal = np.clip(self.goal + speed / self.robot.rate_hz, servos.low, servos.high)
+        return speed.astype(np.float32)
+
+
+@KINDS
+@pytest.mark.parametrize("still", [False, True])
+def test_a_trained_policy_succeeds_where_it_brings_the_robots_own_tip_to_the_target(kind, still):
+    robot = load_pipeline(kind.pipeline).load()
+    aim = np.asarray(robot.draw_aim(jax.random.key(100)))
+    found = kind.draw(0).success(Solved(robot, aim, still), Namespace(trials=1))
+    assert found == [0.0 if still else 1.0]
