@@ -21,6 +21,8 @@ from sim2real.identify.uncertainty import linearise
 
 _GAIN = 1e-3
 """On C, a step that gains a smaller share of a part's loss is its last: errors are told with two digits."""
+_ENOUGH = 0.03
+"""In a program, a step that moves the residuals by less of their size: near the optimum that is 1e-3 of the loss."""
 MOVES = 10.0
 """A joint moves where its positions spread over so many deviations of a measurement."""
 
@@ -133,7 +135,8 @@ def leave_out(
         own = table.of_terms(chosen)
         # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
         start = table.at_scale(stats.x + stats.step(table, chosen, k, bounded=True))
-        z = refine(problem, start[None], *effort(problem), data=problem.part(problem.train[mask], own), gain=_GAIN).z
+        rest = problem.part(problem.train[mask], own)
+        z = refine(problem, start[None], *effort(problem), data=rest, gain=_GAIN, enough=_ENOUGH).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}

@@ -67,6 +67,13 @@ def test_a_start_at_the_optimum_stays(minimum):
     np.testing.assert_allclose(found.z, start[0], atol=1e-3)
 
 
+def test_a_round_ends_when_steps_hardly_move_the_residuals(minimum):
+    start = minimum.x[None] + 0.1  # as for a part that is left out: from near the end
+    all_steps, few = (refine(stub(valley), start, steps=50, rounds=1, enough=enough) for enough in (0.0, 0.03))
+    assert few.steps < all_steps.steps
+    assert few.loss == pytest.approx(minimum.cost / 3, rel=2e-3)
+
+
 def test_what_is_worse_by_the_full_loss_is_not_accepted():
     """Held directions promise what the loss does not keep."""
     problem = stub(valley)
