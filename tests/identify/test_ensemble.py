@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_folds import CONFIG, LENGTH_S, PERIOD_S, TICK_S, Actuator, Lag, Level, Model, Sensor, lag_log, spans
+from test_folds import CONFIG, LENGTH_S, TICK_S, Lag, Level, Model, lag_log, spans
 
 from sim2real.identify import ensemble
 from sim2real.identify.fit import fit
@@ -86,22 +86,13 @@ class Clipped(Lag):
 class Limited(Model):
     """Inputs go up to 1; the data sheet says that its limit is 1.5."""
 
+    world = Clipped
     parameters = ParameterTable(
         [
             *(p for p in Model.parameters if p.name != "square"),
             Parameter("most", "1", 1.5, 0.3, 3.0, begin=0.5, limits=True, leaf="world.square"),
         ]
     )
-
-    def nodes(self, max_delay_s):
-        world, sensor, actuator = (
-            Clipped("world", 1 / TICK_S),
-            Sensor("sensor", 1 / PERIOD_S),
-            Actuator("actuator", 1 / PERIOD_S),
-        )
-        world.connect(actuator, skip=True)
-        sensor.connect(world)
-        return {n.name: n for n in (sensor, actuator, world)}
 
 
 def test_a_limit_that_no_motion_reaches_is_the_data_sheets_and_draws_are_above_what_was_reached():

@@ -88,6 +88,7 @@ class Actuator(BaseNode):
 class Model:
     """What a pipeline provides."""
 
+    world = Lag
     sensor = "sensor"
     ahead_s = 0.0
     given = {"actuator": Command(u="u")}  # noqa: RUF012
@@ -104,7 +105,7 @@ class Model:
 
     def nodes(self, max_delay_s):
         world, sensor, actuator = (
-            Lag("world", 1 / TICK_S),
+            self.world("world", 1 / TICK_S),
             Sensor("sensor", 1 / PERIOD_S),
             Actuator("actuator", 1 / PERIOD_S),
         )
