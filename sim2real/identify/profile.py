@@ -35,21 +35,15 @@ class Profile:
     moves: np.ndarray
     residuals: np.ndarray
 
-    def ends(self) -> tuple[float, float] | None:
-        """Return the last value that is good enough and the next one; None where the data does not bound the parameter.
-
-        Good enough is what a one-sided interval of 95 % holds.
-        """
+    def last(self) -> int | None:
+        """Return the number of the last value in a one-sided interval of 95 %; None where nothing bounds it."""
         good = np.flatnonzero(self.worse <= ONE_SIDED**2)
-        if not len(good) or good[-1] + 1 == len(self.values):
-            return None
-        return float(self.values[good[-1]]), float(self.values[good[-1] + 1])
+        return int(good[-1]) if len(good) and good[-1] + 1 < len(self.values) else None
 
     def bound(self) -> float | None:
         """Return the end of a one-sided interval of 95 %; None where the data does not bound the parameter."""
-        if self.ends() is None:
+        if (a := self.last()) is None:
             return None
-        a = np.flatnonzero(self.worse <= ONE_SIDED**2)[-1]
         # The square root grows like the value itself, as in a linear model.
         return float(np.interp(ONE_SIDED, np.sqrt(self.worse[[a, a + 1]]), self.values[[a, a + 1]]))
 
@@ -86,8 +80,9 @@ def profile(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty
         return over(np.concatenate([[0.0], np.geomspace(p.low, p.high, _VALUES - 1)]))
     found = over(np.geomspace(p.high, p.low, _VALUES))
     # The model is as good down to what was reached, and soon much worse: where, the wide steps do not say.
-    ends = found.ends()
-    return found if ends is None else over(np.concatenate([[p.high], np.geomspace(*ends, _VALUES - 1)]))
+    if (a := found.last()) is None:
+        return found
+    return over(np.concatenate([[p.high], np.geomspace(found.values[a], found.values[a + 1], _VALUES - 1)]))
 
 
 def worse_with(

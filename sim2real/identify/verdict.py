@@ -163,18 +163,7 @@ def judge(
     known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
-    reasons += [
-        f"{name} is negligible: at most {spread.high[i]:.2g} {table.columns[i].parameter.unit} (95 %), and without it "
-        "the model predicts the same"
-        for i, name in enumerate(table.names)
-        if spread.verdict[i] == "negligible"
-    ]
-    reasons += [
-        f"{name} is not reached: it is at least {spread.low[i]:.2g} {table.columns[i].parameter.unit} (95 %), and no "
-        "value above that changes what the model says of these recordings"
-        for i, name in enumerate(table.names)
-        if spread.verdict[i] == "not reached"
-    ]
+    reasons += _absent(table, spread)
     reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)
@@ -196,6 +185,21 @@ def judge(
     elif loose:
         status = "not identifiable"
     return Verdict(status, tuple(reasons), flags)
+
+
+def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
+    """Return a sentence about each parameter that may as well be absent."""
+    said = []
+    for i, name in enumerate(table.names):
+        unit = table.columns[i].parameter.unit
+        if spread.verdict[i] == "negligible":
+            bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
+            said.append(f"{name} is negligible: {bound}, and without it the model predicts the same")
+        elif spread.verdict[i] == "not reached":
+            bound = f"it is at least {spread.low[i]:.2g} {unit} (95 %)"
+            above = "no value above that changes what the model says of these recordings"
+            said.append(f"{name} is not reached: {bound}, and {above}")
+    return said
 
 
 def _on_held_out(found: Sequence[Score]) -> tuple[bool, list[str]]:
