@@ -124,7 +124,7 @@ class ArmPlant:
     ) -> None:
         self._stall, self._back_emf, self._armature = stall * _STALL, back_emf * _BACK_EMF, armature * _ARMATURE
         self._coulomb = [factor * _COULOMB for factor in coulomb]
-        self._bump = bump
+        self._bump, self._carried_kg = bump, carried_kg
         # As stiff as the solver bears: at the default impedance an arm that friction should hold crawls.
         carried = _CARRIED.format(carried_kg) if carried_kg else ""
         sizes = {"armature": self._armature, "viscous": _VISCOUS, "carried": carried}
@@ -180,7 +180,7 @@ class ArmPlant:
         return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can tell: position gain [N m/rad], damping [N m s/rad], armature [kg m^2], friction [N m].
+        """Return what a log can tell: position gain [N m/rad], damping, armature, friction, payload, in SI units.
 
         The gain is servo 1's, at the P gain that it has now; friction is the level at speed, without the bump.
         """
@@ -192,4 +192,5 @@ class ArmPlant:
             "friction_pan": self._coulomb[0],
             "friction_shoulder": self._coulomb[1],
             "friction_elbow": self._coulomb[2],
+            "payload": self._carried_kg,
         }

@@ -13,19 +13,15 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.graph.base import Array
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.identify.model import IdentifiableModel
 from sim2real.robots import standard
 from sim2real.robots.hardware import Embedded
 from sim2real.robots.messages import JointReading
-from sim2real.robots.payload import Hand, with_payload
+from sim2real.robots.payload import Hand
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, LINK_M, SHEET, Arm
 from .task import CLOSE_M, HIGH, LOW, Reach, tip_of
-
-HAND = Hand("elbow", (0.0, 0.0, -LINK_M), most_kg=0.3)
-"""The tip."""
 
 
 class ArmRobot(ServoRobot):
@@ -41,6 +37,7 @@ class ArmRobot(ServoRobot):
     )
     probe = Probe(step=0.12, lag_s=0.0115)
     causes = standard.causes(JOINTS)
+    hand = Hand("elbow", (0.0, 0.0, -LINK_M), most_kg=0.3, least_kg=-0.044)  # the tip; the link has 55 g
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"))
     features = (
         ("position", ("rad",) * 3, 5.0),
@@ -61,10 +58,6 @@ class ArmRobot(ServoRobot):
             reply_loss=0.001,
         )
         return Embedded(plant, emulator)
-
-    def watched(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model with what may change between deployments, a payload at the tip among it."""
-        return with_payload(self, HAND, max_delay_s)
 
     def make_task(self) -> Reach:
         """Return the task; where the target is, the graph's parameters say."""

@@ -118,6 +118,7 @@ class SO101Plant:
         carried = _CARRIED.format(carried_kg) if carried_kg else ""
         sizes = {"armature": _ARMATURE, "damping": _OFF_DAMPING, "carried": carried}
         text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)
+        self._carried_kg = carried_kg
         self._gain, self._levels = gain * _GAIN, [friction * level for level in _FRICTION]
         self.model = MjModel.from_xml_string(text)
         self.data = MjData(self.model)
@@ -185,6 +186,7 @@ class SO101Plant:
             **{f"goal_offset_{j}": b for j, b in zip(joints, _BIAS_RAD, strict=True)},
             "saturation": _SATURATION_RAD[0],
             **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},
+            "payload": self._carried_kg,
         }
 
     def _torque(self, joint: int, angle: float) -> float:

@@ -21,12 +21,11 @@ from sim2real.hardware.device import Device
 from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.registry import load_device
-from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots import standard
 from sim2real.robots.hardware import Embedded, ServoSession
 from sim2real.robots.messages import JointReading
-from sim2real.robots.payload import Hand, with_payload
+from sim2real.robots.payload import Hand
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
@@ -39,9 +38,8 @@ CALIBRATION = "SO101_CALIBRATION"
 """Environment variable that names the calibration of the arm on the port."""
 SATURATES = ("wrist_roll", "gripper")
 """Joints whose servos may push no harder from a smaller error on than the others: each has a limit of its own."""
-
-HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5)
-"""Between the jaws."""
+HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5, least_kg=-0.07)
+"""Between the jaws; the link has 87 g."""
 
 
 class SO101Robot(ServoRobot):
@@ -65,6 +63,7 @@ class SO101Robot(ServoRobot):
     )
     probe = Probe(step=0.12, lag_s=-0.004)
     causes = standard.causes(JOINTS)
+    hand = HAND
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
         ("position", ("rad",) * 6, 5.0),
@@ -94,7 +93,8 @@ class SO101Robot(ServoRobot):
         full, about = SHEET.full_rad, "error from which on it pushes no harder"
         limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
         # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
-        return [*found, limit, *(replace(limit, name=f"saturation_{j}", begin=full / 4) for j in SATURATES)]
+        limits = [limit, *(replace(limit, name=f"saturation_{j}", begin=full / 4) for j in SATURATES)]
+        return [*found, *limits, HAND.parameter()]
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
         """Open the arm with the calibration of the one on this port, with torque off; see ``Robot.connect``."""
@@ -106,10 +106,6 @@ class SO101Robot(ServoRobot):
             return load_device(s.device)(port, s.ids, drive, baud_rate=s.baud_rate, silence_s=limits.servo_watchdog_s)
 
         return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
-
-    def watched(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model with what may change between deployments, a payload at the tip among it."""
-        return with_payload(self, HAND, max_delay_s)
 
     def make_task(self) -> Reach:
         """Return the task; where the target is, the graph's parameters say."""

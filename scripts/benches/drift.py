@@ -188,39 +188,53 @@ def restored(
     """
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
-    from sim2real.stages.next_step import logs_to_identify
+    from sim2real.stages.next_step import logs_to_identify, terms_to_identify
 
     if said["verdict"] != "re-identify":
         return {"success": said["success"], "from": "not done"}
     own: list[Path] = []
     if said["named"] != ROUND_TRIP:  # that is refused before the policy moves anything: there is no such log
         own = [Path(log) for log in logs_to_identify(logs, drifted, identified, logs[0].parent)]
+    terms = terms_to_identify(pipeline.identify.terms, pipeline, identified, drifted)
     try:
-        again = identify(pipeline, own, now.number, options) if own else None
+        again = identify(pipeline, own, now.number, options, terms) if own else None
     except Sim2RealError:
         again = None
     if again is None or again.verdict.status != "accepted":
         own = [logs[0].with_name(f"{change}_session.mcap")]
         now.record(own[0], options.record_s, 1000)
-        again = identify(pipeline, own, now.number, options)
+        again = identify(pipeline, own, now.number, options, terms)
     bundle, _ = sim2real.train(pipeline, randomise.train_config(pipeline, "all", now.number, options), again)
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
-    return {"success": success, "from": [log.name for log in own], "verdict": again.verdict.status}
+    wider = {p.name: p.upper for p in again.parameters if p.upper != _upper(identified, p.name)}
+    found = {"verdict": again.verdict.status, "misfit": again.misfit, "terms": terms, "bounds": wider}
+    return {"success": success, "from": [log.name for log in own], **found}
 
 
-def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Namespace) -> Any:
-    """Return what logs say about a robot.
+def _upper(found: Any, name: str) -> float | None:
+    return next((p.upper for p in found.parameters if p.name == name), None)
+
+
+def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Namespace, terms: str = "own") -> Any:
+    """Return what logs say about a robot; with wider bounds, once, where an estimate lies at one, as a run does it.
 
     Args:
         pipeline: The robot's.
         logs: The logs.
         number: The robot's.
         options: Flags of the bench.
+        terms: Optional terms of the model.
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
+    from sim2real.stages.next_step import with_wider_bounds
 
-    config = replace(pipeline.identify, folds=options.folds, generations=options.generations, seed=number)
+    few = {"folds": options.folds, "generations": options.generations}
+    config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
-    return sim2real.identify(recordings if len(recordings) > 1 else recordings[0], pipeline, config)
+    found = sim2real.identify(recordings, pipeline, config)
+    if found.verdict.status != "hit a bound":
+        return found
+    wider = with_wider_bounds(config, found.verdict.next)
+    return found if wider == config else sim2real.identify(recordings, pipeline, wider)

@@ -1,4 +1,4 @@
-"""What a robot of servos holds in its hand: it is not identified, but tested for when a deployment is judged."""
+"""What a robot of servos holds in its hand: an optional term of its model, and tested for after each deployment."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
-from sim2real.identify.model import Channel
+from sim2real.composer.models.translate import mj
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.devices import SimActuator
-from sim2real.robots.identifiable import IdentifiableLoop
-from sim2real.robots.roles import Roles
-from sim2real.robots.servo_robot import ServoRobot
-from sim2real.robots.simulated import ServoWorld
+from sim2real.robots.parts import GoalTask
 
+PAYLOAD = "payload"
+"""Name of the parameter, and of its term."""
 _MASS, _CENTRE = "mass of the hand", "centre of the hand"
 
 
@@ -23,77 +22,63 @@ _MASS, _CENTRE = "mass of the hand", "centre of the hand"
 class Hand:
     """Where a robot holds things.
 
+    Its inertia about its own centre is left out: behind gears the rotors' is larger by far.
+
     Attributes:
         joint: The joint that moves the hand.
         at_m: Where a payload is in the frame of the link that this joint moves [m].
         most_kg: What it can bear.
+        least_kg: What it may hold less than when the robot was identified, as a negative number; the link that the
+            joint moves weighs more.
     """
 
     joint: str
     at_m: tuple[float, float, float]
     most_kg: float
+    least_kg: float = 0.0
 
-
-class Loaded:
-    """A robot of servos as ``IdentifiableLoop`` takes it, with one parameter more: a payload, a point mass [kg].
-
-    Its inertia about its own centre is left out: behind gears the rotors' is larger by far.
-
-    Args:
-        robot: The robot.
-        hand: Where the payload is.
-    """
-
-    def __init__(self, robot: ServoRobot, hand: Hand) -> None:
-        self._robot, self._hand = robot, hand
-        self.roles: Roles = robot.roles
-        self.rate_hz, self.tick_s, self.lead_s = robot.rate_hz, robot.tick_s, robot.lead_s
-        self.channels: tuple[Channel, ...] = robot.channels
-        self._body = robot.task.robot.servos[robot.servos.names.index(hand.joint)].horn.parent
-        own = self.make_world().init_params().values
-        self._mass, self._centre = own[_MASS][0], own[_CENTRE][0]
-
-    def dynamics(self) -> list[Parameter]:
-        """Return the robot's parameters, and the payload: nothing, but for what was identified as part of the robot."""
-        least = -0.8 * float(self._mass)
+    def parameter(self) -> Parameter:
+        """Return the payload: nothing, unless the term is asked for, as a gain and a mass are told apart less well."""
         about = "mass in the hand, beyond that of the model"
-        return [
-            *self._robot.dynamics(),
-            Parameter("payload", "kg", 0.0, least, self._hand.most_kg, "linear", about=about),
-        ]
+        return Parameter(
+            PAYLOAD, "kg", 0.0, self.least_kg, self.most_kg, "linear", about=about, free=False, term=PAYLOAD, off=0.0
+        )
 
-    def make_world(self, resumed: bool = False) -> ServoWorld:
-        """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
-        task = self._robot.task
-        fields = {_MASS: ([self._body], "mass"), _CENTRE: ([self._body], "ipos"), **self._robot.fields(task)}
-        worn = self._robot.servos.sheet.worn
-        return ServoWorld(self.roles.world, task, fields, resumed, self.roles.actuator, worn)
+    def body(self, task: GoalTask) -> Any:
+        """Return the link in a composed task that holds things."""
+        return next(servo for servo in task.robot.servos if servo.mjcf_model.model == self.joint).horn.parent
 
-    def sim_actuator(self) -> SimActuator:
-        """Return the bus in simulation."""
-        return self._robot.sim_actuator()
+    def fields(self, task: GoalTask) -> dict[str, tuple[Any, str]]:
+        """Return the parts of a composed model that the payload sets: name -> (elements, attribute)."""
+        link = [self.body(task)]
+        return {_MASS: (link, "mass"), _CENTRE: (link, "ipos")}
 
-    def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        """Return parameters of world, sensor and actuator for an episode in the middle of a recording.
+    def loaded(self, mjcf: str, task: GoalTask, values: Mapping[str, Any]) -> str:
+        """Return a model's MJCF with what the hand holds.
 
         Args:
+            mjcf: The composed model.
+            task: Of which it is the model.
             values: Parameters by name.
-            start: Shape ``(2 * channels,)``: positions, then velocities.
         """
-        params = self._robot.resumed_params(values, start)
-        mass = self._mass + values["payload"]
-        centre = (self._mass * self._centre + values["payload"] * jnp.asarray(self._hand.at_m)) / mass
-        world = params[self.roles.world]
-        carried = {_MASS: mass[None], _CENTRE: centre[None]}
-        return {**params, self.roles.world: world.replace(values={**world.values, **carried})}
+        spec: Any = mj.MjSpec.from_string(mjcf)
+        model, body = spec.compile(), spec.body(self.body(task).full_identifier)
+        own = model.body(body.name)
+        placed = self.place(values, {_MASS: own.mass, _CENTRE: own.ipos[None]})
+        body.explicitinertial, body.mass, body.ipos = True, float(placed[_MASS][0]), np.asarray(placed[_CENTRE][0])
+        body.iquat, body.inertia = own.iquat, own.inertia
+        body.fullinertia = np.full(6, np.nan)
+        spec.compile()
+        return spec.to_xml()
 
+    def place(self, values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the arrays of ``fields``.
 
-def with_payload(robot: ServoRobot, hand: Hand, max_delay_s: float) -> IdentifiableLoop:
-    """Return a robot's model for identification, with the payload in its hand.
-
-    Args:
-        robot: The robot.
-        hand: Where the payload is.
-        max_delay_s: Upper bound of each of the two delays [s].
-    """
-    return IdentifiableLoop(Loaded(robot, hand), max_delay_s)
+        Args:
+            values: Parameters by name; without a payload among them there is none.
+            own: The arrays of ``fields`` of a hand that holds nothing.
+        """
+        carried = jnp.asarray(values.get(PAYLOAD, 0.0), jnp.float32)
+        mass, centre = own[_MASS], own[_CENTRE]
+        total = mass + carried
+        return {_MASS: total, _CENTRE: (mass * centre + carried * jnp.asarray(self.at_m)) / total}

@@ -30,10 +30,12 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.hardware import Embedded, ServoSession
+from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.parts import REFERENCE, GoalTask
+from sim2real.robots.payload import PAYLOAD, Hand
 from sim2real.robots.seen import Feature, servo_terms
 from sim2real.robots.servos import Servos
 from sim2real.robots.simulated import ServoWorld
@@ -52,6 +54,7 @@ class ServoRobot(LoopRobot):
         features: What the policy sees of the present: names and units; see ``observe``. A third entry is the largest
             magnitude that its values can have, where that is known.
         history: Past steps that the policy sees.
+        hand: Where it holds things, if it does: what is in there is an optional term, ``payload``.
         position_sigma_rad: Deviation of a measured position.
         velocity_sigma_rad_s: Deviation of a measured velocity.
     """
@@ -66,6 +69,7 @@ class ServoRobot(LoopRobot):
     aim: tuple[tuple[str, str], ...] = ()
     features: tuple[Feature, ...] | None = None
     history: int = 3
+    hand: Hand | None = None
     position_sigma_rad: float = 0.002
     velocity_sigma_rad_s: float = 0.05
 
@@ -91,17 +95,27 @@ class ServoRobot(LoopRobot):
 
     def dynamics(self) -> list[Parameter]:
         """Return the parameters of the model that may be identified, at their data sheet's values."""
-        return standard.parameters(self.servos.sheet, self.servos.joints)
+        own = standard.parameters(self.servos.sheet, self.servos.joints)
+        return [*own, self.hand.parameter()] if self.hand else own
+
+    def watched(self, max_delay_s: float) -> IdentifiableLoop:
+        """Return the model with what may change between deployments, what the hand holds among it."""
+        model = self.identifiable(max_delay_s)
+        if self.hand:
+            model.parameters = model.parameters.with_terms([*model.parameters.terms, PAYLOAD])
+        return model
 
     def fields(self, task: GoalTask) -> Mapping[str, tuple[Any, str]]:
         """Return what of the model differs from copy to copy: name -> (elements, attribute)."""
-        return {**standard.fields(task.robot), **self.aim_fields(task)}
+        held = self.hand.fields(task) if self.hand else {}
+        return {**standard.fields(task.robot), **held, **self.aim_fields(task)}
 
     def place(self, values: Mapping[str, Any], aim: Any) -> dict[str, Any]:
         """Return the arrays of ``fields`` for parameters by name and an aim ``(k,)``."""
         s = self.servos
         own = standard.place(values, s.sheet, s.joints, self.task.physics_timestep)
-        return {**own, **self.place_aim(aim)}
+        held = self.hand.place(values, self._world_params.values) if self.hand else {}
+        return {**own, **held, **self.place_aim(aim)}
 
     def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return a robot inside the computer that is made of this one's model.
@@ -379,7 +393,8 @@ class ServoRobot(LoopRobot):
         """Return the robot's model with what was found, as MJCF."""
         s, task = self.servos, self.task
         text = task.root_entity.mjcf_model.root_model.to_xml_string()
-        return standard.identified_mjcf(text, task.robot, values, s.sheet, s.joints)
+        mjcf = standard.identified_mjcf(text, task.robot, values, s.sheet, s.joints)
+        return self.hand.loaded(mjcf, task, values) if self.hand else mjcf
 
     def _bring_home(self, session: ServoSession, position: np.ndarray) -> None:
         rig, way = session.rig, self.servos.at_rest - position

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -108,18 +108,25 @@ def segments(
     if len(spans) < _LEAST or seconds < _LEAST_S:
         moving = f", {length_s * len(spans):.1f} s of them in motion,"
         raise Sim2RealError(f"{seconds:.1f} s of deployment{moving} are too little to test the model on")
-    return Problem(model, list(episodes), spans, length_s, config, known_table(model.parameters, found)), ahead_s
+    own = {p.name for p in robot.identifiable(config.max_delay_s).parameters if p.free}
+    watched = {p.name for p in model.parameters if p.free} - own
+    table = known_table(model.parameters, found, watched)
+    return Problem(model, list(episodes), spans, length_s, config, table), ahead_s
 
 
-def known_table(parameters: ParameterTable, found: Identification) -> ParameterTable:
-    """Return parameters with what was fixed when they were identified, and with bounds that hold all of the search's.
+def known_table(parameters: ParameterTable, found: Identification, watched: Container[str] = ()) -> ParameterTable:
+    """Return parameters with the terms that were identified and what was fixed then, and bounds that hold the search's.
 
     Args:
         parameters: The model's.
         found: What was identified.
+        watched: Names of those that stay free though they were fixed, from what they were taken to be: a payload.
     """
+    terms = {p.term for p in parameters if p.term and (p.free or p.term in (found.terms or ()))}
     fixed = {p.name: p.estimate for p in found.parameters if p.verdict == "fixed"}
-    table = parameters.with_fixed({n: v for n, v in fixed.items() if n in {p.name for p in parameters}})
+    known = {n: v for n, v in fixed.items() if n in {p.name for p in parameters}}
+    table = parameters.with_terms(terms).with_nominal(known)
+    table = table.with_fixed({n: v for n, v in known.items() if n not in watched})
     free = {p.name for p in table if p.free}
     wider = {
         p.name: (min(p.lower, table[p.name].low), max(p.upper, table[p.name].high))

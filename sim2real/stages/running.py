@@ -13,6 +13,8 @@ from sim2real.stages import console, targets
 
 if TYPE_CHECKING:
     from sim2real.artifacts.deployment import Deployment
+    from sim2real.artifacts.drift import Drift
+    from sim2real.artifacts.identification import Identification
     from sim2real.artifacts.iterations import Iteration
     from sim2real.stages.flags import RunFlags
     from sim2real.stages.pipeline import Pipeline
@@ -57,7 +59,10 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
         redo = True  # what comes after a stage that ran again is out of date
         console.note(f"{stage} ({number}/{len(STAGES)})")
         try:
-            ran.append(call(stage, getattr(flags, stage), run_dir))
+            if stage == "identify":
+                ran += _identified(call, flags.identify, run_dir)[0]
+            else:
+                ran.append(call(stage, getattr(flags, stage), run_dir))
         except DelayChanged as error:
             if flags.iterations == 1 or run_dir is None:
                 raise
@@ -98,7 +103,7 @@ def _go_around(
             row, plan = _judged(row, pipeline, flags, run_dir)
         else:  # nothing else of this robot is recorded yet
             row = replace(row, verdict="re-identify", why=str(refused.args[0]))
-            plan = _anew(flags, run_dir)
+            plan = _anew(pipeline, flags, run_dir)
         if plan.configs and not left:
             plan = Plan({}, f"the last iteration: it would {plan.words}")
         row = replace(row, then=plan.words)
@@ -138,21 +143,44 @@ def _ran(flags: RunFlags, call: Call, run_dir: Path, stage: str, config: Any) ->
     Returns:
         What each stage that ran left.
     """
-    from sim2real.artifacts.identification import Identification
-
-    if stage != "identify" or not config.log:
+    if stage != "identify":
         return [call(stage, config, run_dir)]
+    if not config.log:
+        return _identified(call, config, run_dir)[0]
     ran: list[StageFolder] = []
     try:
-        ran.append(call("identify", config, run_dir))
-        why = Identification.load(ran[0].output("parameters")).verdict.status
+        ran, why = _identified(call, config, run_dir)
     except Sim2RealError as error:
         why = str(error.args[0])
     if why == "accepted":
         return ran
     console.note(f"the deployment's own logs do not suffice ({why}): record, identify from that")
     ran.append(call("record", flags.record, run_dir))
-    return [*ran, call("identify", replace(config, log=()), run_dir)]
+    return [*ran, *_identified(call, replace(config, log=()), run_dir)[0]]
+
+
+def _identified(call: Call, config: Any, run_dir: Path | None) -> tuple[list[StageFolder], str]:
+    """Identify; again with wider bounds, once, where an estimate lies at one: a worn robot leaves a data sheet's.
+
+    Args:
+        call: Runs a stage.
+        config: Of the identification.
+        run_dir: The run's folder.
+
+    Returns:
+        What each identification left, and the status of the last one.
+    """
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.next_step import with_wider_bounds
+
+    ran = [call("identify", config, run_dir)]
+    verdict = Identification.load(ran[0].output("parameters")).verdict
+    wider = with_wider_bounds(config, verdict.next)
+    if verdict.status == "hit a bound" and wider != config:
+        console.note(f"an estimate lies at a bound; once more, as the verdict says: {verdict.next}")
+        ran.append(call("identify", wider, run_dir))
+        verdict = Identification.load(ran[-1].output("parameters")).verdict
+    return ran, verdict.status
 
 
 def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:
@@ -175,10 +203,23 @@ def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) 
     return row, next_plan(pipeline, flags, run_dir, deployed, result)
 
 
-def _anew(flags: RunFlags, run_dir: Path) -> Plan:
+def _anew(pipeline: Pipeline, flags: RunFlags, run_dir: Path, drift: Drift | None = None) -> Plan:
     """Return all stages, for a robot of which nothing recorded is true any more."""
-    new = {"record": flags.record, "identify": replace(flags.identify, log=()), **_trained_again(flags, run_dir)}
-    return Plan(new, ALL)
+    from sim2real.stages.next_step import terms_to_identify
+
+    terms = terms_to_identify(flags.identify.terms, pipeline, _found(pipeline, run_dir), drift)
+    identify = replace(flags.identify, log=(), terms=terms)
+    return Plan({"record": flags.record, "identify": identify, **_trained_again(flags, run_dir)}, ALL)
+
+
+def _found(pipeline: Pipeline, run_dir: Path) -> Identification:
+    """Return what the run identified last."""
+    from sim2real.artifacts.identification import Identification
+
+    identified = finished(run_dir, "identify")
+    if identified is None:
+        raise Sim2RealError("this run has no identification", hint=f"sim2real identify {pipeline.name}")
+    return Identification.load(identified.output("parameters"))
 
 
 def _trained_again(flags: RunFlags, run_dir: Path) -> dict[str, Any]:
@@ -198,8 +239,7 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
         deployed: The deployment's folder.
         result: What it found.
     """
-    from sim2real.artifacts.identification import Identification
-    from sim2real.stages.next_step import logs_to_identify, needs_timing
+    from sim2real.stages.next_step import logs_to_identify, needs_timing, terms_to_identify
 
     if flags.goal and _reached(result, *flags.goal):
         return Plan({}, "stop: {} is at least {:g}".format(*flags.goal))
@@ -211,16 +251,14 @@ def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: Stag
     train = _trained_again(flags, run_dir)
     if advice.status != "re-identify" and not needs_timing(advice):
         return Plan(train, "train with another seed, deploy")
-    identified = finished(run_dir, "identify")
-    if identified is None:
-        raise Sim2RealError("this run has no identification", hint=f"sim2real identify {pipeline.name}")
+    found = _found(pipeline, run_dir)
     own = [path for name, path in sorted(deployed.outputs.items()) if name.startswith("log_") or name == "probe"]
-    found = Identification.load(identified.output("parameters"))
     logs = logs_to_identify(own, result.drift, found, deployed.folder)
     if not logs:
-        return _anew(flags, run_dir)
+        return _anew(pipeline, flags, run_dir, result.drift)
+    terms = terms_to_identify(flags.identify.terms, pipeline, found, result.drift)
     words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
-    return Plan({"identify": replace(flags.identify, log=logs), **train}, words)
+    return Plan({"identify": replace(flags.identify, log=logs, terms=terms), **train}, words)
 
 
 def _reached(result: Deployment, quantity: str, least: float) -> bool:

@@ -12,7 +12,7 @@ PIPELINE = load_pipeline("arm")
 ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")
 VALUES = {
     "gain": 2.5, "damping": 0.3, "armature": 0.006, "friction_pan": 0.04, "friction_shoulder": 0.05,
-    "friction_elbow": 0.02,
+    "friction_elbow": 0.02, "payload": 0.05,
 }  # fmt: skip
 STEP_S = 0.0025
 

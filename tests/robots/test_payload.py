@@ -1,10 +1,12 @@
-"""A payload in the hand of a servo robot: a point mass at the tip, in a model that is only tested with it."""
+"""A payload in the hand of a servo robot: a point mass at the tip, an optional term of its model."""
 
 import jax.numpy as jnp
+import mujoco as mj
 import numpy as np
 import pytest
 
 from sim2real.hardware.plant import load_plant
+from sim2real.stages.left_out import widest
 from sim2real.stages.pipeline import load_pipeline
 
 
@@ -13,12 +15,24 @@ def arm():
     return load_pipeline("arm").load()
 
 
-def test_a_payload_is_not_identified_but_watched(arm):
+def free(table):
+    """Names of what is identified."""
+    return {p.name for p in table if p.free}
+
+
+def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched(arm):
     identified, watched = arm.identifiable(0.06).parameters, arm.watched(0.06).parameters
-    assert set(watched.names) - set(identified.names) == {"payload"}
+    assert free(watched) - free(identified) == {"payload"}
+    assert free(widest(identified, "payload")) == free(watched)
+    assert free(widest(identified, "none")) == free(identified)
     payload = watched["payload"]
     assert (payload.nominal, payload.unit) == (0.0, "kg")
-    assert -0.055 < payload.low < 0.0 < payload.high
+
+
+def test_a_hand_weighs_something_whatever_it_holds(arm):
+    for robot in (arm, load_pipeline("so101").load()):
+        lightest = robot.place(robot.nominal() | {"payload": robot.hand.least_kg}, np.zeros(len(robot.aim)))
+        assert lightest["mass of the hand"][0] > 0.005
 
 
 @pytest.mark.parametrize("name", ["arm", "so101"])
@@ -39,10 +53,21 @@ def test_it_is_the_point_mass_that_the_plant_carries(name):
     np.testing.assert_allclose(found.body_ipos[hand], centre / total, atol=1e-6)
 
 
-def test_without_a_payload_the_model_is_the_robots_own(arm):
-    model, plain = arm.watched(0.06), arm.identifiable(0.06)
-    values, start = {p.name: jnp.float32(p.nominal) for p in model.parameters}, jnp.zeros(6)
-    worlds = [m.nodes(0.06)["world"] for m in (model, plain)]
-    loaded, own = (w._model(m.params(values, start)["world"]) for w, m in zip(worlds, (model, plain), strict=True))
-    np.testing.assert_allclose(loaded.body_mass, own.body_mass, rtol=1e-6)
-    np.testing.assert_allclose(loaded.body_ipos, own.body_ipos, atol=1e-7)
+def test_without_a_payload_the_model_is_as_it_was_composed(arm):
+    params = arm.resumed_params(arm.nominal(), np.zeros(6))["world"]
+    model = arm.make_world()._model(params)
+    own = mj.MjModel.from_xml_string(arm.task.root_entity.mjcf_model.root_model.to_xml_string())
+    np.testing.assert_allclose(model.body_mass, own.body_mass, rtol=1e-6)
+    np.testing.assert_allclose(model.body_ipos, own.body_ipos, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["arm", "so101"])
+def test_the_exported_model_carries_it(name):
+    robot = load_pipeline(name).load()
+    values = robot.nominal() | {"payload": 0.1}
+    model = robot.make_world()._model(robot.resumed_params(values, np.zeros(2 * len(robot.servos.joints)))["world"])
+    laden, empty = (mj.MjModel.from_xml_string(robot.identified_mjcf(v)) for v in (values, values | {"payload": 0.0}))
+    np.testing.assert_allclose(laden.body_mass, model.body_mass, rtol=1e-5)
+    np.testing.assert_allclose(laden.body_ipos, model.body_ipos, atol=1e-6)
+    np.testing.assert_allclose(laden.body_inertia, empty.body_inertia, rtol=1e-5)
+    np.testing.assert_allclose(laden.body_mass.sum() - empty.body_mass.sum(), 0.1, rtol=1e-5)

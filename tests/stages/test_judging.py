@@ -99,7 +99,7 @@ def folder(tmp_path, monkeypatch):
     return run / "deploy"
 
 
-IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")])
+IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")], terms=None)
 OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/episode_1.mcap"
 
 
@@ -121,6 +121,35 @@ OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/
 def test_the_command_can_be_typed(told, found, command, folder):
     """Where the robot has changed, recordings of before are left out."""
     assert commands(told, load_pipeline("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
+
+
+LADEN = Drift((replace(FRICTION, name="payload", unit="kg", before=0.0, now=0.15),), 0.05, ("payload",), 20.0)
+
+
+@pytest.mark.parametrize(
+    ("drift", "terms", "command"),
+    [
+        (LADEN, None, f"sim2real identify arm --terms payload {OWN.replace('pendulum', 'arm')} --run runs/arm/T"),
+        (replace(LADEN, seconds=8.0), None, "sim2real record arm && sim2real identify arm --terms payload"),
+        (replace(ALARM, seconds=8.0), ("payload",), "sim2real record arm && sim2real identify arm --terms payload"),
+        (replace(ALARM, seconds=8.0), None, "sim2real record arm"),
+    ],
+)
+def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp_path, monkeypatch):
+    """Without it the other parameters bend to make up for it, and the verdict need not notice."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "runs" / "arm" / "T" / "deploy"
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text('{"stage": "deploy"}')
+    logs = tuple(Recording(folder.relative_to(tmp_path) / f"episode_{i}.mcap", episode()) for i in (0, 1))
+    found = replace(deployed(drift=drift), recordings=logs)
+    told = commands(Advice("re-identify", ()), load_pipeline("arm"), replace_terms(terms), folder, found)
+    assert sorted(told.next.split()) == sorted(command.split())
+
+
+def replace_terms(terms):
+    """An identification with some optional terms."""
+    return SimpleNamespace(logs=IDENTIFIED.logs, terms=terms)
 
 
 def test_times_stand_beside_those_of_training():

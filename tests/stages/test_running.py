@@ -16,6 +16,7 @@ from sim2real.stages.flags import RunFlags
 from sim2real.stages.pipeline import load_pipeline
 from sim2real.view.iterations import iterations_sections
 
+WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 
 
@@ -30,7 +31,7 @@ def world(tmp_path, monkeypatch):
     """Stages that leave what the loop reads; each deployment takes the next verdict."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
-    seen = SimpleNamespace(calls=[], verdicts=[], judgements=[], root=tmp_path / "runs" / "pendulum")
+    seen = SimpleNamespace(calls=[], verdicts=[], judgements=[], first=4, root=tmp_path / "runs" / "pendulum")
 
     def call(stage, config, run_dir):
         seen.calls.append((stage, config))
@@ -39,10 +40,10 @@ def world(tmp_path, monkeypatch):
                 opened.output("log", "session.mcap").touch()
             if stage == "identify":
                 logs = (Source("record/session.mcap", ""),)
-                status = seen.judgements.pop(0) if len(seen.calls) > 4 and seen.judgements else "accepted"
+                status = seen.judgements.pop(0) if len(seen.calls) > seen.first and seen.judgements else "accepted"
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
-                found = Identification("pendulum", logs, Judgement(status, ()), ())
+                found = Identification("pendulum", logs, Judgement(status, (), WIDER * (status == "hit a bound")), ())
                 found.write(opened.output("parameters", "parameters.json"))
             if stage == "deploy":
                 opened.output("log_0", "episode_0.mcap").touch()
@@ -105,6 +106,29 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
     assert again == stages
     (config,) = (c for s, c in world.calls[4:] if s == "identify")
     assert ["/".join(log.split("/")[-2:]) for log in config.log] == logs
+
+
+def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, capsys):
+    world.judgements = ["hit a bound"]
+    again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
+    assert again == ["identify", "identify", "train", "deploy"]
+    own, wider = (config for stage, config in world.calls[4:] if stage == "identify")
+    assert wider == replace(own, bounds={**own.bounds, "friction": (0.1, 80.0)}, max_delay_s=0.1)
+    assert rows[1].stages == ("identify.2", "identify.3", "train.2", "deploy.2")
+    assert WIDER in capsys.readouterr().err
+
+
+def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_end(world):
+    """The model may be wrong: bounds are not moved for ever."""
+    world.judgements = ["hit a bound"] * 4
+    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
+    assert again == ["identify", "identify", "record", "identify", "identify", "train", "deploy"]
+
+
+def test_a_first_identification_at_a_bound_is_done_once_more_too(world):
+    world.first, world.judgements = 0, ["hit a bound"]
+    world.go(verdict("fine", 1.0), iterations=1)
+    assert [stage for stage, _ in world.calls] == ["record", "identify", "identify", "train", "deploy"]
 
 
 LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")
