@@ -412,4 +412,5 @@ class ServoRobot(LoopRobot):
 
     @cached_property
     def _world_params(self) -> Any:
-        return self.make_world().init_params()
+        with jax.ensure_compile_time_eval():  # what is kept must not be of the function that is traced just now
+            return self.make_world().init_params()

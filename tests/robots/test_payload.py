@@ -1,5 +1,6 @@
 """A payload in the hand of a servo robot: a point mass at the tip, an optional term of its model."""
 
+import jax
 import jax.numpy as jnp
 import mujoco as mj
 import numpy as np
@@ -71,3 +72,11 @@ def test_the_exported_model_carries_it(name):
     np.testing.assert_allclose(laden.body_ipos, model.body_ipos, atol=1e-6)
     np.testing.assert_allclose(laden.body_inertia, empty.body_inertia, rtol=1e-5)
     np.testing.assert_allclose(laden.body_mass.sum() - empty.body_mass.sum(), 0.1, rtol=1e-5)
+
+
+def test_a_robot_that_is_first_asked_while_jax_traces_keeps_no_tracer():
+    robot = type(load_pipeline("arm").load())()
+    mass = jax.jit(lambda kg: robot.place(robot.nominal() | {"payload": kg}, jnp.zeros(3))["mass of the hand"])
+    heavier = mass(0.1) - mass(0.0)
+    again = robot.place(robot.nominal() | {"payload": 0.1}, np.zeros(3))["mass of the hand"]
+    np.testing.assert_allclose([heavier[0], again[0] - mass(0.0)[0]], 0.1, rtol=1e-5)
