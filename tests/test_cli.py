@@ -13,6 +13,7 @@ import pytest
 
 from sim2real import cli, errors
 from sim2real.artifacts import run_folder
+from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.stages.config import RecordConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -29,6 +30,9 @@ def calls(monkeypatch, tmp_path):
             seen.append((stage, config, run_dir))
             with run_folder.open_stage(root, pipeline.name, stage, config, run_dir=run_dir) as folder:
                 folder.output("result", "result.txt").write_text(stage)
+                if stage == "identify":
+                    accepted = Identification(pipeline.name, (), Judgement("accepted", ()), ())
+                    accepted.write(folder.output("parameters", "parameters.json"))
                 folder.summary({"seed": config.seed})
             return folder.result
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.arrays import namespace
-from sim2real.errors import SafetyStop, UsageError
+from sim2real.errors import UsageError
 from sim2real.graph.base import Array
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.config import GateLimits
@@ -30,6 +29,7 @@ from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots import standard
 from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.hardware import Embedded, ServoSession
+from sim2real.robots.homing import HOME_RAD_S, bring_home
 from sim2real.robots.identifiable import IdentifiableLoop
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.loop_robot import LoopRobot
@@ -42,7 +42,7 @@ from sim2real.robots.simulated import ServoWorld
 from sim2real.robots.training import Draw
 from sim2real.train.tasks import Rewards
 
-_AT_HOME_RAD, _HOME_RAD_S, _HOLD_S, _AFTER_S = 0.1, 1.0, 0.5, 1.0
+_AFTER_S = 1.0
 
 
 class ServoRobot(LoopRobot):
@@ -359,18 +359,7 @@ class ServoRobot(LoopRobot):
             HardwareLost: It does not come to rest within ``settle_s`` [s] a try.
             SafetyStop: It rests somewhere else, or what the gate stopped.
         """
-        position = session.rig.wait_until_still(settle_s).position_rad
-        if np.max(np.abs(position - self.servos.at_rest)) > _AT_HOME_RAD:
-            self._bring_home(session, position)  # a joint without weight stays where it was left
-            position = session.rig.wait_until_still(settle_s).position_rad
-        off = np.abs(position - self.servos.at_rest)
-        worst = int(np.argmax(off))
-        if off[worst] > self.servos.rest_tolerance:
-            raise SafetyStop(
-                f"joint {self.servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
-                f"not within {self.servos.rest_tolerance:g} rad of {self.servos.at_rest[worst]:g} rad",
-                hint="free it, or check the zero of its encoder",
-            )
+        bring_home(session, self.servos, self.rate_hz, settle_s)
 
     def recording_nodes(self, session: ServoSession, signal: np.ndarray) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays goals, one row a step ``(N, joints)`` [rad].
@@ -381,7 +370,7 @@ class ServoRobot(LoopRobot):
         # Behind its end an excitation is 0, where these joints may not be: they wait where it ended.
         signal = self.around(np.vstack([signal, np.repeat(signal[-1:], round(_AFTER_S * self.rate_hz), axis=0)]))
         away = session.rig.measure().position_rad - signal[0]
-        gone = np.arange(len(signal))[:, None] * _HOME_RAD_S / self.rate_hz
+        gone = np.arange(len(signal))[:, None] * HOME_RAD_S / self.rate_hz
         signal = signal + np.sign(away) * np.maximum(np.abs(away) - gone, 0.0)
         return super().recording_nodes(session, signal)
 
@@ -395,20 +384,6 @@ class ServoRobot(LoopRobot):
         text = task.root_entity.mjcf_model.root_model.to_xml_string()
         mjcf = standard.identified_mjcf(text, task.robot, values, s.sheet, s.joints)
         return self.hand.loaded(mjcf, task, values) if self.hand else mjcf
-
-    def _bring_home(self, session: ServoSession, position: np.ndarray) -> None:
-        rig, way = session.rig, self.servos.at_rest - position
-        steps = int(np.ceil(np.max(np.abs(way)) / _HOME_RAD_S * self.rate_hz))
-        rig.start()
-        try:
-            for step in range(1, steps + round(_HOLD_S * self.rate_hz)):
-                rig.measure()
-                rig.command(position + min(1.0, step / steps) * way, 0.0, time.monotonic())
-                time.sleep(1 / self.rate_hz)
-        except BaseException:
-            rig.stop_quietly()  # the reason must not be lost to what else fails
-            raise
-        rig.stop()
 
     @cached_property
     def _world_params(self) -> Any:

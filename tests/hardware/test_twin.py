@@ -52,7 +52,8 @@ def test_it_moves_as_a_plant_that_was_written_by_hand(arguments, by_hand):
 
 
 def test_its_truth_is_the_model_times_the_factors(arguments, by_hand):
-    assert TwinPlant(**arguments).truth() == pytest.approx(by_hand.truth(), rel=1e-6)
+    truth = {name: value for name, value in by_hand.truth().items() if name != "payload"}  # a twin's hand is empty
+    assert TwinPlant(**arguments).truth() == pytest.approx(truth, rel=1e-6)
 
 
 def test_without_torque_it_swings_down(arguments):

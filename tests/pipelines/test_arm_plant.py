@@ -203,6 +203,7 @@ def test_truth_says_what_it_is():
             "friction_pan": 0.045,
             "friction_shoulder": 0.057,
             "friction_elbow": 0.036,
+            "payload": 0.0,
         }
     )
     assert [plant.measure(i) for i in plant.servo_ids] == [(np.pi, 0.0, 0.0)] * 3
