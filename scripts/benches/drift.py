@@ -2,8 +2,8 @@
 
 Each is recorded, identified, and deployed: as it was, with twice the friction, with 30 % more to carry, 15 ms later.
 Policies are written by hand for the robots as they were; before each deployment come the small steps by which deploy
-measures the delay. With --restore what the verdict asks for is done once, unattended: identify, from the deployment's
-own logs where they suffice, else from a new recording; train; deploy.
+measures the delay. With --restore what the verdict asks for is done once, unattended, as ``sim2real run`` does it:
+identify, from the deployment's own logs where they suffice, else from a new recording; train; deploy.
 """
 
 from __future__ import annotations
@@ -189,6 +189,7 @@ def restored(
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
     from sim2real.stages.next_step import logs_to_identify, terms_to_identify
+    from sim2real.stages.once_more import for_longer, lacking
 
     if said["verdict"] != "re-identify":
         return {"success": said["success"], "from": "not done"}
@@ -200,15 +201,19 @@ def restored(
         again = identify(pipeline, own, now.number, options, terms) if own else None
     except Sim2RealError:
         again = None
-    if again is None or again.verdict.status != "accepted":
+    if again is None or lacking(again):
         own = [logs[0].with_name(f"{change}_session.mcap")]
         now.record(own[0], options.record_s, 1000)
         again = identify(pipeline, own, now.number, options, terms)
-    bundle, _ = sim2real.train(pipeline, randomise.train_config(pipeline, "all", now.number, options), again)
+    config = randomise.train_config(pipeline, "all", now.number, options)
+    bundle, _ = sim2real.train(pipeline, config, again)
+    if longer := for_longer(config, bundle.history):
+        bundle, _ = sim2real.train(pipeline, longer, again)
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
     wider = {p.name: p.upper for p in again.parameters if p.upper != _upper(identified, p.name)}
     found = {"verdict": again.verdict.status, "misfit": again.misfit, "terms": terms, "bounds": wider}
+    found |= {"simulated": float(bundle.history.success.max()), "longer": longer is not None}
     return {"success": success, "from": [log.name for log in own], **found}
 
 
@@ -228,13 +233,11 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.next_step import with_wider_bounds
+    from sim2real.stages.once_more import with_wider_bounds
 
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
     found = sim2real.identify(recordings, pipeline, config)
-    if found.verdict.status != "hit a bound":
-        return found
-    wider = with_wider_bounds(config, found.verdict.next)
-    return found if wider == config else sim2real.identify(recordings, pipeline, wider)
+    wider = with_wider_bounds(config, found)
+    return found if wider is None else sim2real.identify(recordings, pipeline, wider)

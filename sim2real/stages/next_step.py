@@ -12,7 +12,6 @@ from sim2real.artifacts.drift import Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import MANIFEST
 from sim2real.stages import advice
-from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import shown
 from sim2real.stages.pipeline import Pipeline
 
@@ -73,23 +72,6 @@ def terms_to_identify(wanted: str, pipeline: Pipeline, found: Identification, dr
     new = [p.term for p in table if changed is not None and p.name == changed.name and p.term]
     terms = tuple(dict.fromkeys([*(own if found.terms is None else found.terms), *new]))
     return wanted if terms == own else ",".join(terms) or "none"
-
-
-def with_wider_bounds(config: IdentifyConfig, command: str) -> IdentifyConfig:
-    """Return the configuration of an identification with the bounds of the command that the last one ended with.
-
-    Args:
-        config: That of the last one.
-        command: What its verdict says to do next.
-    """
-    words = shlex.split(command)
-    for i, word in enumerate(words):
-        if word == "--bounds":
-            name, low, high = words[i + 1 : i + 4]
-            config = replace(config, bounds={**config.bounds, name: (float(low), float(high))})
-        elif word == "--max-delay-s":
-            config = replace(config, max_delay_s=float(words[i + 1]))
-    return config
 
 
 def needs_timing(told: Advice) -> bool:

@@ -59,10 +59,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
         redo = True  # what comes after a stage that ran again is out of date
         console.note(f"{stage} ({number}/{len(STAGES)})")
         try:
-            if stage == "identify":
-                ran += _identified(call, flags.identify, run_dir)[0]
-            else:
-                ran.append(call(stage, getattr(flags, stage), run_dir))
+            ran += _done(call, stage, getattr(flags, stage), run_dir)
         except DelayChanged as error:
             if flags.iterations == 1 or run_dir is None:
                 raise
@@ -143,44 +140,52 @@ def _ran(flags: RunFlags, call: Call, run_dir: Path, stage: str, config: Any) ->
     Returns:
         What each stage that ran left.
     """
-    if stage != "identify":
-        return [call(stage, config, run_dir)]
-    if not config.log:
-        return _identified(call, config, run_dir)[0]
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.once_more import lacking
+
+    if stage != "identify" or not config.log:
+        return _done(call, stage, config, run_dir)
     ran: list[StageFolder] = []
     try:
-        ran, why = _identified(call, config, run_dir)
+        ran = _done(call, stage, config, run_dir)
+        why = lacking(Identification.load(ran[-1].output("parameters")))
     except Sim2RealError as error:
         why = str(error.args[0])
-    if why == "accepted":
+    if not why:
         return ran
     console.note(f"the deployment's own logs do not suffice ({why}): record, identify from that")
     ran.append(call("record", flags.record, run_dir))
-    return [*ran, *_identified(call, replace(config, log=()), run_dir)[0]]
+    return [*ran, *_done(call, "identify", replace(config, log=()), run_dir)]
 
 
-def _identified(call: Call, config: Any, run_dir: Path | None) -> tuple[list[StageFolder], str]:
-    """Identify; again with wider bounds, once, where an estimate lies at one: a worn robot leaves a data sheet's.
+def _done(call: Call, stage: str, config: Any, run_dir: Path | None) -> list[StageFolder]:
+    """Run a stage, and once more where its result says how: with wider bounds, or for longer.
+
+    A worn robot leaves the bounds of a data sheet; one with more friction takes more steps to learn for.
 
     Args:
         call: Runs a stage.
-        config: Of the identification.
+        stage: The stage's name.
+        config: Its configuration.
         run_dir: The run's folder.
-
-    Returns:
-        What each identification left, and the status of the last one.
     """
+    from sim2real.artifacts.bundle import History
     from sim2real.artifacts.identification import Identification
-    from sim2real.stages.next_step import with_wider_bounds
+    from sim2real.stages.once_more import for_longer, with_wider_bounds
 
-    ran = [call("identify", config, run_dir)]
-    verdict = Identification.load(ran[0].output("parameters")).verdict
-    wider = with_wider_bounds(config, verdict.next)
-    if verdict.status == "hit a bound" and wider != config:
-        console.note(f"an estimate lies at a bound; once more, as the verdict says: {verdict.next}")
-        ran.append(call("identify", wider, run_dir))
-        verdict = Identification.load(ran[-1].output("parameters")).verdict
-    return ran, verdict.status
+    ran = [call(stage, config, run_dir)]
+    again, why = None, ""
+    if stage == "identify":
+        found = Identification.load(ran[0].output("parameters"))
+        again = with_wider_bounds(config, found)
+        why = f"an estimate lies at a bound: {found.verdict.next}"
+    elif stage == "train" and "history" in ran[0].outputs:
+        again = for_longer(config, History.load(ran[0].output("history")))
+        why = "the policy does not succeed in simulation; twice as many steps"
+    if again is not None:
+        console.note(f"{stage}, once more: {why}")
+        ran.append(call(stage, again, run_dir))
+    return ran
 
 
 def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:

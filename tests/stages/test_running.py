@@ -3,11 +3,13 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
 from sim2real.artifacts.drift import Changed, Drift
-from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.iterations import Iterations
 from sim2real.artifacts.run_folder import STAGES, Source, open_stage
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
@@ -31,7 +33,9 @@ def world(tmp_path, monkeypatch):
     """Stages that leave what the loop reads; each deployment takes the next verdict."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
-    seen = SimpleNamespace(calls=[], verdicts=[], judgements=[], first=4, root=tmp_path / "runs" / "pendulum")
+    seen = SimpleNamespace(
+        calls=[], verdicts=[], judgements=[], trips=[], successes=[], first=4, root=tmp_path / "runs" / "pendulum"
+    )
 
     def call(stage, config, run_dir):
         seen.calls.append((stage, config))
@@ -43,8 +47,14 @@ def world(tmp_path, monkeypatch):
                 status = seen.judgements.pop(0) if len(seen.calls) > seen.first and seen.judgements else "accepted"
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
-                found = Identification("pendulum", logs, Judgement(status, (), WIDER * (status == "hit a bound")), ())
+                told = Judgement(status, (), WIDER * (status == "hit a bound"))
+                trip = seen.trips.pop(0) if len(seen.calls) > 4 and seen.trips else "accepted"
+                delays = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, trip)
+                found = Identification("pendulum", logs, told, (delays,))
                 found.write(opened.output("parameters", "parameters.json"))
+            if stage == "train":
+                curve = np.array([[seen.successes.pop(0) if seen.successes else 1.0]])
+                History(np.ones(1), np.ones(1), curve, curve).save(opened.output("history", "history.json"))
             if stage == "deploy":
                 opened.output("log_0", "episode_0.mcap").touch()
                 found = seen.verdicts.pop(0)
@@ -54,10 +64,11 @@ def world(tmp_path, monkeypatch):
                 opened.output("result", "result.json")
         return opened.result
 
-    def go(*verdicts, iterations=5, **told):
+    def go(*verdicts, iterations=5, train=None, **told):
         pipeline = load_pipeline("pendulum")
         seen.verdicts = list(verdicts)
         stages = {stage: getattr(pipeline, stage) for stage in STAGES}
+        stages["train"] = replace(pipeline.train, **(train or {}))
         flags = RunFlags(iterations=iterations, runs=tmp_path / "runs", **stages, **told)
         running.run_all(pipeline, flags, call)
         (run_dir,) = (tmp_path / "runs" / "pendulum").iterdir()
@@ -123,6 +134,31 @@ def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_e
     world.judgements = ["hit a bound"] * 4
     again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
     assert again == ["identify", "identify", "record", "identify", "identify", "train", "deploy"]
+
+
+def test_delays_that_a_deployment_does_not_tell_are_recorded(world, capsys):
+    """A policy that moves slowly: no delay, and inertia in its place, explains its log as well."""
+    world.trips = ["at a bound"]
+    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
+    assert again == ["identify", "record", "identify", "train", "deploy"]
+    assert "do not suffice (the sum of the delays is at a bound)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("successes", "options", "again"),
+    [
+        ([0.7, 0.95], {}, ["train", "train", "deploy"]),
+        ([0.7, 0.7], {}, ["train", "train", "deploy"]),
+        ([0.95], {}, ["train", "deploy"]),
+        ([0.7], {"target": 0.6}, ["train", "deploy"]),
+    ],
+)
+def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world, successes, options, again):
+    world.successes, ppo = [1.0, *successes], replace(load_pipeline("pendulum").train.ppo, **options)
+    done, _ = world.go(verdict("re-train", 0.6), verdict("fine", 1.0), train={"ppo": ppo})
+    assert done == again
+    steps = [config.ppo.total_steps for stage, config in world.calls if stage == "train"]
+    assert steps == [ppo.total_steps, ppo.total_steps, 2 * ppo.total_steps][: len(steps)]
 
 
 def test_a_first_identification_at_a_bound_is_done_once_more_too(world):
