@@ -59,7 +59,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
         redo = True  # what comes after a stage that ran again is out of date
         console.note(f"{stage} ({number}/{len(STAGES)})")
         try:
-            ran += _done(call, stage, getattr(flags, stage), run_dir)
+            ran += _done(flags, call, stage, getattr(flags, stage), run_dir)
         except DelayChanged as error:
             if flags.iterations == 1 or run_dir is None:
                 raise
@@ -144,10 +144,10 @@ def _ran(flags: RunFlags, call: Call, run_dir: Path, stage: str, config: Any) ->
     from sim2real.stages.once_more import lacking
 
     if stage != "identify" or not config.log:
-        return _done(call, stage, config, run_dir)
+        return _done(flags, call, stage, config, run_dir)
     ran: list[StageFolder] = []
     try:
-        ran = _done(call, stage, config, run_dir)
+        ran = _done(flags, call, stage, config, run_dir)
         why = lacking(Identification.load(ran[-1].output("parameters")))
     except Sim2RealError as error:
         why = str(error.args[0])
@@ -155,15 +155,16 @@ def _ran(flags: RunFlags, call: Call, run_dir: Path, stage: str, config: Any) ->
         return ran
     console.note(f"the deployment's own logs do not suffice ({why}): record, identify from that")
     ran.append(call("record", flags.record, run_dir))
-    return [*ran, *_done(call, "identify", replace(config, log=()), run_dir)]
+    return [*ran, *_done(flags, call, "identify", replace(config, log=()), run_dir)]
 
 
-def _done(call: Call, stage: str, config: Any, run_dir: Path | None) -> list[StageFolder]:
-    """Run a stage, and once more where its result says how: with wider bounds, or for longer.
+def _done(flags: RunFlags, call: Call, stage: str, config: Any, run_dir: Path | None) -> list[StageFolder]:
+    """Run a stage; in a run that goes around by itself once more where its result says how: wider bounds, or longer.
 
     A worn robot leaves the bounds of a data sheet; one with more friction takes more steps to learn for.
 
     Args:
+        flags: Of the run.
         call: Runs a stage.
         stage: The stage's name.
         config: Its configuration.
@@ -175,6 +176,8 @@ def _done(call: Call, stage: str, config: Any, run_dir: Path | None) -> list[Sta
 
     ran = [call(stage, config, run_dir)]
     again, why = None, ""
+    if flags.iterations == 1:
+        return ran
     if stage == "identify":
         found = Identification.load(ran[0].output("parameters"))
         again = with_wider_bounds(config, found)

@@ -163,8 +163,14 @@ def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world
 
 def test_a_first_identification_at_a_bound_is_done_once_more_too(world):
     world.first, world.judgements = 0, ["hit a bound"]
-    world.go(verdict("fine", 1.0), iterations=1)
+    world.go(verdict("fine", 1.0))
     assert [stage for stage, _ in world.calls] == ["record", "identify", "identify", "train", "deploy"]
+
+
+def test_a_run_that_goes_around_once_leaves_that_to_who_attends_it(world):
+    world.first, world.judgements, world.successes = 0, ["hit a bound"], [0.2]
+    world.go(verdict("fine", 1.0), iterations=1)
+    assert tuple(stage for stage, _ in world.calls) == STAGES
 
 
 LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")
