@@ -187,9 +187,8 @@ def show(found: Identification) -> None:
     """Print the parameters, and what stands in the way of trusting them."""
     rows = []
     for p in found.parameters:
-        off = "" if p.truth is None else f"{100 * (p.estimate / p.truth - 1):+.1f} %"
         interval = f"[{number(p.low95):.4g}, {number(p.high95):.4g}]"
-        rows.append([p.name, p.estimate, interval, p.unit, p.nominal, p.truth, off, p.verdict])
+        rows.append([p.name, p.estimate, interval, p.unit, p.nominal, p.truth, _off(p), p.verdict])
     print(table(rows, ["parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict"]))
     if found.aggregate:
         each = [
@@ -210,6 +209,13 @@ def show(found: Identification) -> None:
         note(f"  {reason}")
     if found.verdict.next:
         note(f"next: {found.verdict.next}")
+
+
+def _off(p: Estimate) -> str:
+    """Return how far an estimate is from the truth; of a truth of 0 in its unit."""
+    if p.truth is None:
+        return ""
+    return f"{100 * (p.estimate / p.truth - 1):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
 
 
 def link_table(links: Sequence[Link]) -> str:
