@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -24,6 +25,7 @@ ONE_THREAD = {
     "JAX_PLATFORMS": "cpu",
 }
 """Environment of a process that computes by one thread; what stands in XLA_FLAGS already is kept."""
+_PR_SET_PDEATHSIG = 1
 OVER = "not done when the bench's time was up"
 """What an error says that ends what took too long."""
 
@@ -126,7 +128,12 @@ def _until(until: float | None) -> Iterator[None]:
 
 
 def _hold(number: int) -> None:
-    """Hold this process on one processor: C engines count those that it may use, and take a thread for each."""
+    """Hold this process on one processor, and end it with the bench: one that was killed cannot tell it to.
+
+    C engines count the processors that they may use, and take a thread for each.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {number})
 
