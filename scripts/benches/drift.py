@@ -189,7 +189,7 @@ def restored(
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
     from sim2real.stages.next_step import logs_to_identify, terms_to_identify
-    from sim2real.stages.once_more import for_longer, lacking
+    from sim2real.stages.once_more import MOST, for_longer, lacking
 
     if said["verdict"] != "re-identify":
         return {"success": said["success"], "from": "not done"}
@@ -207,13 +207,16 @@ def restored(
         again = identify(pipeline, own, now.number, options, terms)
     config = randomise.train_config(pipeline, "all", now.number, options)
     bundle, _ = sim2real.train(pipeline, config, again)
-    if longer := for_longer(config, bundle.history):
-        bundle, _ = sim2real.train(pipeline, longer, again)
+    for _ in range(MOST["train"]):
+        if (longer := for_longer(config, bundle.history)) is None:
+            break
+        config = longer
+        bundle, _ = sim2real.train(pipeline, config, again)
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
     wider = {p.name: p.upper for p in again.parameters if p.upper != _upper(identified, p.name)}
     found = {"verdict": again.verdict.status, "misfit": again.misfit, "terms": terms, "bounds": wider}
-    found |= {"simulated": float(bundle.history.success.max()), "longer": longer is not None}
+    found |= {"simulated": float(bundle.history.success.max()), "steps": config.ppo.total_steps}
     return {"success": success, "from": [log.name for log in own], **found}
 
 

@@ -11,6 +11,7 @@ from sim2real.artifacts.deployment import Advice, Deployment
 from sim2real.artifacts.drift import Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import MANIFEST
+from sim2real.robots.worlds import in_world
 from sim2real.stages import advice
 from sim2real.stages.console import shown
 from sim2real.stages.pipeline import Pipeline
@@ -66,8 +67,8 @@ def terms_to_identify(wanted: str, pipeline: Pipeline, found: Identification, dr
     """
     if wanted in ("auto", "all"):
         return wanted
-    table = pipeline.load().watched(pipeline.identify.max_delay_s).parameters
-    own = pipeline.load().identifiable(pipeline.identify.max_delay_s).parameters.terms
+    robot, longest_s = in_world(pipeline.load(), found.world), pipeline.identify.max_delay_s
+    table, own = robot.watched(longest_s).parameters, robot.identifiable(longest_s).parameters.terms
     changed = (drift.named or drift.likely) if drift is not None else None
     new = [p.term for p in table if changed is not None and p.name == changed.name and p.term]
     terms = tuple(dict.fromkeys([*(own if found.terms is None else found.terms), *new]))

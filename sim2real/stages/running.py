@@ -170,24 +170,16 @@ def _done(flags: RunFlags, call: Call, stage: str, config: Any, run_dir: Path | 
         config: Its configuration.
         run_dir: The run's folder.
     """
-    from sim2real.artifacts.bundle import History
-    from sim2real.artifacts.identification import Identification
-    from sim2real.stages.once_more import for_longer, with_wider_bounds
+    from sim2real.stages.once_more import MOST, better
 
     ran = [call(stage, config, run_dir)]
-    again, why = None, ""
-    if flags.iterations == 1:
-        return ran
-    if stage == "identify":
-        found = Identification.load(ran[0].output("parameters"))
-        again = with_wider_bounds(config, found)
-        why = f"an estimate lies at a bound: {found.verdict.next}"
-    elif stage == "train" and "history" in ran[0].outputs:
-        again = for_longer(config, History.load(ran[0].output("history")))
-        why = "the policy does not succeed in simulation; twice as many steps"
-    if again is not None:
+    for _ in range(MOST.get(stage, 0) if flags.iterations > 1 else 0):
+        again, why = better(config, ran[-1])
+        if again is None:
+            break
         console.note(f"{stage}, once more: {why}")
-        ran.append(call(stage, again, run_dir))
+        config = again
+        ran.append(call(stage, config, run_dir))
     return ran
 
 

@@ -99,7 +99,7 @@ def folder(tmp_path, monkeypatch):
     return run / "deploy"
 
 
-IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")], terms=None)
+IDENTIFIED = SimpleNamespace(logs=[SimpleNamespace(path="record/session.mcap")], terms=None, world=None)
 OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/episode_1.mcap"
 
 
@@ -149,7 +149,7 @@ def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp
 
 def replace_terms(terms):
     """An identification with some optional terms."""
-    return SimpleNamespace(logs=IDENTIFIED.logs, terms=terms)
+    return SimpleNamespace(logs=IDENTIFIED.logs, terms=terms, world=None)
 
 
 def test_times_stand_beside_those_of_training():

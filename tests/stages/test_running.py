@@ -148,7 +148,8 @@ def test_delays_that_a_deployment_does_not_tell_are_recorded(world, capsys):
     ("successes", "options", "again"),
     [
         ([0.7, 0.95], {}, ["train", "train", "deploy"]),
-        ([0.7, 0.7], {}, ["train", "train", "deploy"]),
+        ([0.7, 0.9, 0.95], {}, ["train"] * 3 + ["deploy"]),
+        ([0.7] * 4, {}, ["train"] * 3 + ["deploy"]),
         ([0.95], {}, ["train", "deploy"]),
         ([0.7], {"target": 0.6}, ["train", "deploy"]),
     ],
@@ -158,7 +159,7 @@ def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world
     done, _ = world.go(verdict("re-train", 0.6), verdict("fine", 1.0), train={"ppo": ppo})
     assert done == again
     steps = [config.ppo.total_steps for stage, config in world.calls if stage == "train"]
-    assert steps == [ppo.total_steps, ppo.total_steps, 2 * ppo.total_steps][: len(steps)]
+    assert steps == [ppo.total_steps * n for n in (1, 1, 2, 4)][: len(steps)]
 
 
 def test_a_first_identification_at_a_bound_is_done_once_more_too(world):
