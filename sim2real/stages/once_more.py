@@ -16,9 +16,9 @@ from sim2real.stages.config import IdentifyConfig, TrainConfig
 MOST = {"identify": 1, "train": 2}
 """How often a stage is done once more at most: bounds that are moved for ever would hide that the model is wrong."""
 GOOD = 0.95
-"""Success in simulation below which a policy is not worth trying on a robot. Of ten arms with twice the friction six stayed
-below after the usual number of steps, at 0.69 to 0.94, and five of those at 0.6 to 0.9 on the robot. Three were trained
-again: after twice (two) or four times as many steps they had 0.98 to 1 in simulation, and 1 on the robot."""
+"""Success in simulation below which a policy is not worth trying on a robot. Of ten arms with twice the friction six
+stayed below after the usual number of steps, at 0.69 to 0.94, and five of those at 0.6 to 0.9 on the robot. Three were
+trained again: after two or four times as many steps they had 0.98 to 1 in simulation, and 1 on the robot."""
 _LONGER = 2
 
 
