@@ -225,7 +225,7 @@ def _upper(found: Any, name: str) -> float | None:
 
 
 def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Namespace, terms: str = "own") -> Any:
-    """Return what logs say about a robot; with wider bounds, once, where an estimate lies at one, as a run does it.
+    """Return what logs say about a robot; with wider bounds where an estimate lies at one, as a run does it.
 
     Args:
         pipeline: The robot's.
@@ -236,11 +236,15 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.once_more import with_wider_bounds
+    from sim2real.stages.once_more import MOST, with_wider_bounds
 
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
     found = sim2real.identify(recordings, pipeline, config)
-    wider = with_wider_bounds(config, found)
-    return found if wider is None else sim2real.identify(recordings, pipeline, wider)
+    for _ in range(MOST["identify"]):
+        if (wider := with_wider_bounds(config, found)) is None:
+            break
+        config = wider
+        found = sim2real.identify(recordings, pipeline, config)
+    return found
