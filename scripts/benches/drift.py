@@ -189,7 +189,7 @@ def restored(
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
     from sim2real.stages.next_step import logs_to_identify, terms_to_identify
-    from sim2real.stages.once_more import MOST, for_longer, lacking
+    from sim2real.stages.once_more import MOST, for_longer, lacking, repeated
 
     if said["verdict"] != "re-identify":
         return {"success": said["success"], "from": "not done"}
@@ -205,13 +205,12 @@ def restored(
         own = [logs[0].with_name(f"{change}_session.mcap")]
         now.record(own[0], options.record_s, 1000)
         again = identify(pipeline, own, now.number, options, terms)
-    config = randomise.train_config(pipeline, "all", now.number, options)
-    bundle, _ = sim2real.train(pipeline, config, again)
-    for _ in range(MOST["train"]):
-        if (longer := for_longer(config, bundle.history)) is None:
-            break
-        config = longer
-        bundle, _ = sim2real.train(pipeline, config, again)
+    config, bundle = repeated(
+        lambda config: sim2real.train(pipeline, config, again)[0],
+        randomise.train_config(pipeline, "all", now.number, options),
+        lambda config, bundle: for_longer(config, bundle.history),
+        MOST["train"],
+    )[-1]
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
     wider = {p.name: p.upper for p in again.parameters if p.upper != _upper(identified, p.name)}
@@ -236,15 +235,10 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.once_more import MOST, with_wider_bounds
+    from sim2real.stages.once_more import MOST, repeated, with_wider_bounds
 
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
-    found = sim2real.identify(recordings, pipeline, config)
-    for _ in range(MOST["identify"]):
-        if (wider := with_wider_bounds(config, found)) is None:
-            break
-        config = wider
-        found = sim2real.identify(recordings, pipeline, config)
-    return found
+    tried = repeated(lambda c: sim2real.identify(recordings, pipeline, c), config, with_wider_bounds, MOST["identify"])
+    return tried[-1][1]

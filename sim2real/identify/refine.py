@@ -7,7 +7,7 @@ quadruped of 16 parameters ended after 14 Jacobians instead of 25, at the same l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,11 +111,7 @@ def refine(
     improve = problem.programs["improve", steps]
     begin = [problem.at(s, data) for s in starts]
     first = [loss for _, loss in begin]
-    if not np.isfinite(first).any():
-        raise Sim2RealError(
-            "no start of the refinement can be simulated: every loss is infinite or no number",
-            hint="search first, with generations above 0, or check the nominal values",
-        )
+    _require_finite(first)
     best, best_loss, taken = np.asarray(starts[int(np.nanargmin(first))]), float(np.nanmin(first)), 0
     going = [(jnp.asarray(z, jnp.float32), columns, loss) for z, (columns, loss) in zip(starts, begin, strict=True)]
     ends: list[tuple[np.ndarray, float]] = []
@@ -137,6 +133,14 @@ def refine(
         # A round nearly ends a descent: only the best goes on, if it is one of those that still gain.
         going = [e for e in ended if e[2] == best_loss]
     return Refined(best, best_loss, float(np.nanmin(first)), taken, tuple(ends))
+
+
+def _require_finite(losses: Sequence[float]) -> None:
+    if not np.isfinite(losses).any():
+        raise Sim2RealError(
+            "no start of the refinement can be simulated: every loss is infinite or no number",
+            hint="search first, with generations above 0, or check the nominal values",
+        )
 
 
 def _improve(problem: Problem, steps: int, like: Any, data: Data) -> Improve:

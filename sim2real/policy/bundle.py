@@ -102,21 +102,8 @@ def save_bundle(
             samples = np.concatenate([reference.observations for reference in references.values()])
         _check_parity(weights, graph, contract, spec, samples)
     files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
-    plain = spec == NetworkSpec()
-    about = {
-        "format_version": FORMAT_VERSIONS[0] if plain else FORMAT_VERSIONS[1],
-        **contract.to_dict(),
-        **({} if plain else {"network": spec.to_dict()}),
-        "normaliser": {
-            "mean": weights["mean"].tolist(),
-            "std": weights["std"].tolist(),
-            "clip": OBSERVATION_CLIP,
-        },
-        "parity": parity,
-        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
-        "versions": {"python": platform.python_version()}
-        | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
-    }
+    about = {**_described(weights, contract, spec), "parity": parity}
+    about["files"] = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONTRACT).unlink(missing_ok=True)
@@ -124,6 +111,19 @@ def save_bundle(
         (folder / name).write_bytes(content)
     (folder / CONTRACT).write_text(json.dumps(about, indent=2) + "\n")
     return folder
+
+
+def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Any]:
+    """Return what ``policy.json`` says of the policy itself, and of what wrote it."""
+    plain = spec == NetworkSpec()
+    return {
+        "format_version": FORMAT_VERSIONS[0] if plain else FORMAT_VERSIONS[1],
+        **contract.to_dict(),
+        **({} if plain else {"network": spec.to_dict()}),
+        "normaliser": {"mean": weights["mean"].tolist(), "std": weights["std"].tolist(), "clip": OBSERVATION_CLIP},
+        "versions": {"python": platform.python_version()}
+        | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
+    }
 
 
 def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:

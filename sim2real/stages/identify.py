@@ -80,9 +80,7 @@ def identify(
         require_units(log, robot)
     units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
-    table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
-    if config.links:
-        measured(table)  # a model that has no such delay is refused before the search
+    table = _table(model, config)
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
     begin = time.monotonic()
@@ -109,6 +107,14 @@ def identify(
         aggregate=each,
         timing=fitted[0].timing,
     )
+
+
+def _table(model: IdentifiableModel, config: IdentifyConfig) -> ParameterTable:
+    """Return the parameters with what the user knows of them."""
+    table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
+    if config.links:
+        measured(table)  # a model that has no such delay is refused before the search
+    return table
 
 
 def _with_terms(

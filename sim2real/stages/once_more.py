@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.stages.config import IdentifyConfig, TrainConfig
 
+C = TypeVar("C")
+R = TypeVar("R")
 MOST = {"identify": 2, "train": 2}
 """How often a stage is done once more at most: bounds that are moved for ever would hide that the model is wrong. Of an
 SO-101 with twice the friction the elbow's was at its bound, and with a wider one the shoulder's at its own."""
@@ -21,6 +24,21 @@ GOOD = 0.95
 stayed below after the usual number of steps, at 0.69 to 0.94, and five of those at 0.6 to 0.9 on the robot. Three were
 trained again: after two or four times as many steps they had 0.98 to 1 in simulation, and 1 on the robot."""
 _LONGER = 2
+
+
+def repeated(run: Callable[[C], R], config: C, again: Callable[[C, R], C | None], most: int) -> list[tuple[C, R]]:
+    """Return each way in which something was done, with what came out; the last is the one to use.
+
+    Args:
+        run: Does it.
+        config: How, the first time.
+        again: Returns from how it was done and what came out how to do it once more; None where it need not be.
+        most: How often it is done once more at most.
+    """
+    tried = [(config, run(config))]
+    while len(tried) <= most and (following := again(*tried[-1])) is not None:
+        tried.append((following, run(following)))
+    return tried
 
 
 def better(config: Any, done: StageFolder) -> tuple[Any, str]:

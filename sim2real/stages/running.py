@@ -170,17 +170,16 @@ def _done(flags: RunFlags, call: Call, stage: str, config: Any, run_dir: Path | 
         config: Its configuration.
         run_dir: The run's folder.
     """
-    from sim2real.stages.once_more import MOST, better
+    from sim2real.stages.once_more import MOST, better, repeated
 
-    ran = [call(stage, config, run_dir)]
-    for _ in range(MOST.get(stage, 0) if flags.iterations > 1 else 0):
-        again, why = better(config, ran[-1])
-        if again is None:
-            break
-        console.note(f"{stage}, once more: {why}")
-        config = again
-        ran.append(call(stage, config, run_dir))
-    return ran
+    def again(config: Any, done: StageFolder) -> Any:
+        following, why = better(config, done)
+        if following is not None:
+            console.note(f"{stage}, once more: {why}")
+        return following
+
+    most = MOST.get(stage, 0) if flags.iterations > 1 else 0
+    return [done for _, done in repeated(lambda config: call(stage, config, run_dir), config, again, most)]
 
 
 def _judged(row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path) -> tuple[Iteration, Plan]:

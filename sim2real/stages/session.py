@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -116,18 +116,22 @@ def run_episode(
         graph.stop()
     except BaseException as error:
         session.rig.stop_quietly()
-        status = f"{type(error).__name__}: {error}"
-        # What else goes wrong on the way out must not take the place of the reason.
-        with noted(error):
-            graph.stop()
-        with noted(error):
-            recorder.write_event("stop", status)
-        with noted(error):
-            recorder.close(status, _exit_code(error), _summary(robot, graph, session, watch))
+        _end(error, graph, recorder, lambda: _summary(robot, graph, session, watch))
         raise
     summary = _summary(robot, graph, session, watch)
     recorder.close("finished", OK, summary)
     return summary
+
+
+def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summary: Callable[[], Any]) -> None:
+    """Stop the graph and complete the log; what else goes wrong on the way must not take the place of the reason."""
+    status = f"{type(error).__name__}: {error}"
+    with noted(error):
+        graph.stop()
+    with noted(error):
+        recorder.write_event("stop", status)
+    with noted(error):
+        recorder.close(status, _exit_code(error), summary())
 
 
 def check_deadlines(summary: Mapping[str, Any]) -> None:

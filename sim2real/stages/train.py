@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle, History
+from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.recording import Recording
@@ -34,6 +35,7 @@ from sim2real.stages.prepared import contract_of, find_parameters, prepare, requ
 from sim2real.stages.resuming import CHECKPOINT, check_same_parameters, find_interrupted, resumable
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.sensitivity import TIMELINES, models_of, moves_of, sensitivity, with_room
+from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
 from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
@@ -98,20 +100,23 @@ def train(
         seen["log"] = observations_of(made.robot, log, make_runner(weights, contract, None, policy.spec, graph))
     references = {name: reference_of(policy, observations) for name, observations in seen.items()}
     bundle = Bundle(contract, weights, _history(result), made.episodes, None, weak, policy.spec, graph, references)
+    about = {"model": config.model} | _told(result, ppo, sweep, made.episodes)
+    return bundle, about if weak is None else {**about, "what breaks it": weak.said}
+
+
+def _told(result: TrainResult, ppo: PPOConfig, sweep: Sweep, episodes: Episodes) -> dict[str, Any]:
     kept = sweep.names(ppo.num_seeds)[result.best_seed]
-    about = {
-        "model": config.model,
+    return {
         "success in simulation": f"{result.history['success'].max():.2f} ({kept})",
         "policy steps": int(result.env_steps[-1]) * len(result.members),
         **({} if ppo.target is None else {"target": _target_reached(result, ppo.target)}),
         "policy steps a second": round(result.env_steps_per_s),
         "compile": f"{result.compile_s:.1f} s",
         "train": f"{result.train_s:.1f} s",
-        "episodes that end at a pause": f"{made.episodes.cut} of {made.episodes.timelines}",
-        "timelines drawn again": made.episodes.again,
-        **disturbance_rows(made.episodes),
+        "episodes that end at a pause": f"{episodes.cut} of {episodes.timelines}",
+        "timelines drawn again": episodes.again,
+        **disturbance_rows(episodes),
     }
-    return bundle, about if weak is None else {**about, "what breaks it": weak.said}
 
 
 def _sensitivity(

@@ -78,8 +78,7 @@ def train(
     check_environment(env)
     env = TeacherEnvironment(env) if config.teacher else env
     _check_target(env, config)
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    key = key if typed else jax.random.wrap_key_data(key)
+    key = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
     sweep = sweep or Sweep({})
     networks = make_networks(env, config, actor, critic, teacher)
     state, numbers = make_start(env, sweep.configs(config), key, networks), swept_numbers(sweep, config.num_seeds)
@@ -87,21 +86,16 @@ def train(
     shared = with_numbers(config, {"num_seeds": config.num_seeds * len(sweep.grid)})
     layout = shardings_of(state, shared)
     state = place(state, layout)
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(shared, numbers), networks, state))
-    where = layout and (layout.state, layout.whole, layout.whole)
-    with small_random_numbers():
-        lowered = jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)
+    lowered = _lowered(env, shared, networks, state, numbers, layout)
     now = Checkpoint(state, None, None, [])
     identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume or layout else None
     if identity:
         agree({**identity.said(), "saves": checkpoint is not None, "resumes": resume is not None})
     if resume and identity:
-        now = load_checkpoint(resume, identity, now.state, lowered.out_info[1])
-        now = now._replace(state=place(now.state, layout))
+        now = _resumed(resume, identity, state, lowered, layout)
     first, before_s = len(now.log), now.log[-1].elapsed_s if now.log else 0.0
-    epoch = partial(
-        _advance, compile_lowered(lowered), numbers, config, sweep.names(config.num_seeds), before_s - start
-    )
+    names = sweep.names(config.num_seeds)
+    epoch = partial(_advance, compile_lowered(lowered), numbers, config, names, before_s - start)
     compiled = time.perf_counter()
     report = on_progress or (lambda _: None)
     for progress in now.log:
@@ -114,6 +108,27 @@ def train(
     members = [point for point in sweep.grid for _ in range(config.num_seeds)]
     train_s, seen = time.perf_counter() - compiled, np.asarray(gather(now.state.copies.observation, layout))
     return _result(members, now, first, seen, compiled - start, train_s)
+
+
+def _lowered(
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    networks: ActorCritic,
+    state: TrainState,
+    numbers: dict[str, Any],
+    layout: Shardings | None,
+) -> Any:
+    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
+    where = layout and (layout.state, layout.whole, layout.whole)
+    with small_random_numbers():
+        return jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)
+
+
+def _resumed(
+    path: Path, identity: TrainingIdentity, state: TrainState, lowered: Any, layout: Shardings | None
+) -> Checkpoint:
+    saved = load_checkpoint(path, identity, state, lowered.out_info[1])
+    return saved._replace(state=place(saved.state, layout))
 
 
 def _save(path: Path, identity: TrainingIdentity, now: Checkpoint, layout: Shardings | None) -> None:

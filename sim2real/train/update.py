@@ -191,7 +191,11 @@ def update(
     }
     if rows.privileged_following is not None:
         stats |= {"finite_privileged": jnp.isfinite(rows.privileged_following).all((0, 1))}
-    normaliser, privileged = update_normaliser(state.normaliser, rows.observation, rows.valid), None
-    if state.privileged is not None and rows.privileged is not None:
-        privileged = update_normaliser(state.privileged, rows.privileged, rows.valid)
-    return TrainState(params, optimiser_state, normaliser, privileged, copies, state.update + 1, state.key), stats
+    return TrainState(params, optimiser_state, *_normalisers(state, rows), copies, state.update + 1, state.key), stats
+
+
+def _normalisers(state: TrainState, rows: Rows) -> tuple[Normaliser, Normaliser | None]:
+    normaliser = update_normaliser(state.normaliser, rows.observation, rows.valid)
+    if state.privileged is None or rows.privileged is None:
+        return normaliser, None
+    return normaliser, update_normaliser(state.privileged, rows.privileged, rows.valid)

@@ -103,7 +103,6 @@ def test_randomise(run):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_drift(run):
     report = run("drift", "--changes", "friction")
     (robot,) = report["robots"]

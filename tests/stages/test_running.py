@@ -34,7 +34,14 @@ def world(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
     seen = SimpleNamespace(
-        calls=[], verdicts=[], judgements=[], trips=[], successes=[], first=4, root=tmp_path / "runs" / "pendulum"
+        calls=[],
+        verdicts=[],
+        judgements=[],
+        asks=[],
+        trips=[],
+        successes=[],
+        first=4,
+        root=tmp_path / "runs" / "pendulum",
     )
 
     def call(stage, config, run_dir):
@@ -47,7 +54,8 @@ def world(tmp_path, monkeypatch):
                 status = seen.judgements.pop(0) if len(seen.calls) > seen.first and seen.judgements else "accepted"
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
-                told = Judgement(status, (), WIDER * (status == "hit a bound"))
+                asked = "" if status != "hit a bound" else seen.asks.pop(0) if seen.asks else WIDER
+                told = Judgement(status, (), asked)
                 trip = seen.trips.pop(0) if len(seen.calls) > 4 and seen.trips else "accepted"
                 delays = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, trip)
                 found = Identification("pendulum", logs, told, (delays,))
@@ -127,6 +135,16 @@ def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, c
     assert wider == replace(own, bounds={**own.bounds, "friction": (0.1, 80.0)}, max_delay_s=0.1)
     assert rows[1].stages == ("identify.2", "identify.3", "train.2", "deploy.2")
     assert WIDER in capsys.readouterr().err
+
+
+def test_with_a_wider_bound_another_estimate_may_come_to_its_own(world):
+    """Of an SO-101 with twice the friction: the elbow's was at its bound, then the shoulder's."""
+    world.judgements = ["hit a bound"] * 2
+    world.asks = [f"sim2real identify pendulum --bounds {bounds}" for bounds in ("friction 0.1 80", "damping 0.1 9")]
+    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
+    assert again == ["identify"] * 3 + ["train", "deploy"]
+    own, _, last = (config for stage, config in world.calls[4:] if stage == "identify")
+    assert last == replace(own, bounds={**own.bounds, "friction": (0.1, 80.0), "damping": (0.1, 9.0)})
 
 
 def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_end(world):
