@@ -11,6 +11,8 @@ _STAMP_S = 0.01
 """Uncertainty of the time between two samples [s]: a servo may answer with an older sample."""
 _PLAY_RAD = 0.05
 """Tolerance of a position change [rad]: 33 counts."""
+_KEPT = 0.5
+"""The share of its speed that a joint surely keeps from one reading to the next."""
 _HARD = 10.0
 """A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
 
@@ -24,7 +26,8 @@ class Plausibility:
     **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
     same to the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead. "Surely": between two
     samples more time may have passed than between their stamps, since the first may have been an older one and the
-    second may have been taken as late as its answer came.
+    second may have been taken as late as its answer came. An encoder that freezes just after a reading moves by next to
+    nothing until the following one: half the speed from the reading before counts there, too.
 
     **Envelope.** A position outside of ``envelope_rad`` stops the robot.
 
@@ -56,7 +59,9 @@ class Plausibility:
         self.suspects: list[str] = []
         self._t_s: float | None = None
         self._unsure_s = 0.0
-        self._position = self._since_s = self._start = self._speed = self._held_s = self._longest_s = np.zeros(0)
+        self._position = self._since_s = self._start = self._speed = self._before = self._held_s = self._longest_s = (
+            np.zeros(0)
+        )
 
     def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
         """Check a measurement.
@@ -80,7 +85,9 @@ class Plausibility:
         self._t_s, self._unsure_s = t_s, unsure_s
         moved = position_rad != self._position
         if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
-            self._speed[moved] = np.abs(position_rad - self._position)[moved] / (elapsed_s + _STAMP_S + unsure_s)
+            speed = np.abs(position_rad - self._position) / (elapsed_s + _STAMP_S + unsure_s)
+            self._speed[moved] = np.maximum(speed, _KEPT * self._before)[moved]
+            self._before = speed
         self._position = position_rad.copy()
         self._since_s[moved], self._start[moved] = t_s + unsure_s, effort[moved]
         self._require_no_freeze(t_s, effort)
@@ -90,7 +97,8 @@ class Plausibility:
     def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
         n = len(position_rad)
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
-        self._speed = np.zeros(n)
+        # Of each joint [rad/s]: before it stood still, and between the last two samples.
+        self._speed, self._before = np.zeros(n), np.zeros(n)
         self._since_s, self._start = np.full(n, t_s), effort.copy()
         # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
         # differs from that at the start of the standstill, pushed hard up, pushed hard down.

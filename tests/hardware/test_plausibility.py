@@ -69,6 +69,15 @@ def test_a_joint_that_stops_dead_though_it_is_pushed_is_stopped():
         judge(np.full(path.shape, 0.1), path, FREE)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.5, 0.99])
+def test_an_encoder_that_freezes_at_any_moment_of_a_period_is_seen(share):
+    """Of the last period before it froze it has seen this share, maybe but a count."""
+    rotor = moving_then_still(9.0)
+    rotor[6:, 1] += max(share * 9.0 * PERIOD_S, 0.0015)
+    with pytest.raises(SafetyStop, match=r"but moved at [3-6].*rad/s or more just before"):
+        judge(np.full(rotor.shape, 0.1), rotor, FREE)
+
+
 @pytest.mark.parametrize(
     ("leap_rad", "period_s", "unsure_s", "stops"),
     [
@@ -95,9 +104,10 @@ def test_speeds_are_those_that_inexact_stamps_allow(leap_rad, period_s, unsure_s
         (moving_then_still(1.0), 0.1),  # a slow joint may stick
         (moving_then_still(6.0), 0.0),  # nothing pushes it: somebody moved it by hand
         (moving_then_still(6.0, still=2), 0.1),  # an old sample or two
+        (np.cumsum(np.outer([0, *[3.5 * PERIOD_S] * 5, 0.01, 0, 0, 0, 0, 0], [0, 1]), axis=0), 0.1),  # it brakes
         (np.stack([np.zeros(40), 0.5 * np.sin(12.0 * PERIOD_S * np.arange(40))], axis=1), 0.1),  # it swings
     ],
-    ids=["slow", "by hand", "old samples", "swing"],
+    ids=["slow", "by hand", "old samples", "brakes", "swing"],
 )
 def test_what_comes_to_rest_by_itself_is_normal(path, effort):
     assert judge(np.full(path.shape, effort), path, FREE).suspects == []
