@@ -332,6 +332,7 @@ class AsyncGraph:
             raise UsageError("the graph is not running", hint="call start() or reset() first")
         self._run.check()
         if self._run.ended:
+            self._run.check()  # it may have failed since it was asked first
             raise UsageError("the graph has been stopped", hint="call start() or reset() to run it again")
         return self._run
 

@@ -17,6 +17,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.failure import GraphTimeout, NodeFailed, noted
 from sim2real.runtime.nodethread import NodeThread
+from sim2real.runtime.wallclock import WallClockRun
 from sim2real.runtime.watchdog import step_limits
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
@@ -83,6 +84,25 @@ def test_an_exception_stops_the_graph_and_reaches_the_caller(how):
     assert not graph.running
     graph.start(gs)
     graph.stop()
+
+
+def test_a_failure_that_comes_while_a_call_looks_for_one_is_the_one_that_is_told(monkeypatch):
+    """A process that was stopped goes on: the node that the guardian left without torque wakes with its caller."""
+    looks, check = [], WallClockRun.check
+
+    def late(run):
+        check(run)
+        looks.append(run)
+        if len(looks) == 1:
+            run._shared.fail(SafetyStop("the guardian has taken the torque off"))
+
+    sensor, agent = pair(Plain)
+    graph = AsyncGraph([sensor, agent], agent)
+    graph.start(graph.init(KEY))
+    monkeypatch.setattr(WallClockRun, "check", late)
+    with pytest.raises(SafetyStop, match="the guardian"):
+        graph.run_for(5.0)
+    assert not graph.running
 
 
 def test_the_projects_own_errors_keep_their_type():
