@@ -109,9 +109,7 @@ class ComposedWorld(BaseWorld):
         found = self._view()
         self._set(found, self.init_params())  # refuses what cannot vary
         if self._derives:
-            # Their names alone: computed one operation at a time, the constants of an arm took 6 to 50 s.
-            derive = lambda: constants.derive(self.environment.model, found.mjx_model)  # noqa: E731
-            self._derived = frozenset(jax.eval_shape(derive))
+            self._derived = constants.derived(self.environment.model, found.mjx_model)
             self.environment.carry(self._derived)
 
     def _view(self) -> MjxPhysics:

@@ -163,6 +163,23 @@ def test_derived_constants_are_those_of_mj_set_const(double):
         np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        BODIES,
+        """<mujoco><worldbody><camera/><body><joint name="one"/><geom size=".1"/></body></worldbody>
+        <tendon><fixed><joint joint="one" coef="1"/></fixed></tendon></mujoco>""",
+        """<mujoco><worldbody><body><joint name="one"/><geom size=".1"/></body></worldbody>
+        <actuator><motor joint="one"/></actuator></mujoco>""",
+    ],
+    ids=["all", "no actuator", "no camera, no tendon"],
+)
+def test_which_constants_are_derived_is_known_before(text):
+    model = mujoco.MjModel.from_xml_string(text)
+    given = mjx.put_model(model)
+    assert constants.derived(model, given) == set(jax.eval_shape(lambda m: constants.derive(model, m), given))
+
+
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
 def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
     """``mjx.step`` leaves accelerometers at 0 where nothing is constrained, and RK4's sensors in its last stage."""

@@ -30,6 +30,29 @@ _IS_DERIVED = 11
 """Where the data of a weld say whether its pose is that at the reference position."""
 
 
+def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:
+    """Return the names of the fields that ``derive`` computes, without computing them, which takes a second.
+
+    Args:
+        host: The compiled ``mujoco.MjModel``.
+        model: The ``mjx.Model``.
+
+    Raises:
+        UsageError: As ``derive`` does.
+    """
+    if is_warp(model):
+        return frozenset(n for n in (*derived(host, _twin(host, model)), "geom_aabb") if varies(n))
+    names = ["body_subtreemass", "geom_rbound"]
+    if host.nv:
+        names += ["dof_M0", "dof_invweight0", "body_invweight0"]
+        names += ["actuator_acc0"] * (host.nu > 0) + ["tendon_invweight0"] * (host.ntendon > 0)
+    if host.ntendon:
+        names += ["tendon_length0"]
+    if np.any(_derived_equalities(host)):
+        names += ["eq_data"]
+    return frozenset([*names, "cam_pos0", "cam_poscom0", "cam_mat0"] if host.ncam else names)
+
+
 def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     """Return the constants of an ``mjx.Model`` whose masses, inertias, lengths or poses were changed: path -> array.
 
@@ -43,9 +66,7 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     if is_warp(model):
         found = derive(host, _twin(host, model)) | {"geom_aabb": _boxes(host, model)}
         return {name: value for name, value in found.items() if varies(name)}
-    data: Any = mjx.make_data(host, impl="jax").replace(qpos=model.qpos0)
-    data = mjx.com_pos(model, mjx.kinematics(model, data))
-    data = mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
+    data = _at_reference(model, mjx.make_data(host, impl="jax"))
     found = {"body_subtreemass": _subtree_masses(host, model), "geom_rbound": _radii(host, model)}
     if host.nv:
         found |= _inverse_weights(host, model, data)
@@ -54,6 +75,13 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     if np.any(_derived_equalities(host)):
         found["eq_data"] = _equalities(host, model, data)
     return found | _cameras(host, model, data) if host.ncam else found
+
+
+@jax.jit
+def _at_reference(model: mjx.Model, data: Any) -> mjx.Data:
+    """Return what follows from the reference position; traced once for all programs with a model of this form."""
+    data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=model.qpos0)))
+    return mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
 
 
 def _twin(host: MjModel, model: mjx.Model) -> mjx.Model:
@@ -80,7 +108,7 @@ def _subtree_masses(host: MjModel, model: mjx.Model) -> jax.Array:
 def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     """Return the inverse inertias that constraints see of bodies, degrees of freedom and tendons; ``(A M^-1 A^T)``."""
     impl: Any = data._impl
-    M = mjx.full_m(model, data)
+    M, J = _inertia_and_jacobians(model, data)
     factor = jax.scipy.linalg.cho_factor(M)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(host.nv, dtype=M.dtype))
     diagonal = jnp.diag(inverse)
@@ -89,8 +117,6 @@ def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[st
         for width in _WIDTHS[int(kind)]:
             start = len(dofs)
             dofs += [jnp.mean(diagonal[start : start + width])] * width
-    jacobians = jax.vmap(lambda point, body: mjx.jac(model, data, point, body))(data.xipos, jnp.arange(host.nbody))
-    J = jnp.concatenate(jacobians, axis=-1)  # (nbody, nv, 6)
     spatial = jnp.einsum("bvi,vw,bwi->bi", J, inverse, J)
     weights = jnp.where((host.body_weldid != 0)[:, None], spatial.reshape(-1, 2, 3).mean(axis=-1), 0.0)
     simple, mass = np.asarray(host.body_simple) == _ONLY_SLIDES, jnp.maximum(model.body_mass, mj.mjMINVAL)
@@ -104,6 +130,14 @@ def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[st
     if host.ntendon:
         found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", impl.ten_J, inverse, impl.ten_J)
     return found
+
+
+@jax.jit
+def _inertia_and_jacobians(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    """Return the matrix of inertia ``(nv, nv)``, and the bodies' Jacobians at their centres ``(nbody, nv, 6)``."""
+    bodies = jnp.arange(data.xipos.shape[0])
+    jacobians = jax.vmap(lambda point, body: mjx.jac(model, data, point, body))(data.xipos, bodies)
+    return mjx.full_m(model, data), jnp.concatenate(jacobians, axis=-1)
 
 
 def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
