@@ -37,7 +37,8 @@ def test_identification_finds_the_true_parameters(name):
     entry = MANIFEST[name]
     pipeline = load_pipeline(entry["pipeline"])
     recording = Recording.load(DATASETS / entry["pipeline"] / name)
-    config = replace(pipeline.identify, seed=1, folds=0, free_run_s=0.0)  # estimates are what is looked at
+    # Estimates are what is looked at; a third of the usual search finds where the descents begin.
+    config = replace(pipeline.identify, seed=1, folds=0, free_run_s=0.0, generations=25)
     rows = {p.name: p for p in identify(recording, pipeline, config).parameters}
     for parameter, truth in entry["truth"].items():
         error = rows[parameter].estimate - truth

@@ -27,7 +27,7 @@ class ConvergedRobot(PairRobot):
     def make_task(self):
         task = PairTask()
         option = task.root_entity.mjcf_model.option
-        option.iterations, option.ls_iterations, option.tolerance = 100, 50, 0
+        option.iterations, option.ls_iterations, option.tolerance = 20, 50, 0
         return task
 
 
