@@ -4,6 +4,7 @@ import copy
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -178,6 +179,26 @@ def test_which_constants_are_derived_is_known_before(text):
     model = mujoco.MjModel.from_xml_string(text)
     given = mjx.put_model(model)
     assert constants.derived(model, given) == set(jax.eval_shape(lambda m: constants.derive(model, m), given))
+
+
+def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint type="slide"/><joint type="slide" axis="1 0 0"/><geom size=".1"/>
+        <body><joint/><geom size=".07" pos="0 0 .3"/></body></body></worldbody></mujoco>"""
+    )
+    traced, known = [], mjx.fwd_position
+    monkeypatch.setattr(stepping.mjx, "fwd_position", lambda m, d: traced.append(m) or known(m, d))
+    given, data = mjx.put_model(model), mjx.make_data(model, impl="jax")
+
+    def speeds(qvel, mass):
+        heavier = stepping.with_fields(given, {"body_mass": given.body_mass * mass})
+        return stepping.advance(heavier, stepping.advance(heavier, data.replace(qvel=qvel), True), True).qvel
+
+    still = jnp.zeros((4, model.nv))
+    jax.eval_shape(speeds, still[0], 2.0)
+    jax.eval_shape(jax.vmap(speeds, (0, None)), still, 2.0)
+    jax.eval_shape(lambda v: jax.jvp(lambda v: speeds(v, 2.0), (v,), (v,)), still[0])
+    assert len(traced) == 1
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
