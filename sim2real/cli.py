@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.runtime import compilation_cache
 from sim2real.stages import ending
 from sim2real.stages.interruption import SignalHandling
 
@@ -74,6 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     with SignalHandling() as signals:
         code = _run_command(list(sys.argv[1:] if argv is None else argv), signals)
+        compilation_cache.release()
         if argv is None and code != OK:
             ending.leave(code)
     return code
@@ -127,6 +129,7 @@ def _stage(stage: str, arguments: list[str]) -> None:
 
     if stage == "identify" and described_flags.by_model(arguments):
         told = described_flags.parse_identify(arguments, EXIT_CODES)
+        compilation_cache.enable(told.cache)
         from sim2real.stages import described  # imports JAX
 
         _call_stage(stage, described.from_flags(told.robot, told.config.log), told.config, told.runs, told.run)
@@ -141,6 +144,7 @@ def _stage(stage: str, arguments: list[str]) -> None:
         epilog=_epilog(f"sim2real {stage} {pipeline.name} --runs /data/runs", f"sim2real report {pipeline.name}"),
         kind=flags.StageFlags[type(config)],
     )
+    compilation_cache.enable(parsed.cache)
     run_dir = targets.find_run(parsed.runs, parsed.run, pipeline.name) if parsed.run else None
     _call_stage(stage, pipeline, parsed.config, parsed.runs, run_dir)
 
@@ -183,7 +187,7 @@ def _demo(command: str, arguments: list[str]) -> None:
     )
     pipeline = load_pipeline(DEMO_PIPELINE)
     stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-    everything = flags.RunFlags(seed=parsed.seed, runs=parsed.runs, resume=parsed.resume, **stages)
+    everything = flags.RunFlags(parsed.seed, parsed.runs, parsed.resume, parsed.cache, **stages)
     _run_all(pipeline, everything if parsed.seed is None else _seeded(everything, parsed.seed))
 
 
@@ -256,6 +260,7 @@ def _files(command: str, arguments: list[str]) -> None:
     }[command]
     own, epilog = getattr(config, f"{kind}Config")(), _epilog(*(f"sim2real {example}" for example in examples))
     asked = flags.parse(own, arguments, f"sim2real {command}", _summary(own) + text, epilog)
+    compilation_cache.enable()
     if importlib.import_module(f"sim2real.stages.{stage}").run(asked) is False:  # imports JAX
         sys.exit(ERROR)
 
@@ -293,6 +298,8 @@ def _act(command: str, arguments: list[str]) -> None:
 
 def _check(command: str, arguments: list[str]) -> None:
     """``sim2real check PIPELINE [flags]``."""
+    if not {"-h", "--help"} & set(arguments):
+        compilation_cache.enable()
     from sim2real.stages import config, described_flags, flags
 
     if described_flags.by_model(arguments):
@@ -334,6 +341,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
 
 def _run_all(pipeline: Pipeline, flags: Any) -> None:
     """Run the four stages in one run folder, and around again where that was asked for."""
+    compilation_cache.enable(flags.cache)
     from sim2real.stages.running import run_all
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:

@@ -145,6 +145,11 @@ BENCHES = {
         "training and identification on all devices of a host against one",
         (*_GRAPH, "sim2real/train", "sim2real/identify", "scripts/benches/train.py"),
     ),
+    "identify-time": Bench(
+        "identify_time",
+        "the processor time of an identification whose programs are in the compilation cache",
+        (*_STAGES, "datasets/pendulum", "pipelines"),
+    ),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
 }

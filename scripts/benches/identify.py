@@ -288,7 +288,7 @@ def delays(case: Case, data: Path) -> list[dict[str, Any]]:
         problem = Problem(case.model, part, windows(part, 1.0, 0.5, True), 1.0, config)
         starts = [problem.table.encode(nominal | {"delay": s}) for s in DELAY_STARTS_S]
         searched = [run_search(problem, s) for s in starts]
-        ended = [refine(problem, f.finalists, config.refine_steps) for f in searched]
+        ended = [refine(problem, f.finalists) for f in searched]
         found = [as_numbers(problem.table, e.z)["delay"] for e in ended]
         best = min(ended, key=lambda e: e.loss)
         spread = uncertainty(problem, best.z)
@@ -334,12 +334,12 @@ def speed(case: Case, fitted: Mapping[str, Episode], count: int | None, seconds:
     device = jax.devices()[0].platform
     count = count or (65536 if device == "gpu" else 2048)
     candidates = 0.3 * jax.random.normal(jax.random.key(0), (count, len(problem.table)))
-    run = jax.jit(lambda c: problem.losses(c, c[0]))
-    run(candidates).block_until_ready()
+    run = jax.jit(lambda c, data: problem.residuals.losses(c, c[0], data))
+    run(candidates, problem.data).block_until_ready()
     times = []
     for i in range(3):
         begin = time.monotonic()
-        run(candidates + 0.01 * i).block_until_ready()
+        run(candidates + 0.01 * i, problem.data).block_until_ready()
         times.append(time.monotonic() - begin)
     took = float(np.median(times))
     rows = [row(f"disk/{device}/candidates_per_s", count / took, "1/s", "30,000 steps each")]

@@ -164,7 +164,7 @@ def _free_run(
     problem = Problem(case.model, test, spans, max(e.duration_s for e in test), config)
     # A cubic in time for each joint, of which position and velocity are known.
     starts = np.stack([np.pad(r.start, ((0, 0), (0, 2))) for r in own])
-    problem.data = problem.data._replace(starts=starts.astype(np.float32))
+    problem.data = problem.data._replace(starts=problem.data.starts.at[: len(own)].set(starts))
     columns = prediction.samples(problem, {"identified": values}, 0.0)
     return columns | {"ahead": columns["into"]}
 

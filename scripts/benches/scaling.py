@@ -127,7 +127,8 @@ def identify_on(options: argparse.Namespace) -> Measure:
         def on_compile(on: bool) -> None:
             compiling[0 if on else 1] = time.perf_counter()
 
-        search(problem.losses, problem.table.start(), config, on_generations=told, on_compile=on_compile)
+        losses, start = problem.residuals.losses, problem.table.start()
+        search(losses, start, config, problem.data, on_generations=told, on_compile=on_compile)
         took = np.diff(done[1:])  # without what happens before the first ten generations have ended
         return 10 * size / float(np.median(took)), compiling[1] - compiling[0], size
 

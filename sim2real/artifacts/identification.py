@@ -27,6 +27,10 @@ _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _AGAIN = "run `sim2real identify` again"
 
 
+UNFINISHED = {"interrupted": "was interrupted", "not converged": "did not converge"}
+"""Verdict -> what happened to an identification that has no intervals."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """One identified parameter; None where a number does not apply, is infinite or not known.
@@ -44,7 +48,7 @@ class Estimate:
         lower: Lower bound of the search.
         upper: Upper bound.
         verdict: ``accepted``, ``negligible``, ``not reached``, ``fixed``, ``at a bound``, ``not identifiable`` or
-            ``interrupted``.
+            ``not converged``, or ``interrupted``.
         truth: The embedded robot's own value.
     """
 

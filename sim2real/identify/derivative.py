@@ -33,19 +33,3 @@ def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[
 
     wrapped.defjvp(rule)
     return wrapped
-
-
-def by_jacobian(f: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return ``f``, array ``(P,)`` -> ``(N,)``, with a derivative that computes its whole Jacobian in forward mode.
-
-    ``jax.linearize``, which optimistix uses, would keep every intermediate value of a rollout in memory instead.
-    """
-    wrapped = jax.custom_jvp(f)
-
-    def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
-        (x,), (t,) = primals, tangents
-        value, columns = jax.vmap(lambda d: jax.jvp(f, (x,), (d,)), out_axes=(None, 0))(jnp.eye(x.size, dtype=x.dtype))
-        return value, t @ columns
-
-    wrapped.defjvp(rule)
-    return wrapped

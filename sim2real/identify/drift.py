@@ -14,7 +14,6 @@ from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
 from sim2real.identify.uncertainty import Linearised, linearise, loss_variance
 
 LEVEL = 0.05
@@ -127,7 +126,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     found.sort(key=lambda one: one.loss)
     seconds = problem.segment_s * len(problem.train)
     ends = (posterior.mean + found[0].size * found[0].way.along, posterior.mean)
-    losses = [problem.at(table.at_scale(x))[1] for x in ends]
+    losses = [problem.loss(table.at_scale(x)) for x in ends]
     return weigh(found, now, table, posterior, seconds), ends[int(losses[1] < losses[0] or not np.isfinite(losses[0]))]
 
 
@@ -179,11 +178,10 @@ def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -
         point: Size of the change -> the unbounded vector ``(P,)``.
         unit: The size that goes from bound to bound.
     """
-    losses = problem.programs.setdefault("changes", program(problem.losses))
     size, sizes = 0.0, unit * np.array(sorted([0.0, *_SIZES]))
     for _ in range(_TURNS):
-        tried = np.array([point(s) for s in sizes], np.float32)
-        found = np.asarray(losses(tried, np.asarray(point(size), np.float32)))
+        tried = np.array([point(s) for s in sizes])
+        found = problem.losses(tried, point(size))
         best = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
         size = float(sizes[best])
         sizes = np.linspace(sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)], len(sizes))

@@ -9,21 +9,15 @@ from typing import Any
 import numpy as np
 
 from sim2real.identify.fit import Fit, as_numbers
-from sim2real.identify.refine import effort, refine
+from sim2real.identify.refine import refine
 from sim2real.identify.terms import statistics
-from sim2real.identify.uncertainty import Uncertainty, centred, from_linearised, linearise
-
-_ROUNDS = 3
-_ENOUGH = 0.01
-"""A step that moves the residuals by less of their size ends a round: near the optimum that is 1e-4 of the loss. Three
-recordings of an arm took all 25 steps of every round without it."""
+from sim2real.identify.uncertainty import Uncertainty, from_linearised, linearise
 
 
 def identify_each(found: Fit) -> list[tuple[Mapping[str, Any], Uncertainty]]:
     """Return what each recording says by itself, with its uncertainty, in order.
 
     A descent from where the others led stays in their optimum: what differs is the robot, not which optimum was found.
-    It may be long, and initial states are linearised once a round: so it has several.
 
     Args:
         found: The estimate of all.
@@ -37,8 +31,8 @@ def identify_each(found: Fit) -> list[tuple[Mapping[str, Any], Uncertainty]]:
     for k, own in enumerate(rows):
         data = problem.part(problem.train[~own])
         starts = (table.at_scale(at.x + stats.only(k).step(table, every)), found.z)
-        start = min(starts, key=lambda z, data=data: np.nan_to_num(problem.at(z, data)[1], nan=np.inf))
-        z = centred(problem, refine(problem, start[None], *effort(problem, _ROUNDS), data=data, enough=_ENOUGH).z)
+        start = min(starts, key=lambda z, data=data: np.nan_to_num(problem.loss(z, data), nan=np.inf))
+        z = refine(problem, start[None], data, settle=False).z
         there = linearise(problem, z)
         alone = replace(there, residuals=there.residuals[own], jacobian=there.jacobian[own], raw=there.raw[own])
         single.append((as_numbers(table, z), from_linearised(problem, alone)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,7 @@ from sim2real.composer.c.rollouts import OpenLoop, Rollouts, Start, StepLaw
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.runtime.program import Rollout
+from sim2real.runtime.open_loop import OpenLoopGraph, Tables
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 
@@ -101,49 +100,87 @@ def _world(nodes: Mapping[str, BaseNode], given: Mapping[str, Any]) -> Any:
     return worlds[0]
 
 
+class Outside(NamedTuple):
+    """What C MuJoCo needs to roll a copy out.
+
+    Attributes:
+        fields: Fields of the model that differ from the compiled one.
+        start: Where the physics starts.
+        controls: Shape ``(ticks, substeps, nu)``, or what the law takes.
+        law: The numbers that the law takes.
+    """
+
+    fields: Mapping[str, Any]
+    start: Start
+    controls: Any
+    law: Mapping[str, Any]
+
+
 class CRollouts:
     """Rolls a graph's recorded commands out on C MuJoCo.
 
-    The graph's programs say what the world hears in each tick, with its delays and averages, and what the sensor makes
-    of the world's messages; in between C steps all copies at once, with the parameters that each has.
+    The graph's programs compute what the world hears in each tick, with its delays and averages, and what the sensor
+    makes of the world's messages; in between C steps all copies at once, with the parameters that each has.
 
     Args:
         graph: The graph, whose world's physics was taken out.
         model: The ``MjModel``.
     """
 
-    def __init__(self, graph: CompiledGraph, model: Any) -> None:
+    def __init__(self, graph: OpenLoopGraph, model: Any) -> None:
         self._graph, self._model = graph, model
-        self._world: OpenLoop = graph.nodes[graph.wiring.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
+        self._world: OpenLoop = graph.nodes[graph.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
         self._law: StepLaw | None = getattr(self._world, "law", None)
         self._rollouts: dict[tuple[str, ...], Rollouts] = {}
 
-    def rollout(self, gs: GraphState, params: Mapping[str, Any], record: str) -> Rollout:
-        """Return what a node did in an episode; traceable, without derivatives.
+    def inputs(self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any]) -> Outside:
+        """Return what C needs for an episode; traceable.
 
         Args:
-            gs: What the graph's ``init`` returned.
-            params: The nodes' parameters, as ``init`` got them.
-            record: The node.
+            gs: What the graph's ``begin`` returned.
+            params: The nodes' parameters, as ``begin`` got them.
+            tables: As in the graph's ``run``.
+            given: As in the graph's ``run``.
         """
         world = self._world
         state, own = gs.state[world.name], params[world.name]
-        fields = world.fields(own, state)
-        names = tuple(sorted(fields))
+        law = world.law_values(own) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
+        controls = self._graph.drive(gs, tables, given, world.controls)
+        return Outside(dict(world.fields(own, state)), world.start(own, state), controls, law)
+
+    def step(self, inputs: Outside) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions, velocities and accelerations ``(..., 1 + ticks, n)`` of copies, rolled out on C."""
+        names = tuple(sorted(inputs.fields))
         if names not in self._rollouts:
+            world = self._world
             self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives, self._law)
-        values = world.law_values(own) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
-        controls = self._graph.drive(gs, world.controls)
-        start = world.start(own, state)
-        count, dtype = controls.shape[0], jnp.result_type(float)
+        return self._rollouts[names](inputs.fields, inputs.start, inputs.controls, inputs.law)
+
+    def outputs(self, gs: GraphState, moved: Any, tables: Tables, given: Mapping[str, Any], record: str) -> Any:
+        """Return a node's outputs in an episode, leaves ``(K, ...)``; traceable.
+
+        Args:
+            gs: What the graph's ``begin`` returned.
+            moved: What ``step`` returned for the episode.
+            tables: As in the graph's ``run``.
+            given: As in the graph's ``run``.
+            record: The node.
+        """
+        world = self._world
+        messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
+        return self._graph.run(gs, tables, given, record, {world.name: messages})
+
+    def rollout(
+        self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any], record: str
+    ) -> Any:
+        """Return a node's outputs in an episode by a callback to C; a program with it is in no compilation cache."""
+        inputs = self.inputs(gs, params, tables, given)
+        dtype, count = jnp.result_type(float), inputs.controls.shape[0]
         widths = (self._model.nq, self._model.nv, self._model.nv)
-
-        def outside(*given: Any) -> tuple[np.ndarray, ...]:
-            fields, start, controls, values = jax.tree_util.tree_map(np.asarray, given)
-            made = self._rollouts[names](fields, Start(*start), controls, values)
-            return tuple(a.astype(dtype) for a in made)
-
         shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
-        moved = jax.pure_callback(outside, shapes, fields, start, controls, values, vmap_method="expand_dims")
-        messages = jax.vmap(lambda *moved: world.message(state, *moved))(*moved)
-        return self._graph.replay(gs, messages, (record,))[record]
+
+        def outside(given: Any) -> tuple[np.ndarray, ...]:
+            return tuple(a.astype(dtype) for a in self.step(jax.tree_util.tree_map(np.asarray, given)))
+
+        moved = jax.pure_callback(outside, shapes, inputs, vmap_method="expand_dims")
+        return self.outputs(gs, moved, tables, given, record)

@@ -10,13 +10,12 @@ from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.identify.fit import Fit
 from sim2real.identify.negligible import ABSENT, NOT_REACHED
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.refine import effort, refine
+from sim2real.identify.refine import refine
 from sim2real.identify.terms import Selection, statistics
 from sim2real.identify.uncertainty import Linearised, Uncertainty, centred, from_linearised, linearise, loss_variance
 
 _WORSE = 0.1
 """A model whose loss is larger by this share explains the recordings less well, whatever an approximation said."""
-_ROUNDS = 3
 
 
 def posterior(found: Fit, at: Linearised, spread: Uncertainty, every: Fit, choice: Selection | None) -> Posterior:
@@ -66,13 +65,13 @@ def _optima(found: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative
         return len(off) > 1 and bool(off.mean() <= off.std(ddof=1) / np.sqrt(len(off)))
 
     for z, loss in found.refined[-1].ends if found.refined else ():
-        if not loss <= (1.0 + _WORSE) * found.loss or not apart(table.scale(centred(problem, z))[0]):
+        if not loss <= (1.0 + _WORSE) * found.loss or not apart(table.scale(centred(table, z))[0]):
             continue
-        x, residuals = _descended(linearise(problem, centred(problem, z)))
+        x, residuals = _descended(linearise(problem, centred(table, z)))
         if not (apart(x) and as_good(residuals)):
             continue
         # The estimate went on after the first round; so must what is compared with it.
-        z = centred(problem, refine(problem, z[None], *effort(problem, _ROUNDS)).z)
+        z = refine(problem, z[None], settle=False).z
         there = linearise(problem, z)
         if apart(there.x) and as_good(there.residuals):
             near.append(there.x)
@@ -97,10 +96,10 @@ def _models(every: Fit, found: Fit, spread: Uncertainty, choice: Selection) -> l
     for kept, weight in zip(choice.near[1:], choice.weight[1:], strict=True):
         own = table.of_terms(kept)
         start = table.at_scale(at.x + whole.step(table, kept))
-        ended = refine(problem, start[None], *effort(problem), data=problem.part(kept=own))
+        ended = refine(problem, start[None], problem.part(kept=own), settle=False)
         if ended.loss > (1.0 + _WORSE) * found.loss:
             continue
-        z, rest = centred(problem, ended.z), np.flatnonzero(own)
+        z, rest = ended.z, np.flatnonzero(own)
         fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, kept))
         covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, found.problem.table, spread)
         drawn = _possible(fewer.posterior(z[rest], covariance), found.problem.table, spread)

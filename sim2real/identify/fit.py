@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,17 +14,16 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
-from sim2real.identify.refine import Refined, effort, refine
+from sim2real.identify.programs import OnCompile
+from sim2real.identify.refine import Refined, refine, remaining
 from sim2real.identify.search import SearchResult, search
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of the bounds."""
-_ROUNDS = 3
-"""Most rounds of a refinement."""
-_COARSE = 1e-2
-"""A baseline is compared with by percents: a round that gains less is its last."""
+_CONVERGED = 0.5
+"""A fit without refinement has converged where less is left of the next Gauss-Newton step, in standard errors."""
 Told = Callable[[str, float, float, np.ndarray], None]
 """Called with the phase (``search`` or ``refine``; ``compiling`` in between), the share of it done since the last call,
 and the best loss and point so far."""
@@ -41,6 +40,8 @@ class Fit:
         search: What the search found; None where it was left out.
         refined: How each refinement ended, in order.
         windows: Segments that were searched on, and held-out segments of the same length.
+        left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
+        converged: Whether the loss has a minimum at the estimate.
     """
 
     problem: Problem
@@ -49,6 +50,8 @@ class Fit:
     search: SearchResult | None
     refined: tuple[Refined, ...]
     windows: Problem
+    left: float
+    converged: bool
 
     @property
     def values(self) -> dict[str, Any]:
@@ -108,12 +111,16 @@ def fit(
     refined = []
     if config.refine:
         refined.append(_refine(problem, starts, told))
-        z, loss = refined[-1].z, refined[-1].loss
     if config.refine and config.long_s and long_spans:
-        problem = Problem(model, recordings, long_spans, config.long_s, config, table)
-        refined.append(_refine(problem, z[None], told))
-        z, loss = refined[-1].z, refined[-1].loss
-    return Fit(problem, centred(problem, z), loss, found, tuple(refined), windows)
+        problem = problem.recut(long_spans, config.long_s)
+        refined.append(_refine(problem, refined[-1].z[None], told))
+    if refined:
+        z, loss, left, converged = refined[-1].z, refined[-1].loss, refined[-1].left, refined[-1].converged
+    else:
+        z = centred(problem.table, z)
+        left = remaining(problem, z)
+        converged = left < _CONVERGED
+    return Fit(problem, z, loss, found, tuple(refined), windows, left, converged)
 
 
 def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any]:
@@ -131,8 +138,7 @@ def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any
     if not kept.any():
         return as_numbers(table, near, kept)
     starts = np.stack([table.encode(as_numbers(table, near)), table.start()])
-    ended = refine(problem, starts, *effort(problem, _ROUNDS), data=problem.part(kept=kept), gain=_COARSE)
-    return as_numbers(table, ended.z, kept)
+    return as_numbers(table, refine(problem, starts, problem.part(kept=kept), coarse=True).z, kept)
 
 
 def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
@@ -151,23 +157,47 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
         if told:
             told("search", generations / total, best, z)
 
-    compiling = _compiling(told, "search", start)
-    every, programs = problem.train, problem.programs
-    loss = lambda z: problem.at(z)[1]  # noqa: E731 - refinement needs this program anyway
-    return search(problem.losses, start, problem.config, every, advance, programs, compiling, loss)
+    compiling, data, config = _compiling(told, "search", start), problem.data, problem.config
+    free = config.initial_state == "free"
+    # How a search shares the delays' sum between both sides of the world means nothing: see ``centred``.
+    middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
+    alone = lambda z: problem.loss(middle(z), on_compile=compiling)  # noqa: E731
+    given = (data, np.asarray(data.weight), advance)
+    found = search(
+        problem.evaluator.searched(data),
+        start,
+        config,
+        *given,
+        problem.residuals.searches,
+        compiling,
+        alone,
+        host=problem.engine.name == "c",
+    )
+    finalists = np.array([middle(z) for z in found.finalists])
+    found = replace(found, z=finalists[0], finalists=finalists)
+    if told:  # the loss of the best candidate by itself: before, initial states were those of its generation's middle
+        told("search", 0.0, found.loss, found.z)
+    return found
 
 
 def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
-    total = _ROUNDS + len(starts) - 1
+    left, share = 1.0, 0.5 / (problem.config.refine_steps * (1 + len(starts)))
 
     def advance(best: float, z: np.ndarray) -> None:
+        nonlocal left
+        step = min(share, left / 2.0)  # how many evaluations there will be is not known
+        left -= step
         if told:
-            told("refine", 1 / total, best, z)
+            told("refine", step, best, z)
 
-    compiling = _compiling(told, "refine", starts[0])
-    return refine(problem, starts, problem.config.refine_steps, _ROUNDS, advance, None, compiling)
+    return refine(problem, starts, on_step=advance, on_compile=_compiling(told, "refine", starts[0]))
 
 
-def _compiling(told: Told | None, then: str, z: np.ndarray) -> Callable[[bool], None]:
-    """Return what tells of programs that are compiled, before the phase ``then`` goes on."""
-    return lambda on: told("compiling" if on else then, 0.0, float("inf"), z) if told else None
+def _compiling(told: Told | None, then: str, z: np.ndarray) -> OnCompile:
+    """Return what reports that programs are compiled, before the phase ``then`` goes on."""
+
+    def report(started: bool) -> None:
+        if told:
+            told("compiling" if started else then, 0.0, float("inf"), z)
+
+    return report

@@ -13,16 +13,12 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.identify import terms
 from sim2real.identify.fit import Fit
-from sim2real.identify.prediction import labels, simulated
+from sim2real.identify.prediction import labels
 from sim2real.identify.problem import Problem
-from sim2real.identify.refine import effort, refine
+from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import linearise
 
-_GAIN = 1e-3
-"""On C, a step that gains a smaller share of a part's loss is its last: errors are told with two digits."""
-_ENOUGH = 0.03
-"""In a program, a step that moves the residuals by less of their size: near the optimum that is 1e-3 of the loss."""
 MOVES = 10.0
 """A joint moves where its positions spread over so many deviations of a measurement."""
 
@@ -136,7 +132,7 @@ def leave_out(
         # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
         start = table.at_scale(stats.x + stats.step(table, chosen, k, bounded=True))
         rest = problem.part(problem.train[mask], own)
-        z = refine(problem, start[None], *effort(problem), data=rest, gain=_GAIN, enough=_ENOUGH).z
+        z = refine(problem, start[None], rest, settle=False).z
         values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
         kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
@@ -167,7 +163,7 @@ def _free(
             first, last = max(begin, min(own)), min(end, max(own) + problem.segment_s)
             where.append((k, Span(r, first, False), last - first))
     length_s = min(longest_s, *(w[2] for w in where))
-    runs = problem.cut_anew([w[1] for w in where], length_s)
+    runs = problem.recut([w[1] for w in where], length_s)
     fold = np.array([w[0] for w in where])
     return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts))
 
@@ -176,8 +172,8 @@ def _errors(
     problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float, parts: int
 ) -> list[dict[str, float | None]]:
     """Return the errors of each part's segments beyond the first part of each."""
-    errors, ts = simulated(problem, {n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
-    beyond = [e[t > settle_s] for e, t in zip(errors, ts, strict=True)]
+    errors = problem.predict({n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
+    beyond = [e[t > settle_s] for e, t in zip(errors, problem.ts[segment], strict=True)]
     sigmas = [sigma for _, sigma, _ in problem.fields]
     found = []
     for k in range(parts):
@@ -194,7 +190,7 @@ def moving(problem: Problem, segments: np.ndarray) -> list[bool]:
         problem: The recordings.
         segments: Shape ``(S,)``: numbers of segments.
     """
-    there, column, found = problem.places[segments] >= 0, 0, list[bool]()
+    there, column, found = problem.ts[segments] >= 0.0, 0, list[bool]()
     for channel in problem.channels:
         read = problem.measured(column)[segments]  # the position comes first
         spread = np.max(read, axis=1, where=there, initial=-np.inf) - np.min(read, axis=1, where=there, initial=np.inf)

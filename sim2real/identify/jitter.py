@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.likelihood import Seen
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
+from sim2real.identify.segments import Data
 
 _LATER_S, _SHORTEST_S = 0.002, 2e-4
 """By how much a command is moved, to see what that does, and by how much at least where the next one follows [s]."""
@@ -75,10 +76,15 @@ def late_commands(problem: Problem, z: np.ndarray, pick: np.ndarray, counts: np.
     pick = pick[:several]
     spans = [problem.spans[e] for e in pick for _ in range(width + 1)]  # one more, as it was
     later_s = np.zeros(len(spans))
-    copies = problem.cut_anew(spans, problem.segment_s, lambda t: one_later(t, problem.model.given, width, later_s))
-    values, still = problem.table.decode(jnp.asarray(z, jnp.float32)), jnp.zeros(2 * len(problem.channels))
-    every = program(lambda e: jax.vmap(lambda e: copies.residuals(values, e, still)[0])(e))
-    rows = np.asarray(every(jnp.arange(len(spans))), np.float64).reshape(several, width + 1, counts.shape[1], -1)
+    copies = problem.recut(spans, problem.segment_s, lambda t: one_later(t, problem.model.given, width, later_s))
+    values, residuals = problem.table.decode(jnp.asarray(z, jnp.float32)), problem.residuals
+
+    def every(values: Any, data: Data) -> Any:
+        still = jnp.zeros(len(residuals.prior))
+        return jax.vmap(lambda e: residuals.residuals(values, e, still, data))(jnp.arange(len(data.recording)))
+
+    found = np.asarray(residuals.program("every", every)(values, copies.data), np.float64)
+    rows = found[: len(spans), : counts.shape[1]].reshape(several, width + 1, counts.shape[1], -1)
     by = later_s.reshape(several, width + 1, 1, 1)[:, :-1]
     slopes = np.where(by > 0.0, (rows[:, :-1] - rows[:, -1:]) / np.maximum(by, _SHORTEST_S), 0.0)  # (E, K, C, F)
     sizes, found, begin = _sizes(problem, pick, width), [], 0

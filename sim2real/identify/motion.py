@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.identify.hidden import Linearise
 from sim2real.identify.likelihood import Seen
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
+from sim2real.identify.programs import Program
 from sim2real.identify.segments import Data
 
 _STEP_S = 0.001
@@ -84,14 +84,14 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
 
 
 def _programs(
-    problem: Problem, z: Any, late: str, pick: np.ndarray, data: Data, delay_s: float, own: np.ndarray
+    seen: Problem, z: Any, late: str, pick: np.ndarray, data: Data, delay_s: float, own: np.ndarray
 ) -> tuple[Any, Any]:
     """Return two compiled functions of unknowns, shifts of initial states ``(E, states)`` and delays.
 
     The first returns residuals ``(G, E, C, F)``. The second returns their derivative by the unknowns
     ``(P, E, C, F)`` and by the states ``(E, states, C, F)``, and the times of the measurements ``(E, C)``.
     """
-    every = jnp.asarray(pick)
+    every, problem = jnp.asarray(pick), seen.residuals
 
     def residuals(at: Any, shifts: Any, delay: Any) -> tuple[Any, Any]:
         values = {**problem.table.decode(z.at[own].set(at)), late: jnp.asarray(delay, jnp.float32)}
@@ -101,7 +101,8 @@ def _programs(
         def one(eps: Any, shift: Any) -> tuple[Any, Any]:
             # The world is the same for all delays; only when it was measured differs.
             same = problem.start(eps, delay_s, data) - problem.start(eps, delay, data)
-            return problem.residuals(values, eps, shift * problem.prior + same, data)
+            error = problem.residuals(values, eps, shift * problem.prior + same, data)
+            return error, data.ts[eps]
 
         return jax.vmap(one)(every, shifts)
 
@@ -116,7 +117,7 @@ def _programs(
         by_state = jax.vmap(lambda d: jax.jvp(g, (jnp.zeros(size),), (d,))[1])(jnp.eye(size))
         return by_value, jnp.swapaxes(by_state, 0, 1), residuals(at, shifts, delay)[1]
 
-    return program(curves), program(slopes)
+    return Program(curves), Program(slopes)
 
 
 def _shifts(x: np.ndarray, own: np.ndarray, states: int, pick: np.ndarray) -> Any:
@@ -138,13 +139,11 @@ def _apart(problem: Problem) -> np.ndarray:
 
 def _again(problem: Problem, data: Data, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which measurements ``(E, C)`` have the values of the one before, and the fields' resolution ``(F,)``."""
-    places = problem.places[pick]
-    same, quantum = np.ones(places.shape, bool), []
+    same, quantum = np.ones((len(pick), data.ts.shape[1]), bool), []
     for field, sigma, entry in problem.fields:
         rows = np.asarray(entry(np.asarray(data.measured[field])), np.float64)[pick]
-        now = np.take_along_axis(rows, np.maximum(places, 0), axis=1)
-        before = np.take_along_axis(rows, np.maximum(places - 1, 0), axis=1)
-        same &= (now == before) & (places > 0)
+        same[:, 0] = False
+        same[:, 1:] &= rows[:, 1:] == rows[:, :-1]
         gaps = np.diff(np.unique(rows))
         quantum.append(float(gaps.min()) / sigma if gaps.size else 1.0)
     return same, np.array(quantum)

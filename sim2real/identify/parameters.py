@@ -44,8 +44,8 @@ class Parameter:
             only comes near, and counts as negligible where the model without it is as good.
         limits: Whether it limits what no motion need reach, as a torque: where the recordings do not feel it, it counts
             as not reached, and only a lower bound is said.
-        begin: Where a search begins; None: at the nominal value. A limit that no motion reaches at the data sheet's
-            value is found from below: there the data feel it.
+        begin: Where a search begins; None: at the nominal value; of a delay, within its bounds. A limit that no motion
+            reaches at the data sheet's value is found from below: there the data feel it.
         narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
     """
 
@@ -180,6 +180,13 @@ class ParameterTable:
             self.recordings,
         )
 
+    def with_begin(self, values: Mapping[str, float]) -> ParameterTable:
+        """Return the table with other values from which a search starts; unknown names are ignored."""
+        return ParameterTable(
+            (replace(p, begin=float(values[p.name])) if p.name in values else p for p in self.parameters),
+            self.recordings,
+        )
+
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> ParameterTable:
         """Return the table with other bounds for some parameters.
 
@@ -301,9 +308,10 @@ class ParameterTable:
         """
         at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
         own = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
-        first = {p.name: own[p.name] if p.kind != "delay" else at(p, share) for p in self.parameters}
+        open_delay = lambda p: p.kind == "delay" and p.begin is None  # noqa: E731
+        first = {p.name: at(p, share) if open_delay(p) else own[p.name] for p in self.parameters}
         for p in self.parameters:
-            if p.kind != "delay" and p.transform == "linear" and p.nominal == p.low:
+            if p.kind != "delay" and p.begin is None and p.transform == "linear" and p.nominal == p.low:
                 first[p.name] = at(p, _ABOVE)
         return self.encode(first)
 

@@ -6,14 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.artifacts.identification import FreeRun, Prediction
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify.model import Channel
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
 
 Values = Mapping[str, Any]
 
@@ -39,7 +37,7 @@ def samples(
     columns: dict[str, np.ndarray] = {}
     for name, values in models.items():
         rows = {n: np.broadcast_to(v, (problem.segments, *np.shape(v))) for n, v in values.items()}
-        residuals, ts = simulated(problem, rows, every, fit_s)
+        residuals, ts = problem.predict(rows, every, fit_s), problem.ts
         at = np.nonzero(ts >= 0)
         if not columns:
             segment, into = at[0], ts[at]
@@ -58,32 +56,6 @@ def samples(
     return columns
 
 
-def simulated(
-    problem: Problem, values: Mapping[str, np.ndarray], segments: np.ndarray, fit_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate segments, each with values of its own, after fitting its initial state to its first part.
-
-    Args:
-        problem: The segments.
-        values: Name -> values, ``(R, ...)``.
-        segments: Shape ``(R,)``: numbers of the segments.
-        fit_s: Shape ``(R,)``: lengths of their first parts [s].
-
-    Returns:
-        Residuals ``(R, C, fields)`` and their times ``(R, C)`` [s], as ``problem.predict`` returns them.
-    """
-    # So many at a time, however many there are: a program serves all, and compiling it takes longer than it runs.
-    size = problem.segments
-    predict = problem.programs.setdefault("predict", program(jax.vmap(problem.predict)))
-    found = []
-    for first in range(0, len(segments), size):
-        rows = np.minimum(np.arange(first, first + size), len(segments) - 1)
-        own = {n: jnp.asarray(v[rows], jnp.float32) for n, v in values.items()}
-        found.append(predict(own, jnp.asarray(segments[rows]), jnp.asarray(fit_s[rows], jnp.float32)))
-    residuals, ts = (np.concatenate(a)[: len(segments)].astype(np.float64) for a in zip(*found, strict=True))
-    return residuals, ts
-
-
 def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, np.ndarray]:
     """Return the newest goal sent before each sample, ``LABEL_told`` for each channel that is told where to be."""
     columns = {}
@@ -96,7 +68,7 @@ def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, 
             if c.goal in (fields := jax.tree_util.tree_leaves(tree))
         )
         rows = np.asarray(jax.tree_util.tree_leaves(problem.given[node])[place])
-        sent_s = problem.graph.timeline.vertices[node].end / TICKS_PER_S
+        sent_s = problem.timeline.vertices[node].end / TICKS_PER_S
         told = np.empty(len(into))
         for s in np.unique(segment):
             own = segment == s

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
-from sim2real.identify.robust import tamed
 from sim2real.identify.uncertainty import Linearised, Uncertainty, loss_variance
 
 ONE_SIDED = 1.645
@@ -99,17 +94,11 @@ def worse_with(
         held: Numbers of those that are not fitted anew in any row.
     """
     size = len(at.x)
-    if "given" not in problem.programs:
-        problem.programs["given"] = program(lambda z, columns, rows: _with_values(problem, z, columns, rows))
-    columns, _ = problem.at(z)
     # Rows of one number: one program serves all.
     padded = np.full((-(-len(rows) // _VALUES) * _VALUES, size), np.nan)
     padded[: len(rows)] = rows
-    found = [
-        np.asarray(problem.programs["given"](jnp.asarray(z, jnp.float32), columns, jnp.asarray(part, jnp.float32)))
-        for part in padded.reshape(-1, _VALUES, size)
-    ]
-    r = np.concatenate(found)[: len(rows)].reshape(len(rows), -1).astype(np.float64)
+    found = [problem.with_values(z, part) for part in padded.reshape(-1, _VALUES, size)]
+    r = np.concatenate(found)[: len(rows)].reshape(len(rows), -1)
     variance = loss_variance(problem, at) * float(np.median(spread.widening)) ** 2
     worse, moves = np.empty(len(rows)), np.zeros((len(rows), size))
     for k, row in enumerate(rows):
@@ -118,21 +107,6 @@ def worse_with(
         worse[k], moves[k, rest] = _refitted(r[k], at, rest, variance)
         worse[k] -= before
     return np.where(np.isfinite(worse), worse, np.inf) / variance, np.nan_to_num(moves), np.nan_to_num(r)
-
-
-def _with_values(problem: Problem, z: Any, columns: Any, rows: Any) -> Any:
-    """Return the robust residuals of all fitted segments with some values given, ``(G, S, C, F)``; as ``_worse``."""
-    values, pick = problem.table.decode(z), jnp.asarray(problem.train)
-
-    def one(row: Any) -> Any:
-        own = dict(values)
-        for i, c in enumerate(problem.table.columns):
-            if c.recording is None:
-                own[c.label] = jnp.where(jnp.isnan(row[i]), values[c.label], row[i])
-        r = jax.vmap(lambda e, s: problem.projected(own, e, s)[0])(pick, columns)
-        return tamed(r, problem.config.loss, problem.config.reach)
-
-    return jax.vmap(one)(rows)
 
 
 def _refitted(r: np.ndarray, at: Linearised, rest: np.ndarray, variance: float) -> tuple[float, np.ndarray]:

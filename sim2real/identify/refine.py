@@ -1,38 +1,49 @@
-"""Local refinement by damped least squares, from the best candidates of a search.
+"""Local refinement by least squares, and whether it converged.
 
-Where rollouts are part of a program, so is the whole descent: optimistix's Levenberg-Marquardt. On C its steps are
-scipy's, which takes derivatives of accepted steps alone; optimistix takes them of rejected ones, too. From one start a
-quadruped of 16 parameters ended after 14 Jacobians instead of 25, at the same loss: 10.6 instead of 18 s.
+scipy's trust-region method takes the steps on the host; an evaluator computes residuals and derivatives at a point. The
+loss that decides is that with initial states solved for at the point itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import Sim2RealError
-from sim2real.identify.derivative import by_jacobian
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
-from sim2real.identify.search import telling
+from sim2real.identify.programs import OnCompile
 from sim2real.identify.segments import Data
+from sim2real.identify.uncertainty import (
+    centred,
+    determined,
+    linearise,
+    loss_variance,
+    root_of_inverse,
+    shift_range,
+    time_shift,
+)
 
-_GAIN = 1e-4
-"""A round that gains a smaller share of the loss is the last."""
-_STEPS = 8
-"""Most steps of a short round, on C: of a quadruped the loss is within 0.01 % of its end after four."""
-_TOLERANCE = (1e-5, 1e-6)
-"""Relative and absolute change of point and loss at which a round of a program ends."""
-_LEAST, _MOST = 1e-4, 1e-3
-"""Relative change at which one on C does, from the finest to the coarsest: a round's own gain in between. Finer steps
-are lost in the noise of finite differences: an arm took twice the steps to the same point."""
-Improve = Callable[[Any, Any, Data, float, float], tuple[Any, Any]]
-"""One round: ``z, columns, data``, least gain of a step on C, its least move in a program ``-> (z, steps taken)``."""
+_COARSE = 1e-3
+"""Relative gain of the loss at which the descent from each start ends; that from the best goes on."""
+_ROUNDS, _ROUND_GAIN, _BACK = 4, 1e-4, 4
+"""Most rounds of a descent; a round that gains a smaller share of the loss is the last; how often one goes back."""
+_NEAR = 1e-5
+"""Relative change of the point at which a descent ends, where the evaluator resolves it."""
+_PIN = 10.0
+"""How stiffly the delays' common shift is held in the middle at first: what all of it costs, in norms of the residuals.
+A log does not determine the shift, and the loss has a minimum for each tick of the world: descents from all starts end
+in the one next to the middle."""
+_LEFT = 0.1
+"""A descent has converged where less is left of the next Gauss-Newton step, in standard errors."""
+_POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
+"""Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
+their loss must be lower. Where friction sticks, the derivative at a point says little about the points around it."""
+_TRIES = 3
+OnStep = Callable[[float, np.ndarray], None]
+"""Called with the best loss and point ``(P,)`` so far, after every evaluation."""
 
 
 @dataclass(frozen=True)
@@ -40,170 +51,204 @@ class Refined:
     """Where refinement ended.
 
     Attributes:
-        z: Shape ``(P,)``: the best point; where nothing got better, the best start.
+        z: Shape ``(P,)``: the best point.
         loss: Its loss.
         before: Loss of the best start.
-        steps: Steps of Levenberg-Marquardt, of all starts.
-        ends: Where each start's first round ended, ``(P,)``, and the loss there.
+        steps: Evaluations, of all starts.
+        left: Length of the next Gauss-Newton step at the end [standard errors], of the parameter that it moves most.
+        converged: Whether the loss has a minimum there: little is left, or no point around is better.
+        ends: Where the descent from each start ended, ``(P,)``, and the loss there.
     """
 
     z: np.ndarray
     loss: float
     before: float
     steps: int
+    left: float
+    converged: bool
     ends: tuple[tuple[np.ndarray, float], ...] = ()
-
-    @property
-    def accepted(self) -> bool:
-        """Whether refinement made the loss smaller."""
-        return self.loss < self.before
-
-
-def effort(problem: Problem, rounds: int = 1) -> tuple[int, int]:
-    """Return most steps of a round, and most rounds, for a descent that begins near its end: on C short ones.
-
-    A fit from far keeps long rounds: with short ones a quadruped's ended 0.3 % above another optimum.
-
-    Args:
-        problem: The residuals.
-        rounds: Most rounds of as many steps as are configured.
-    """
-    steps = problem.config.refine_steps
-    if problem.engine.name != "c" or steps <= _STEPS:
-        return steps, rounds
-    return _STEPS, -(-rounds * steps // _STEPS) if rounds > 1 else 1
 
 
 def refine(
     problem: Problem,
     starts: np.ndarray,
-    steps: int = 25,
-    rounds: int = 3,
-    on_round: Callable[[float, np.ndarray], None] | None = None,
     data: Data | None = None,
-    on_compile: Callable[[bool], None] | None = None,
-    gain: float = _GAIN,
-    enough: float = 0.0,
+    coarse: bool = False,
+    settle: bool = True,
+    on_step: OnStep | None = None,
+    on_compile: OnCompile | None = None,
 ) -> Refined:
-    """Improve each start by a round, the best of them by further ones; one that does not lower the loss is dropped.
-
-    How residuals depend on initial states is linearised once a round.
+    """Descend from each start, and from the best end to the minimum.
 
     Args:
         problem: The residuals.
         starts: Shape ``(K, P)``.
-        steps: Most steps of a round.
-        rounds: Most rounds.
-        on_round: Called after each round with the best loss and point so far.
-        data: What is fitted; default: the problem's logs.
-        on_compile: Called with True before a program is compiled, and with False afterwards.
-        gain: A round that gains a smaller share of the loss is the last.
-        enough: In a program, a step that moves the residuals by a smaller share of their size is its round's last: for
-            a descent that begins near its end; far from it a step around a bend moves them as little.
+        data: What is fitted; default: all fitted segments.
+        coarse: Whether the first descents do: to compare with a model by percents.
+        settle: Whether the end is tested, and points around it tried where it is no minimum.
+        on_step: Called after every evaluation.
+        on_compile: Called around a compilation.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
     """
-    data = data or problem.part()
-    if ("improve", steps) not in problem.programs:
-        with telling(on_compile):
-            problem.programs["improve", steps] = _improve(problem, steps, jnp.asarray(starts[0], jnp.float32), data)
-    improve = problem.programs["improve", steps]
-    begin = [problem.at(s, data) for s in starts]
-    first = [loss for _, loss in begin]
-    _require_finite(first)
-    best, best_loss, taken = np.asarray(starts[int(np.nanargmin(first))]), float(np.nanmin(first)), 0
-    going = [(jnp.asarray(z, jnp.float32), columns, loss) for z, (columns, loss) in zip(starts, begin, strict=True)]
-    ends: list[tuple[np.ndarray, float]] = []
-    for turn in range(rounds):
-        ended = []
-        for z, columns, loss in going:
-            moved, count = improve(z, columns, data, gain, enough)
-            taken += int(count)
-            after, new = problem.at(moved, data)
-            better = bool(jnp.all(jnp.isfinite(moved))) and new < loss
-            if better and new < best_loss:
-                best, best_loss = np.asarray(moved), new
-            if turn == 0:
-                ends.append((np.asarray(moved), new) if better else (np.asarray(z), loss))
-            if better and loss - new >= gain * abs(loss):
-                ended.append((moved, after, new))
-            if on_round:
-                on_round(best_loss, best)
-        # A round nearly ends a descent: only the best goes on, if it is one of those that still gain.
-        going = [e for e in ended if e[2] == best_loss]
-    return Refined(best, best_loss, float(np.nanmin(first)), taken, tuple(ends))
-
-
-def _require_finite(losses: Sequence[float]) -> None:
-    if not np.isfinite(losses).any():
+    descent = _Descent(problem, problem.data if data is None else data, on_step, on_compile)
+    first = [descent.at(np.asarray(z, np.float64)) for z in starts]
+    if not np.isfinite(first).any():
         raise Sim2RealError(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
+    ends = [descent.down(z, _COARSE, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
+    z, loss = min(ends, key=lambda end: end[1])
+    if coarse:
+        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
+    fine = problem.evaluator.precision
+    if time_shift(problem.table).any():
+        z, loss = descent.down(z, fine, _PIN)
+    z, loss = descent.down(z, fine)
+    if not settle:
+        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
+    left, converged = remaining(problem, z, data), False
+    for _ in range(_TRIES):
+        if converged := left < _LEFT:
+            break
+        better = descent.around(z, loss)
+        if converged := better is None:
+            break
+        z, loss = descent.down(better, fine)
+        left = remaining(problem, z, data)
+    return Refined(z, loss, float(np.nanmin(first)), descent.steps, left, converged, tuple(ends))
 
 
-def _improve(problem: Problem, steps: int, like: Any, data: Data) -> Improve:
-    """Return one round of descent, compiled for points like this one."""
-    columns, _ = problem.at(like, data)
-    scale = 1.0 / np.sqrt(max(problem.measurements, 1))
+def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> float:
+    """Return how much is left of a descent: the largest move of the next Gauss-Newton step [standard errors].
 
-    def weighed(y: Any, columns: Any, data: Data) -> Any:
-        residuals = problem.stacked(y, columns, data).reshape(-1)
-        return scale * jnp.concatenate([residuals, problem.table.prior_residuals(y)])
+    A scale-free test of convergence (Bates and Watts, Technometrics 23, 1981). Where the step leaves the bounds it ends
+    there. The delays' common shift, which a log does not determine, does not count.
 
-    if problem.engine.name == "c":
-        return _on_host(problem, weighed, steps, (like, columns, data))
-    compiled = _as_program(problem, weighed, steps).lower(like, columns, data, jnp.float32(0.0)).compile()
-    return lambda z, columns, data, _, enough: compiled(z, columns, data, jnp.float32(enough))
-
-
-def _on_host(problem: Problem, weighed: Callable[..., Any], steps: int, like: Any) -> Improve:
-    """Return a round of scipy's trust-region method."""
-    from scipy.optimize import least_squares  # 0.2 s
-
-    def columns_of(y: Any, columns: Any, data: Data) -> Any:
-        f = problem.differentiable(lambda x: weighed(x, columns, data))
-        return jax.vmap(lambda d: jax.jvp(f, (y,), (d,))[1], out_axes=-1)(jnp.eye(y.size, dtype=y.dtype))
-
-    value, slope = (program(f).lower(*like).compile() for f in (weighed, columns_of))
-
-    def improve(z: Any, columns: Any, data: Data, gain: float, _: float) -> tuple[Any, Any]:
-        def of(f: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
-            return lambda y: np.asarray(f(jnp.asarray(y, jnp.float32), columns, data), np.float64)
-
-        if not np.isfinite(of(value)(z)).all():
-            return z, 0
-        least = float(np.clip(gain, _LEAST, _MOST))
-        jac: Any = of(slope)  # scipy's stubs know the names of its own differences alone
-        found = least_squares(of(value), np.asarray(z, np.float64), jac, ftol=least, xtol=_LEAST, max_nfev=steps)
-        return jnp.asarray(found.x, jnp.float32), found.njev
-
-    return improve
-
-
-def _as_program(problem: Problem, weighed: Callable[..., Any], steps: int) -> Any:
-    """Return a round of optimistix's Levenberg-Marquardt, jitted.
-
-    By itself it ends when no residual changes any more, which in single precision rarely comes: it takes all its steps.
-    Where less will do, a step that moves the residuals by less than a share of their size is the last: near the optimum
-    it gains the square of that share of the loss.
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the point.
+        data: What is fitted; default: all fitted segments.
     """
-    import optimistix  # 0.5 s
+    at, rest = linearise(problem, z, data), determined(problem)
+    if data is not None:
+        rest = rest[np.asarray(data.kept)[rest]]
+    J, variance = at.jacobian.reshape(-1, len(at.x))[:, rest], loss_variance(problem, at)
+    root = root_of_inverse(J.T @ J / variance + at.prior[np.ix_(rest, rest)])
+    covariance = root @ root.T
+    step = -covariance @ (J.T @ at.residuals.reshape(-1)) / variance
+    low, high = problem.table.low[rest] - at.x[rest], problem.table.high[rest] - at.x[rest]
+    return float(np.max(np.abs(np.clip(step, low, high)) / np.sqrt(np.diag(covariance)), initial=0.0))
 
-    def improve(z: Any, columns: Any, data: Data, enough: Any) -> tuple[Any, Any]:
-        residuals = by_jacobian(problem.differentiable(lambda y: weighed(y, columns, data)))
-        size = jnp.linalg.norm(weighed(z, columns, data))
-        tolerance: Any = [jnp.where(enough > 0, a, b) for a, b in zip((0.0, enough * size), _TOLERANCE, strict=True)]
 
-        def norm(x: Any) -> Any:  # of the point's change over its tolerance, and of that of the residuals
-            coarse = jnp.linalg.norm(x) if x.size != z.size else 0.0
-            return jnp.where(enough > 0, coarse, jnp.max(jnp.abs(x)))
+class _Descent:
+    """Descends on one problem and data.
 
-        solver = optimistix.LevenbergMarquardt(*tolerance, norm=norm)
-        found = optimistix.least_squares(
-            lambda y, _: residuals(y), solver, z, options={"jac": "fwd"}, max_steps=steps, throw=False
-        )
-        return found.value, found.stats["num_steps"]
+    Args:
+        problem: The residuals.
+        data: What is fitted.
+        on_step: Called after every evaluation.
+        on_compile: Called around a compilation.
 
-    return program(improve)
+    Attributes:
+        steps: Evaluations so far.
+    """
+
+    def __init__(self, problem: Problem, data: Data, on_step: OnStep | None, on_compile: OnCompile | None) -> None:
+        self._problem, self._data, self._on_step, self._on_compile = problem, data, on_step, on_compile
+        self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
+        self.steps = 0
+
+    def at(self, z: np.ndarray) -> float:
+        """Return the loss at a point, where initial states are linearised there."""
+        loss = self._problem.loss(z, self._data, self._on_compile)
+        self._report(loss, z)
+        return loss
+
+    def down(self, z: np.ndarray, gain: float, pin: float = 0.0) -> tuple[np.ndarray, float]:
+        """Descend from a point until a round gains a smaller share of the loss; return where that ends, and its loss.
+
+        In a round initial states may keep the derivatives that they have at its start. Where the loss is larger at its
+        end once they are linearised there, the round goes back towards its start.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            gain: The share.
+            pin: How stiffly the delays' common shift is held in the middle, see ``_PIN``.
+        """
+        z = np.asarray(z, np.float64)
+        if pin and self._problem.config.initial_state == "free":
+            z = centred(self._problem.table, z)
+        loss = self.at(z)
+        for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
+            end = self._round(z, gain, pin)
+            after = self.at(end)
+            for _ in range(_BACK):
+                if after <= loss:
+                    break
+                end = (z + end) / 2.0
+                after = self.at(end)
+            if not after < loss:
+                break
+            gained, z, loss = loss - after, end, after
+            if gained < max(gain, _ROUND_GAIN) * loss:
+                break
+        return z, loss
+
+    def around(self, z: np.ndarray, loss: float) -> np.ndarray | None:
+        """Return a point within about a standard error that is better; None if none of those tried is."""
+        table = self._problem.table
+        at = linearise(self._problem, z, self._data)
+        J, variance = at.jacobian.reshape(-1, len(at.x)), loss_variance(self._problem, at)
+        root = root_of_inverse(J.T @ J / variance + at.prior)
+        for draw in np.random.default_rng(0).normal(size=(_POLLED, len(at.x))):
+            there = table.at_scale(at.x + _REACH * root @ draw)
+            if self.at(there) < (1.0 - _BETTER) * loss:
+                return there
+        return None
+
+    def _round(self, z: np.ndarray, gain: float, pin: float) -> np.ndarray:
+        """Return where least squares ends from a point."""
+        from scipy.optimize import least_squares  # 0.2 s
+
+        value, slope = self._problem.evaluator.around(z, self._data)
+        first = value(z)
+        if not (np.isfinite(first).all() and np.isfinite(slope(z)).all()):
+            return z
+        pin *= float(np.linalg.norm(first))
+
+        def pinned(y: np.ndarray) -> np.ndarray:
+            self._report(np.inf, y)
+            return np.nan_to_num(np.concatenate([value(y), pin * self._pinned(y)[0]]), nan=np.inf)
+
+        def pinned_slope(y: np.ndarray) -> np.ndarray:
+            return np.concatenate([slope(y), pin * self._pinned(y)[1]])
+
+        most = max(1, self._problem.config.refine_steps)
+        near = max(_NEAR, self._problem.evaluator.precision)
+        options: Any = {"jac": pinned_slope, "gtol": None}  # scipy's stubs have neither functions nor None
+        found = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
+        return np.asarray(found.x, np.float64)
+
+    def _report(self, loss: float, z: np.ndarray) -> None:
+        self.steps += 1
+        if loss < self._best[0]:
+            self._best = (loss, z.copy())
+        if self._on_step and np.isfinite(self._best[0]):
+            self._on_step(*self._best)
+
+    def _pinned(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far the delays' common shift is from its middle, ``(1,)`` in shares of it, and the slope."""
+        table = self._problem.table
+        shift = time_shift(table)
+        if self._problem.config.initial_state != "free" or not shift.any():
+            return np.zeros(0), np.zeros((0, z.size))
+        x, stretch = table.scale(z)
+        width = float(table.span[shift != 0.0].min())
+        middle = lambda x: sum(shift_range(table, x, shift)) / 2.0 / width  # noqa: E731
+        step = 1e-3 * width
+        moves = step * np.diag((shift != 0.0).astype(float))
+        slope = np.array([(middle(x + m) - middle(x - m)) / (2.0 * step) for m in moves])
+        return np.array([middle(x)]), (slope * stretch)[None]

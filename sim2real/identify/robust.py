@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from sim2real.identify.config import Loss
 
 
-def tamed(residual: Any, loss: Loss, reach: float) -> Any:
+def tamed(residual: Any, loss: Loss, reach: float, xp: Any = jnp) -> Any:
     """Return a residual whose half square is the robust loss of the given one, so that least squares minimises it.
 
     ``huber`` is the pseudo-Huber loss: squared below ``reach``, linear far above it. ``cauchy`` grows
@@ -19,12 +19,13 @@ def tamed(residual: Any, loss: Loss, reach: float) -> Any:
         residual: Any shape, in deviations.
         loss: The kind.
         reach: Above this the loss grows more slowly than the square, in deviations.
+        xp: ``jax.numpy`` or ``numpy``.
     """
     if loss == "squared":
         return residual
     if loss == "huber":  # by hypot: the square may overflow, and the worst residual would become the best
-        return residual * jnp.sqrt(2.0 / (jnp.hypot(1.0, residual / reach) + 1.0))
+        return residual * xp.sqrt(2.0 / (xp.hypot(1.0, residual / reach) + 1.0))
     square = (residual / reach) ** 2
     small = square < 1e-6
-    safe = jnp.where(small, 1.0, square)  # log(1 + s) / s, without dividing by zero on the branch not taken
-    return residual * jnp.sqrt(jnp.where(small, 1.0 - square / 2.0, jnp.log1p(safe) / safe))
+    safe = xp.where(small, 1.0, square)  # log(1 + s) / s, without dividing by zero on the branch not taken
+    return residual * xp.sqrt(xp.where(small, 1.0 - square / 2.0, xp.log1p(safe) / safe))

@@ -16,6 +16,7 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.sizes import padded, rounded
 
 Retimed = Callable[[Timeline], Timeline]
 """From segments' recorded timing to another."""
@@ -60,25 +61,73 @@ class Segments:
 
 
 class Data(NamedTuple):
-    """What is fitted, as an argument of compiled programs: one program serves other measurements, and parts of them.
+    """Segments as an argument of compiled programs: one program serves all recordings whose counts round up alike.
+
+    E is the number of segments, S that of the fitted ones, K that of the sensor's steps; all are rounded up, and what
+    was added repeats the last entry and has no weight.
 
     Attributes:
-        measured: Field -> ``(E, N, ...)``, as in ``Segments``.
+        tables: Timing of the simulated steps, as ``OpenLoopGraph.tables`` returns it.
+        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        measured: Field -> ``(E, K, ...)``: the measurement that each of the sensor's steps predicts.
+        ts: Shape ``(E, K)``: when it was made [s from the segment's start]; -1 where nothing is compared.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
-        weight: Shape ``(E,)``: 1 for a segment that counts, 0 for one that is left out; None: all count.
-        kept: Shape ``(P,)``, bool: which free parameters are part of the model; None: all.
+        recording: Shape ``(E,)``: number of the segment's recording.
+        length_s: Length of a segment [s].
+        fitted: Shape ``(S,)``: numbers of the fitted segments.
+        weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for one that is left out.
+        kept: Shape ``(P,)``, bool: which free parameters are part of the model.
+        count: How many numbers the fitted segments hold.
     """
 
+    tables: Any
+    given: Mapping[str, Any]
     measured: Mapping[str, Any]
+    ts: Any
     starts: Any
-    weight: Any = None
-    kept: Any = None
+    recording: Any
+    length_s: Any
+    fitted: Any
+    weight: Any
+    kept: Any
+    count: Any
 
-    @classmethod
-    def of(cls, cuts: Segments) -> Data:
-        """Return all of the segments."""
-        measured = {f: jnp.asarray(rows, jnp.float32) for f, rows in cuts.measured.items()}
-        return cls(measured, jnp.asarray(cuts.starts, jnp.float32))
+
+def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters: int) -> Data:
+    """Return segments as an argument of compiled programs.
+
+    Args:
+        cuts: The segments.
+        tables: Their timing.
+        from_s: Measurements before this time are not compared [s from the segment's start].
+        fields: How many numbers are compared of each measurement.
+        parameters: How many free parameters there are.
+    """
+    segments = len(cuts.spans)
+    fitted = np.flatnonzero([s.fitted for s in cuts.spans])
+    seq = np.asarray(cuts.ts)  # (E, N), and 0 behind the last measurement
+    ts = np.where(seq >= from_s, seq, -1.0)
+    steps, size = rounded(ts.shape[1]), rounded(segments)
+    ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
+    measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
+    given = {
+        n: jax.tree_util.tree_map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree)
+        for n, tree in cuts.given.items()
+    }
+    rows = (tables, given, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
+            np.array([s.recording for s in cuts.spans], np.int32))  # fmt: skip
+    counts = rounded(max(len(fitted), 1))
+    return jax.tree_util.tree_map(
+        jnp.asarray,
+        Data(
+            *padded(rows, size),
+            length_s=np.float32(cuts.length_s),
+            fitted=np.pad(fitted, (0, counts - len(fitted))).astype(np.int32),
+            weight=(np.arange(counts) < len(fitted)).astype(np.float32),
+            kept=np.ones(parameters, bool),
+            count=np.float32(max(int((ts[fitted] >= 0.0).sum()) * fields, 1)),
+        ),
+    )
 
 
 def cut(

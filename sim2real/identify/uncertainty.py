@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.special import chdtri, stdtrit
+from scipy.special import chdtrc, stdtrit
 
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem import Problem
-from sim2real.identify.programs import program
+from sim2real.identify.segments import Data
 
 VAGUE = 0.15
 """Standard errors above this share of the bounds' width are not identifiable (a uniform distribution has 0.29)."""
@@ -31,8 +29,9 @@ _LEAST_FREEDOM = 2.0
 """With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
 _ALONE = 0.5
 """Share of the information about a parameter above which one part stands alone with what it says."""
-_BY_CHANCE = 0.1
-"""Intervals widen only where blocks differ so much that chance alone would explain it in this share of recordings."""
+_BY_CHANCE = (0.2, 0.05)
+"""Intervals begin to widen where chance alone would make blocks differ as much in this share of recordings, and widen
+in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
 
 
 @dataclass(frozen=True)
@@ -85,23 +84,22 @@ class Uncertainty:
     widening: np.ndarray
 
 
-def centred(problem: Problem, z: np.ndarray) -> np.ndarray:
+def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
     """Return ``z (P,)`` with the delays on either side of the world shifted to the middle of what their bounds admit.
 
     The log does not tell them apart, so how a search shared their sum between them means nothing.
     """
-    table = problem.table
     x, _ = table.scale(z)
     shift = time_shift(table)
-    down, up = _shift_range(table, x, shift)
+    down, up = shift_range(table, x, shift)
     moved = table.unscale(x + shift * (down + up) / 2)
     scaled = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, moved, strict=True)])
     share = np.clip((scaled - table.low) / table.span, 1e-6, 1 - 1e-6)
     return np.where(shift != 0.0, np.log(share / (1 - share)), z)
 
 
-def linearise(problem: Problem, z: np.ndarray) -> Linearised:
-    """Compute residuals and Jacobian at ``z (P,)``.
+def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Linearised:
+    """Compute residuals and Jacobian at ``z (P,)``, of some data; default: all fitted segments.
 
     At a bound nothing changes with ``z`` any more, but it does with the parameter: there both are computed at a point a
     little inside, and the residuals carried on to the estimate along the Jacobian.
@@ -109,16 +107,13 @@ def linearise(problem: Problem, z: np.ndarray) -> Linearised:
     table = problem.table
     most = np.log((1.0 - _INSIDE) / _INSIDE)
     inside = np.clip(z, -most, most)
-    point = jnp.asarray(inside, jnp.float32)
-    linearised = problem.programs.setdefault("linearised", program(problem.linearised))
-    columns, _ = problem.at(inside)
-    r, J, raw = (np.asarray(a, np.float64) for a in linearised(point, columns))
+    found = problem.at(inside, data)
     at, stretch = table.scale(inside)
-    x = table.scale(z)[0]
-    onward = (J / stretch) @ (x - at)
-    priors = np.asarray(jax.jacfwd(table.prior_residuals)(point), np.float64) / stretch
+    x, J = table.scale(z)[0], found.jacobian / stretch
+    onward = J @ (x - at)
+    priors = found.prior_jacobian / stretch
     prior = priors.T @ priors + np.diag(12.0 / table.span**2)
-    return Linearised(r + onward, J / stretch, prior, x, raw + onward)
+    return Linearised(found.residuals + onward, J, prior, x, found.raw + onward)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
@@ -144,13 +139,10 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     table, size = problem.table, len(at.x)
     J, (count, free, inflation) = at.jacobian.reshape(-1, size), _freedom(problem, at)
     variance = loss_variance(problem, at)
-    shift = time_shift(table)
-    # The sensor's delay carries the shift.
-    fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
-    rest = np.setdiff1d(np.arange(size), fixed)
+    shift, rest = time_shift(table), determined(problem)
     precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
     cov = np.zeros((size, size))
-    root = _root_of_inverse(precision)
+    root = root_of_inverse(precision)
     cov[np.ix_(rest, rest)] = root @ root.T
     quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
@@ -159,7 +151,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     # No standard error grows beyond that of a uniform distribution within the bounds.
     wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
     cov *= np.outer(wider, wider)
-    down, up = _shift_range(table, at.x, shift)
+    down, up = shift_range(table, at.x, shift)
     reach = quantile * np.sqrt(np.diag(cov))
     low = table.unscale(at.x - reach + np.minimum(down * shift, up * shift))
     high = table.unscale(at.x + reach + np.maximum(down * shift, up * shift))
@@ -179,6 +171,13 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
         misfit=float(np.sqrt(np.sum(at.raw**2) / max(count, 1))),
         widening=wider,
     )
+
+
+def determined(problem: Problem) -> np.ndarray:
+    """Return the numbers of the parameters that are judged one by one: without the delay that carries the shift."""
+    shift = time_shift(problem.table)
+    fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
+    return np.setdiff1d(np.arange(len(shift)), fixed)
 
 
 def loss_variance(problem: Problem, at: Linearised) -> float:
@@ -278,7 +277,7 @@ def _verdict(error: float, margin: float, shifts: bool) -> str:
     return "not identifiable" if error > VAGUE else "accepted"
 
 
-def _shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
+def shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
     """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift."""
     moved = shift != 0.0
     if not moved.any():
@@ -319,7 +318,7 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
         informations: Shape ``(B, Q, Q)``.
         prior: Shape ``(Q, Q)``: what the prior adds to the information.
     """
-    root = _root_of_inverse(informations.sum(axis=0) + prior)
+    root = root_of_inverse(informations.sum(axis=0) + prior)
     shares = root.T @ informations @ root  # they sum to the identity, less the prior's
     left, axes = np.linalg.eigh(np.eye(len(root)) - shares)
     scaled = (axes / np.sqrt(np.maximum(left, 1e-3))[:, None, :]) @ axes.transpose(0, 2, 1)
@@ -333,7 +332,7 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
     return np.sqrt(variance), trace**2 / np.maximum(square, 1e-300)
 
 
-def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
+def root_of_inverse(precision: np.ndarray) -> np.ndarray:
     """Return ``R (Q, Q)`` with ``R R' = precision^-1``, for a matrix that rounding may have made indefinite.
 
     What was measured a million times, and what only the bounds say, differ by more than doubles resolve: the inverse
@@ -353,8 +352,10 @@ def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.nda
         quantile: What the latter is multiplied by for an interval of 95 %.
     """
     freedom = np.maximum(freedom, 1.0)
-    more = (freedom >= _LEAST_FREEDOM) & (ratio**2 > chdtri(freedom, _BY_CHANCE) / freedom)
-    return np.where(more, np.maximum(ratio * stdtrit(freedom, 0.975) / quantile, 1.0), 1.0)
+    begin, full = _BY_CHANCE
+    share = np.clip((begin - chdtrc(freedom, freedom * ratio**2)) / (begin - full), 0.0, 1.0)
+    wider = np.maximum(ratio * stdtrit(freedom, 0.975) / quantile, 1.0)
+    return np.where(freedom >= _LEAST_FREEDOM, 1.0 + share * (wider - 1.0), 1.0)
 
 
 def _correlation_in_time(r: np.ndarray) -> float:

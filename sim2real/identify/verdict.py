@@ -16,7 +16,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.round_trip import RoundTrip
 from sim2real.identify.uncertainty import Uncertainty
 
-Status = Literal["accepted", "no improvement on held-out data", "not identifiable", "hit a bound"]
+Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
 _BETTER = 0.95
 """The error on held-out data must be below this share of every baseline's."""
 _ALIKE = 1.05
@@ -102,7 +102,7 @@ class Verdict:
     """The judgement.
 
     Attributes:
-        status: The first that applies of: no improvement, hit a bound, not identifiable, accepted.
+        status: The first that applies of: not converged, no improvement, hit a bound, not identifiable, accepted.
         reasons: Sentences.
         flags: Flags with which to identify again, where that is the way out.
     """
@@ -145,6 +145,7 @@ def judge(
     trip: RoundTrip | None = None,
     max_delay_s: float = 1.0,
     beyond: Sequence[str] = (),
+    left: float | None = None,
 ) -> Verdict:
     """Judge an identification.
 
@@ -157,9 +158,12 @@ def judge(
         trip: The sum of the delays.
         max_delay_s: For which delays the model is made [s].
         beyond: Where held-out data goes beyond what was fitted: sentences.
+        left: Length of the next step of a fit that did not converge [standard errors]; None: it converged.
     """
     improves, reasons = _on_held_out(found)
     reasons += beyond
+    if left is not None:
+        return Verdict("not converged", (_not_converged(left), *reasons))
     known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
@@ -185,6 +189,14 @@ def judge(
     elif loose:
         status = "not identifiable"
     return Verdict(status, tuple(reasons), flags)
+
+
+def _not_converged(left: float) -> str:
+    """Return why a fit has no intervals."""
+    return (
+        f"the fit ended before its loss had a minimum: the next step would move an estimate by {left:.2g} standard "
+        "errors, so there are no intervals"
+    )
 
 
 def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:

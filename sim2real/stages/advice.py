@@ -56,6 +56,25 @@ def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) ->
     return command(pipeline, config, root, flags) if flags else ""
 
 
+def onward(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -> str:
+    """Return the command line that goes on with an identification that was interrupted or did not converge.
+
+    Args:
+        pipeline: The robot.
+        config: The settings of that identification.
+        root: Folder of all runs.
+        file: Its values.
+    """
+    usual = pipeline.identify
+    effort = {
+        "generations": max(config.generations, usual.generations),
+        "refine": max(config.refine, usual.refine, 1),
+        "refine-steps": max(2 * config.refine_steps, usual.refine_steps),
+    }
+    flags = " ".join(f"--{name} {number}" for name, number in effort.items())
+    return command(pipeline, config, root, f"--begin {shlex.quote(str(file))} {flags}")
+
+
 def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str = "") -> str:
     """Return the command line of an identification with some settings and further flags.
 

@@ -64,6 +64,8 @@ class IdentifyConfig(FitConfig):
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log to identify from, one flag a log; default: the newest finished recording of the pipeline."""
+    begin: str | None = None
+    """Where the search begins: the parameters.json or partial.json of an earlier one; default: at the data sheet."""
     hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log that is held out: only predicted, not fitted; one flag a log."""
     settle_s: float = 0.3

@@ -42,6 +42,8 @@ class IdentifyModelFlags:
     """Folder of all runs."""
     run: OptionalFolder = None
     """Run folder to add to; default: a new one."""
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
     robot: Annotated[RobotFlags, tyro.conf.arg(name="")] = field(default_factory=RobotFlags)
 
 

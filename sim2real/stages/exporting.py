@@ -7,7 +7,7 @@ from pathlib import Path
 
 import sim2real
 from sim2real.artifacts.files import write_json
-from sim2real.artifacts.identification import PARAMETERS, Identification
+from sim2real.artifacts.identification import PARAMETERS, UNFINISHED, Identification
 from sim2real.artifacts.run_folder import newest, pipeline_of
 from sim2real.errors import UsageError
 from sim2real.identify.export.document import json_document
@@ -44,9 +44,10 @@ def run(config: ExportConfig) -> Path:
     file = find_parameters(config)
     found = Identification.load(file)
     if found.posterior is None:
+        ended = UNFINISHED.get(found.verdict.status, "has no intervals")
         raise UsageError(
-            f"the search that {file} is from was interrupted: nothing is known about how far off its values are",
-            hint=f"sim2real identify {found.pipeline}",
+            f"the identification in {file} {ended}: its estimates may be far off",
+            hint=found.verdict.next or f"sim2real identify {found.pipeline}",
         )
     pipeline = pipeline_beside(file, found)
     robot = having(pipeline.load(), [p.name for p in found.parameters])

@@ -33,6 +33,8 @@ class StageFlags(Generic[Config]):
     """Folder of all runs."""
     run: OptionalFolder = None
     """Run folder to add to; default: a new one for record, for the others the newest one with what they need."""
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class DemoFlags:
     """Folder of all runs."""
     resume: OptionalFolder = None
     """Run folder to go on with: stages that are finished there are skipped."""
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
 
 
 @dataclass(frozen=True)

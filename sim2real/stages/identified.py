@@ -113,6 +113,11 @@ def document(
         seconds=seconds,
         engine=str(fit.problem.engine),
     )
+    if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
+        rows = tuple(_without_interval(row) for row in _rows(found, truth))
+        return Identification(
+            pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
+        )
     return Identification(
         pipeline=pipeline,
         logs=(),
@@ -144,8 +149,17 @@ def judged(
     judged_on = positions(found.fit.problem, units)
     rows = scores(document.prediction, judged_on)
     table = found.fit.problem.table
+    fit = found.fit
     verdict = judge(
-        rows, table, found.x, found.spread, found.check, trip=found.trip, max_delay_s=max_delay_s, beyond=outside
+        rows,
+        table,
+        found.x,
+        found.spread,
+        found.check,
+        trip=found.trip,
+        max_delay_s=max_delay_s,
+        beyond=outside,
+        left=None if fit.converged else fit.left,
     )
     horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
     worth = left_out.sentences(document.left_out, judged_on, horizon_s)
@@ -187,7 +201,7 @@ def show(found: Identification) -> None:
     """Print the parameters, and what stands in the way of trusting them."""
     rows = []
     for p in found.parameters:
-        interval = f"[{number(p.low95):.4g}, {number(p.high95):.4g}]"
+        interval = "" if p.low95 is None else f"[{p.low95:.4g}, {number(p.high95):.4g}]"
         rows.append([p.name, p.estimate, interval, p.unit, p.nominal, p.truth, _off(p), p.verdict])
     print(table(rows, ["parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict"]))
     if found.aggregate:
@@ -281,6 +295,13 @@ def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:
         named = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
         rows.append(Estimate(*named, verdict="fixed", truth=truth.get(p.name), **ends))
     return rows + ([_round_trip(found.trip, truth)] if found.trip else [])
+
+
+def _without_interval(row: Estimate) -> Estimate:
+    """Return the row of a parameter whose fit did not converge."""
+    if row.verdict == "fixed":
+        return row
+    return replace(row, standard_error=None, low95=None, high95=None, verdict="not converged")
 
 
 def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> Estimate:

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import FreeRun, Identification, Quantity
+from sim2real.artifacts.identification import PARAMETERS, FreeRun, Identification, Quantity
 from sim2real.artifacts.manifest import sha256
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import Source, StageFolder, newest, open_stage
+from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify import ensemble, prediction
 from sim2real.identify.aggregate import aggregate
@@ -53,6 +54,7 @@ def identify(
     config: IdentifyConfig | None = None,
     hold_out: Sequence[Recording] = (),
     best: Best | None = None,
+    begin: Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a robot's parameters.
 
@@ -62,6 +64,7 @@ def identify(
         config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
+        begin: Values at which the search begins; default: the pipeline's.
 
     Returns:
         Estimates, their uncertainty, what they predict, and a verdict.
@@ -80,19 +83,22 @@ def identify(
         require_units(log, robot)
     units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
-    table = _table(model, config)
+    table = _table(model, config).with_begin(begin or {})
+    best = best or Best()
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
     windows = spans(episodes, len(fitted), config, config.settle_s + config.horizon_s)
-    begin = time.monotonic()
+    started = time.monotonic()
     every, found, choice = _with_terms(model, episodes, windows, config, table, names, best)
+    best.fitted(found.z, found.loss)
     with progress(None, "identify: errors, predictions and baselines"):
-        without = patiently(lambda: left_out.examined(every, config, names)) if config.folds else ()
+        judged = config.folds and found.converged  # errors of other fits promise nothing of this one
+        without = patiently(lambda: left_out.examined(every, config, names)) if judged else ()
         findings = patiently(lambda: identified.Findings.of(found, without))
         found = findings.fit
         terms = found.problem.table.terms if every.problem.table.terms else None
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
         posterior = patiently(lambda: ensemble.posterior(found, findings.at, findings.spread, every, choice))
-        document = identified.document(pipeline.name, findings, posterior, truth, time.monotonic() - begin)
+        document = identified.document(pipeline.name, findings, posterior, truth, time.monotonic() - started)
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, found))
         each = patiently(lambda: _each(found)) if config.each and len(fitted) > 1 else ()
         own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
@@ -124,9 +130,10 @@ def _with_terms(
     config: IdentifyConfig,
     table: ParameterTable,
     names: Sequence[str],
-    best: Best | None,
+    best: Best,
 ) -> tuple[Fit, Fit, Selection | None]:
     """Return the fit with all optional terms, that with those that are needed, and how they were chosen."""
+    best.restart(table.for_recordings(len(episodes)))
     with _told("identify", best) as told:
         found = patiently(lambda: _fit(model, episodes, len(names), windows, config, table, told, _begins))
     if config.terms != "auto":
@@ -137,6 +144,7 @@ def _with_terms(
     fewer = table.with_terms(terms).with_fixed(config.fix)
     fewer = fewer.with_nominal({p.name: found.values[p.name] for p in fewer if p.free and not p.per_recording})
     again = replace(config, generations=0)
+    best.restart(fewer.for_recordings(len(episodes)))
     with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
         narrow = patiently(lambda: _fit(model, episodes, len(names), windows, again, fewer, told))
     return found, narrow, choice
@@ -155,18 +163,20 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
     logs = [open_recording(path, pipeline, robot) for path in paths]
     fitted = len(logs) - len(config.hold_out)
-    model = robot.identifiable(config.max_delay_s)
-    table = left_out.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
-    table = table.for_recordings(len(logs))
+    _table(robot.identifiable(config.max_delay_s), config)  # a wrong flag is refused before a folder is made
+    begin = _begin(config.begin, pipeline) if config.begin else None
     # Logs that are too short are refused before a folder is made.
     spans([log.episode for log in logs], fitted, config, config.settle_s + config.horizon_s)
     inputs = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}
     with (
         open_stage(root, pipeline.name, "identify", config, inputs, run_dir) as stage,
-        left_behind(stage, pipeline.name, paths, table) as best,
+        left_behind(stage, pipeline.name, paths, lambda file: advice.onward(pipeline, config, root, file)) as best,
     ):
-        found = identify(logs[:fitted], pipeline, config, logs[fitted:], best)
-        verdict = replace(found.verdict, next=advice.again(pipeline, config, root, found.verdict.next))
+        found = identify(logs[:fitted], pipeline, config, logs[fitted:], best, begin)
+        again = advice.again(pipeline, config, root, found.verdict.next)
+        if found.verdict.status == "not converged":
+            again = advice.onward(pipeline, config, root, stage.folder / PARAMETERS)
+        verdict = replace(found.verdict, next=again)
         sources = tuple(Source.of(path, stage.run_dir) for path in paths)
         found = replace(found, logs=sources, verdict=verdict)
         for name, path in found.save(stage.folder).items():
@@ -181,6 +191,17 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         identified.show(found)
         stage.summary(identified.summary(found))
     return stage.result
+
+
+def _begin(path: str, pipeline: Pipeline) -> dict[str, float]:
+    """Return the values at which a search begins, from an earlier identification of the same robot."""
+    found = Identification.load(Path(path))
+    if found.pipeline != pipeline.name:
+        raise UsageError(
+            f"{path} is of pipeline {found.pipeline!r}, not of {pipeline.name!r}",
+            hint="begin at an identification of the same robot, or leave --begin out",
+        )
+    return {p.name: p.estimate for p in found.parameters if p.kind != "derived" and p.verdict != "fixed"}
 
 
 def find_logs(
@@ -274,7 +295,7 @@ def _free_runs(
     if not held_out or not config.free_run_s:
         return [], {}
     length_s = min(config.free_run_s, min(ends[s.recording] - s.begin_s for s in held_out))
-    problem = found.windows.cut_anew(held_out, length_s)
+    problem = found.windows.recut(held_out, length_s)
     columns = prediction.samples(problem, models, config.settle_s)
     return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns
 

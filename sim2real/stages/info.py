@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from sim2real.artifacts.manifest import plain, versions
 from sim2real.artifacts.run_folder import STAGES, attempts, run_folders
 from sim2real.hardware import entries
+from sim2real.runtime import compilation_cache
 from sim2real.stages.console import pairs, shown, table
 from sim2real.stages.flags import flag_names
 from sim2real.stages.pipeline import available, load_pipeline
@@ -24,11 +26,21 @@ def installation() -> str:
         except Exception as error:  # one broken pipeline must not hide the others
             summary = f"cannot be imported: {type(error).__name__}: {error}"
         rows.append([name, summary, _origin(source)])
-    blocks = [pairs(versions()), table(rows, ["pipeline", "summary", "from"])]
+    blocks = [pairs({**versions(), "compiled programs": _programs()}), table(rows, ["pipeline", "summary", "from"])]
     for what, group in (("device", entries.DEVICES), ("world", entries.WORLDS)):
         if found := entries.available(group):
             blocks.append(table([[name, _origin(found[name])] for name in sorted(found)], [what, "from"]))
     return "\n\n".join(blocks)
+
+
+def _programs() -> str:
+    """Return where compiled programs are kept, and how much there is of them."""
+    if (own := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
+        return f"{own} (JAX_COMPILATION_CACHE_DIR)"
+    folder = compilation_cache.location()
+    if folder is None:
+        return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}"
+    return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"
 
 
 def pipeline(name: str, root: Path) -> str:

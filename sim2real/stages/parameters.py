@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.errors import Sim2RealError
 from sim2real.robots.worlds import in_world
 from sim2real.stages.pipeline import Pipeline
@@ -18,7 +18,7 @@ def open_identification(path: Path, pipeline: Pipeline) -> Identification:
         pipeline: The robot that it must be of.
 
     Raises:
-        Sim2RealError: When it is missing, damaged, of another pipeline, or was interrupted.
+        Sim2RealError: When it is missing, damaged, of another pipeline, was interrupted, or did not converge.
     """
     found = Identification.load(path)
     check_parameters(found, pipeline)
@@ -29,15 +29,16 @@ def check_parameters(found: Identification, pipeline: Pipeline) -> None:
     """Check that a pipeline can be simulated with what was identified.
 
     Raises:
-        Sim2RealError: When it is of another pipeline, lacks parameters, or was interrupted.
+        Sim2RealError: When it is of another pipeline, lacks parameters, was interrupted, or did not converge.
         UsageError: When the world that it was identified in is not installed.
     """
     hint = f"make them with `sim2real identify {pipeline.name}`"
     if found.pipeline != pipeline.name:
         raise Sim2RealError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}", hint=hint)
     if found.posterior is None:
+        ended = UNFINISHED.get(found.verdict.status, "has no intervals")
         raise Sim2RealError(
-            "this identification was interrupted: it says nothing about how sure its estimates are", hint=hint
+            f"this identification {ended}: its estimates may be far off", hint=found.verdict.next or hint
         )
     robot = in_world(pipeline.load(), found.world)
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names

@@ -17,7 +17,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.engine import CRollouts, choose
 from sim2real.identify.model import IdentifiableModel
 from sim2real.robots.base import Robot
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.open_loop import OpenLoopGraph
 
 
 def simulate(
@@ -56,25 +56,23 @@ def simulate(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
         )
         outputs[name] = rows
-    graph = CompiledGraph(nodes, model.sensor, timeline, given)
+    graph = OpenLoopGraph(nodes, model.sensor, model.given)
+    tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, given))
+    messages = jax.tree_util.tree_map(lambda rows: rows[0], given)
     rest = named_leaves(nodes[model.sensor].init_output(jax.random.key(0), None))
     told = [i for i, c in enumerate(model.channels) if c.goal is not None]
     start = np.array([float(c.of(np.asarray(rest[c.position]))) for c in model.channels])
     start[told] = [signal[0, model.channels[i].index or 0] for i in told]
     params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
-    gs = graph.init(jax.random.key(0), params=params, eps=0)
     # The first command is taken to have held before, as where a log is cut into segments.
-    first = lambda rows, old: jnp.asarray(rows[0, 0], old.dtype)  # noqa: E731
-    held = {n: jax.tree_util.tree_map(first, given[n], gs.buffer[n]) for n in given}
-    gs = gs.replace(buffer={**gs.buffer, **held})
+    gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
     if engine.name == "c":
         outside = CRollouts(graph, engine.model)
-        found = jax.jit(lambda state: outside.rollout(state, params, model.sensor))(gs)
+        found = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
     else:
-        found = jax.jit(lambda state: graph.rollout(state, record=(model.sensor,)))(gs)[1][model.sensor]
-    seq = np.asarray(found.seq)
-    made = np.flatnonzero(seq >= 0)[np.argsort(seq[seq >= 0], kind="stable")]
-    outputs[model.sensor] = {n: np.asarray(v)[made] for n, v in named_leaves(found.output).items()}
+        found = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
+    count = int(timeline.vertices[model.sensor].count[0])
+    outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(found).items()}
     early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
     steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
     return Episode(steps=steps, messages={}, outputs=outputs, metadata={})

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.deployment import Replay
 from sim2real.artifacts.drift import Drift
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify import drift, prediction
@@ -33,8 +33,6 @@ _SEGMENT_S = 0.4
 """Length of a segment at least [s]; a balanced pendulum's errors grow tenfold in 0.2 s: longer ones say little."""
 _LEAST, _LEAST_S = 4, 5.0
 """Segments with motion that a test needs at least, and length of all logs [s]."""
-_STEPS = 5
-"""Most steps of a round that refines all parameters: of an SO-101 errors are within 5 % of those after 15."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement are its noise."""
 
@@ -58,9 +56,12 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
     config = replace(pipeline.identify, settle_s=found.settle_s, max_delay_s=longest_s)
     problem, ahead_s = segments(robot, found, episodes, config)
     if found.posterior is None:
-        raise Sim2RealError("this identification was interrupted: it does not say how sure its estimates are")
+        ended = UNFINISHED.get(found.verdict.status, "has no intervals")
+        raise Sim2RealError(
+            f"this identification {ended}: its estimates may be far off", hint=found.verdict.next or None
+        )
     drifted, x = drift.drift(problem, found.posterior, found.widening or 1.0, robot.causes)
-    z = refine(problem, problem.table.at_scale(x)[None], _STEPS, 2).z
+    z = refine(problem, problem.table.at_scale(x)[None], settle=False).z
     here = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
     models = {"identified": {n: found.values.get(n, v) for n, v in nominal.items()}, AS_HERE: here, "nominal": nominal}

@@ -14,7 +14,7 @@ import numpy as np
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
-from sim2real.identify.programs import program
+from sim2real.identify.programs import Program
 from sim2real.robots.loop import DELAYS, in_a_loop
 from sim2real.robots.loop_robot import LoopRobot
 from sim2real.robots.training import LoopTask
@@ -163,7 +163,7 @@ def sensitivity(
         game = seen_by(policy, GraphEnvironment(env.graph, moved_task(env.task, values)))
         return evaluate(game, config, policy, key)["success"]
 
-    found = np.asarray(program(jax.vmap(play))(columns), np.float64)
+    found = np.asarray(Program(jax.vmap(play))(columns), np.float64)
     success = found[1:].reshape(len(moves), len(MULTIPLES))
     told = [Moved(m.name, m.unit, m.estimate, m.half_width, m.values, s) for m, s in zip(moves, success, strict=True)]
     return Sensitivity.of(MULTIPLES, float(found[0]), _EPISODES, told)

@@ -2,15 +2,14 @@
 
 from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import run_search
 from sim2real.identify.problem import Problem
-from sim2real.identify.search import search
 from sim2real.identify.segments import Span
 from sim2real.identify.uncertainty import uncertainty
 from sim2real.stages.config import RecordConfig
@@ -74,7 +73,7 @@ def fitted():
     """One synthetic log, identified: the only problem of its size, as it takes long to compile."""
     episode, truth = synthetic_log(np.random.default_rng(0))
     problem = make_problem(episode)
-    found = search(problem.losses, problem.table.start(), FitConfig())
+    found = run_search(problem, problem.table.start())
     values = {n: float(v) for n, v in problem.table.decode(jnp.asarray(found.z)).items()}
     return SimpleNamespace(
         episode=episode,
@@ -83,7 +82,7 @@ def fitted():
         found=found,
         values=values,
         spread=uncertainty(problem, found.z),
-        loss=jax.jit(lambda z: problem.losses(z[None], z, None)[0]),
+        loss=lambda z: float(problem.losses(z[None], z)[0]),
         make_problem=make_problem,
     )
 

@@ -11,7 +11,8 @@ from sim2real.graph.episode import Episode, Steps
 from sim2real.identify import identifiability, uncertainty
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Data, Span, cut
+from sim2real.identify.segments import Span, cut
+from sim2real.identify.sizes import padded
 from sim2real.identify.uncertainty import Linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation import excitation
@@ -54,39 +55,43 @@ def fitted(request):
     config = FitConfig(max_delay_s=MAX_DELAY_S, loss="squared", initial_state=request.param)
     problem = Problem(model, [episode], spans, SEGMENT_S, config)
     known = request.param == "rest"
-    data = released_at_rest(problem) if known else moving_on(model, episode, spans, config)
+    noisy = released_at_rest(problem) if known else moving_on(problem, episode, spans, config)
     z_true = jnp.asarray(problem.table.encode(TRUTH), jnp.float32)
 
-    def estimate(data):
+    def estimate(noisy):
+        measured, starts = noisy
+        data = problem.data._replace(measured=measured, starts=starts)
+
         def step(z, _):
-            r, J, _ = problem.linearised(z, problem.sensitivities(z, data=data), data)
+            r, J = problem.residuals.linearised(z, data)[:2]
             r, J = r.reshape(-1), J.reshape(-1, z.size)
             # A little damping: where initial states are free, nothing fixes the shift between the delays.
             return z - jnp.linalg.solve(J.T @ J + 10.0 * jnp.eye(z.size), J.T @ r), None
 
         # From the truth, two steps are enough.
         z = jax.lax.scan(step, z_true, length=2)[0]
-        return z, *problem.linearised(z, problem.sensitivities(z, data=data), data)
+        return z, *problem.residuals.linearised(z, data)[:3]
 
     # It runs for half a minute: here it pays to let LLVM optimise, as the suite does not.
     optimised = {"xla_backend_optimization_level": 2}
-    z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40), compiler_options=optimised)(data)
+    z, r, J, raw = jax.jit(lambda d: jax.lax.map(estimate, d, batch_size=40), compiler_options=optimised)(noisy)
     np.testing.assert_array_equal(r, raw)  # a squared loss tames nothing
-    return problem, *(np.asarray(a, np.float64) for a in (z, r, J))
+    count, steps = len(problem.train), problem.ts.shape[1]
+    r, J = (np.asarray(a, np.float64)[:, :count, :steps] for a in (r, J))
+    return problem, np.asarray(z, np.float64), r, J
 
 
 def sensed(problem, starts=None):
-    """Return what the sensor measures without noise at the true parameters, ``(E, N)`` each; 0 where it is masked."""
+    """Return what the sensor measures without noise at the true parameters, ``(E, K)`` each."""
     values = {n: jnp.float32(v) for n, v in TRUTH.items()}
-    data = Data(problem.data.measured, problem.data.starts if starts is None else starts)
-    width = problem.data.measured["th"].shape[1]
+    data = problem.data if starts is None else problem.data._replace(starts=starts)
 
     def one(e):
-        output, seq = problem.simulate(values, e, jnp.zeros(2), data)
-        place = jnp.where(seq >= 0, seq, width)
-        return {n: jnp.zeros(width).at[place].set(getattr(output, n), mode="drop") for n in ("th", "thdot")}
+        output = problem.residuals.simulate(values, e, jnp.zeros(2), data)
+        return {n: getattr(output, n) for n in ("th", "thdot")}
 
-    return {n: np.asarray(v) for n, v in jax.jit(jax.vmap(one))(jnp.arange(problem.segments)).items()}
+    steps = problem.ts.shape[1]
+    return {n: np.asarray(v)[:, :steps] for n, v in jax.jit(jax.vmap(one))(jnp.arange(problem.segments)).items()}
 
 
 def with_noise(problem, clean):
@@ -101,15 +106,12 @@ def released_at_rest(problem):
     starts = np.zeros((SEGMENTS, 1, 4), np.float32)
     starts[:, 0, 0] = np.pi + np.random.default_rng(2).uniform(-1.5, 1.5, SEGMENTS)
     measured = with_noise(problem, sensed(problem, jnp.asarray(starts)))
-    return Data(
-        {n: jnp.asarray(v, jnp.float32) for n, v in measured.items()},
-        jnp.broadcast_to(jnp.asarray(starts), (SEEDS, *starts.shape)),
-    )
+    return rounded_up(problem, measured, np.broadcast_to(starts, (SEEDS, *starts.shape)))
 
 
-def moving_on(model, episode, spans, config):
+def moving_on(problem, episode, spans, config):
     """One long run, cut as any log is: initial states are estimated from the noisy measurements."""
-    length_s = SEGMENTS * SEGMENT_S + 1.0
+    model, length_s = problem.model, SEGMENTS * SEGMENT_S + 1.0
     whole = Problem(model, [episode], [Span(0, 0.3)], length_s, replace(config, initial_state="rest"))
     first = int(np.searchsorted(episode.steps["sensor"].ts_overwrite, 300_000))
     noisy = with_noise(whole, {n: v[0] for n, v in sensed(whole).items()})
@@ -120,10 +122,15 @@ def moving_on(model, episode, spans, config):
         fields["th"][first : first + count], fields["thdot"][first : first + count] = th[:count], thdot[:count]
         own = replace(episode, outputs={**episode.outputs, "sensor": fields})
         cuts.append(cut(model, nodes, [own], spans, SEGMENT_S, 2 * MAX_DELAY_S))
-    return Data(
-        {n: jnp.asarray(np.stack([c.measured[n] for c in cuts]), jnp.float32) for n in ("th", "thdot")},
-        jnp.asarray(np.stack([c.starts for c in cuts]), jnp.float32),
-    )
+    measured = {n: np.stack([c.measured[n] for c in cuts]) for n in ("th", "thdot")}
+    return rounded_up(problem, measured, np.stack([c.starts for c in cuts]))
+
+
+def rounded_up(problem, measured, starts):
+    """Return measurements ``(400, E, K)`` and starts ``(400, E, ...)`` as programs want them."""
+    segments, steps = problem.data.ts.shape
+    measured = {n: jnp.asarray(padded(padded(v, segments, 1), steps, 2), jnp.float32) for n, v in measured.items()}
+    return measured, jnp.asarray(padded(starts, segments, 1), jnp.float32)
 
 
 def spreads(fitted):

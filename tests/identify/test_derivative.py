@@ -9,8 +9,8 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
-from sim2real.identify.derivative import by_jacobian, finite_differences
-from sim2real.identify.problem import Problem
+from sim2real.identify.derivative import finite_differences
+from sim2real.identify.residuals import Residuals
 
 POINT = jnp.array([0.4, -0.7, 1.1])
 
@@ -73,29 +73,10 @@ def test_a_callback_can_be_differentiated_by_what_is_closed_over():
     np.testing.assert_allclose(found, exact, rtol=2e-3, atol=1e-3)
 
 
-def test_the_kept_jacobian_is_the_linearisation():
-    value, push = jax.linearize(by_jacobian(smooth), POINT)
-    expected, exact = jax.linearize(smooth, POINT)
-    np.testing.assert_allclose(value, expected, rtol=1e-6)
-    for direction in (*np.eye(3, dtype=np.float32), np.float32([2.0, -1.0, 0.5])):
-        np.testing.assert_allclose(push(direction), exact(direction), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(
-        jax.linear_transpose(push, POINT)(jnp.ones(4))[0], jax.vjp(smooth, POINT)[1](jnp.ones(4))[0], rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        jax.jit(jax.jacfwd(by_jacobian(smooth)))(POINT), jax.jacfwd(smooth)(POINT), rtol=1e-5, atol=1e-6
-    )
-
-
-def test_the_kept_jacobian_of_finite_differences():
-    found = jax.jacfwd(by_jacobian(finite_differences(outside)))(POINT)
-    np.testing.assert_allclose(found, jax.jacfwd(smooth)(POINT), rtol=2e-3, atol=1e-3)
-
-
 @pytest.mark.parametrize(("step", "slope"), [(3e-3, 1.0), (0.5, 0.2)])
 def test_a_wide_difference_looks_past_a_kink(step, slope):
     problem = SimpleNamespace(forward=False, config=FitConfig(difference=step))
-    differentiable = Problem.differentiable(problem, jnp.abs)
+    differentiable = Residuals.differentiable(problem, jnp.abs)
     assert jax.jacfwd(differentiable)(jnp.array([0.1]))[0, 0] == pytest.approx(slope, rel=1e-3)
 
 

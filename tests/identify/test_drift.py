@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.drift import Fitted, Way, _beside_the_rest, drift, ways, weigh
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.problem import Evaluation
 from sim2real.identify.uncertainty import Linearised
 
 TABLE = ParameterTable(
@@ -108,7 +110,7 @@ class Robot:
         rng = np.random.default_rng(seed)
         self.table = ParameterTable([TABLE["gain"], TABLE["friction"]])
         self.train, self.segment_s = np.arange(segments), 0.4
-        self.channels, self.config, self.programs = (), SimpleNamespace(initial_state="measured"), {}
+        self.channels, self.config = (), SimpleNamespace(initial_state="measured")
         self.true, self.slopes = np.log(true), rng.standard_normal((segments, 3, 1, 2))
         self.noise = 0.1 * rng.standard_normal((segments, 3, 1))
 
@@ -117,19 +119,14 @@ class Robot:
         return jnp.tensordot(self.slopes, x - self.true, 1) + self.noise
 
     def at(self, z, data=None):
-        r = np.asarray(self._residuals(jnp.asarray(z)))
-        return None, float(np.mean(r**2))
+        r, J = (np.asarray(f(jnp.asarray(z))) for f in (self._residuals, jax.jacfwd(self._residuals)))
+        return Evaluation(r, J, r, np.zeros(0), np.zeros((0, 2)), float(np.mean(r**2)))
+
+    def loss(self, z, data=None):
+        return self.at(z).loss
 
     def losses(self, candidates, around):
-        import jax
-
-        return jax.vmap(lambda z: jnp.mean(self._residuals(z) ** 2))(candidates)
-
-    def linearised(self, z, columns):
-        import jax
-
-        r = self._residuals(z)
-        return r, jax.jacfwd(self._residuals)(z), r
+        return np.asarray(jax.vmap(lambda z: jnp.mean(self._residuals(z) ** 2))(jnp.asarray(candidates)))
 
 
 POSTERIOR_ENDS = TABLE.low[:2], TABLE.high[:2]

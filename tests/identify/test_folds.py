@@ -18,6 +18,7 @@ from sim2real.identify.fit import fit, refit
 from sim2real.identify.folds import Fold, folds_of, leave_out, moving
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.identify.refine import refine
 from sim2real.identify.segments import Span
 
 TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
@@ -167,15 +168,24 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
 
 
 def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one):
-    names = one.fit.problem.table.names
-    found = refit(one.fit.problem, np.array([n in ("gain", "tau") for n in names]), one.fit.z)
+    problem, names = one.fit.problem, one.fit.problem.table.names
+    kept = np.array([n in ("gain", "tau") for n in names])
     fixed = Model.parameters.with_fixed({"bias": 0.0, "square": 0.0})
-    alone = fit(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed).values
-    assert (found["bias"], found["square"]) == (0.0, 0.0)
+    alone = fit(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed)
+    data = problem.part(kept=kept)
+    ended = refine(problem, problem.table.start()[None], data)
+    found = problem.table.decode(ended.z, kept)
+    assert ended.loss == pytest.approx(alone.loss, rel=5e-5)
+    errors = dict(zip(alone.problem.table.names, alone.uncertainty().standard_error, strict=True))
+    assert (float(found["bias"]), float(found["square"])) == (0.0, 0.0)
     for name in ("gain", "tau"):
-        assert found[name] == pytest.approx(alone[name], rel=2e-5)
-        assert abs(found[name] - one.fit.values[name]) > 1e-4
-    assert refit(one.fit.problem, np.zeros(len(names), bool), one.fit.z)["gain"] == 1.5
+        assert float(found[name]) == pytest.approx(alone.values[name], abs=0.1 * errors[name])
+        assert abs(float(found[name]) - one.fit.values[name]) > 10 * 0.1 * errors[name]
+    # A model to compare with by percents ends earlier.
+    coarse = refit(problem, kept, one.fit.z)
+    assert (coarse["bias"], coarse["square"]) == (0.0, 0.0)
+    assert problem.at(problem.table.encode(coarse), data).loss == pytest.approx(alone.loss, rel=2e-3)
+    assert refit(problem, np.zeros(len(names), bool), one.fit.z)["gain"] == 1.5
 
 
 def test_blocks_cover_the_log_without_overlap(one):
@@ -194,9 +204,9 @@ def test_a_model_that_is_right_leaves_the_noise(one):
 
 def test_errors_are_of_parts_in_which_the_joint_moves():
     pan, tilt = Channel("pan", "pan_rate", 0.002, 0.1), Channel("tilt", None, 0.002, 0.1)
-    places = np.array([[0, 1, 2, -1], [0, 1, 2, 3]])  # the first segment has three measurements
+    ts = np.array([[0.0, 0.1, 0.2, -1.0], [0.0, 0.1, 0.2, 0.3]])  # the first segment has three measurements
     read = {0: [[0.0, 0.01, 0.02, 9.0], [0.0, 0.0, 0.0, 0.0]], 2: [[0.0, 0.01, 0.03, 0.0], [0.5, 0.5, 0.51, 0.5]]}
-    problem = SimpleNamespace(places=places, channels=(pan, tilt), measured=lambda column: np.array(read[column]))
+    problem = SimpleNamespace(ts=ts, channels=(pan, tilt), measured=lambda column: np.array(read[column]))
     assert moving(problem, np.array([0])) == [False, False, True]
     assert moving(problem, np.array([1])) == [False, False, False]
     read[0][1][3] = 0.021  # more than ten deviations of a measurement, in one of the segments

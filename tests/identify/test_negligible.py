@@ -48,13 +48,13 @@ def made(effects, truth, seed=0, names="fgh", gain=0.0):
     J = (X * slope[:, None]).T.reshape(*shape, len(X))
     at = Linearised(r, J, np.diag(12.0 / table.span**2), x, r)
 
-    def given(z, columns, values):
+    def given(z, values):
         own = np.where(np.isnan(values), best, values)
         return (own @ X - y).reshape(len(values), *shape)
 
     problem = SimpleNamespace(
         table=table, config=SimpleNamespace(initial_state="rest"), channels=(Channel("q", None, 1.0, 1.0),),
-        segment_s=1.0, train=np.arange(SEGMENTS), at=lambda z: (None, 0.0), programs={"given": given},
+        segment_s=1.0, train=np.arange(SEGMENTS), with_values=given,
     )  # fmt: skip
     spread, check = from_linearised(problem, at), judged(problem, at)
     return problem, x, at, spread, check, best
@@ -154,9 +154,8 @@ def limited(pushes, limit, estimate, seed=0):
     at = Linearised(r, J.reshape(*shape, 2) / 0.1, np.diag(12.0 / table.span**2), x, r)
     problem = SimpleNamespace(
         table=table, config=SimpleNamespace(initial_state="rest"), channels=(Channel("q", None, 1.0, 1.0),),
-        segment_s=1.0, train=np.arange(SEGMENTS), at=lambda z: (None, 0.0),
-        programs={"given": lambda z, columns, rows: np.stack(
-            [off(np.where(np.isnan(row), best, row)).reshape(shape) for row in rows])},
+        segment_s=1.0, train=np.arange(SEGMENTS), with_values=lambda z, rows: np.stack(
+            [off(np.where(np.isnan(row), best, row)).reshape(shape) for row in rows]),
     )  # fmt: skip
     spread, check = from_linearised(problem, at), judged(problem, at)
     return problem, at, spread, check, *negligible(problem, x, at, spread, check)

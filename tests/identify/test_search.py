@@ -26,8 +26,8 @@ STANDARD = [
 CONFIG = FitConfig(population=16, generations=2000, std=1.0, seed=1)
 
 
-def bowl(candidates, around=None, pick=None):
-    del around, pick
+def bowl(candidates, around=None, data=None, pick=None):
+    del around, data, pick
     return 1.0 + jnp.sum((candidates - BOTTOM) ** 2 * jnp.array([1.0, 30.0]), axis=1)
 
 
@@ -62,14 +62,14 @@ def test_one_seed_one_result():
 
 
 def test_candidates_that_cannot_be_simulated_lose():
-    hole = lambda c, around, pick: jnp.where(c[:, 0] > 0.5, jnp.nan, bowl(c))  # noqa: E731
+    hole = lambda c, around, data, pick: jnp.where(c[:, 0] > 0.5, jnp.nan, bowl(c))  # noqa: E731
     found = search(hole, np.zeros(2), CONFIG)
     assert np.isfinite(found.loss)
     assert found.loss == pytest.approx(1.25, abs=0.05)
 
 
 def test_when_nothing_can_be_simulated():
-    bad = lambda c, around, pick: jnp.where(c[:, 0] > 0.0, jnp.nan, jnp.inf)  # noqa: E731
+    bad = lambda c, around, data, pick: jnp.where(c[:, 0] > 0.0, jnp.nan, jnp.inf)  # noqa: E731
     with pytest.raises(Sim2RealError, match="no candidate could be simulated"):
         search(bad, np.zeros(2), replace(CONFIG, strategy="SNES", generations=10))
 
@@ -94,7 +94,7 @@ def test_every_strategy_runs_or_says_why_not(strategy):
 
 def test_a_strategy_works_where_its_population_suits_it():
     found = search(
-        lambda c, around, pick: jnp.sum((c - 0.5) ** 2, axis=1),
+        lambda c, around, data, pick: jnp.sum((c - 0.5) ** 2, axis=1),
         np.zeros(8),
         FitConfig(strategy="LM_MA_ES", population=8, generations=40),
     )
@@ -108,9 +108,9 @@ def test_unknown_strategies_and_populations_that_one_refuses():
         search(bowl, np.zeros(2), replace(CONFIG, strategy="Open_ES", population=7))
 
 
-def funnels(candidates, around, pick):
+def funnels(candidates, around, data, pick):
     """Two funnels, the deeper one on the left; what is far from the middle of its generation is judged too badly."""
-    del pick
+    del data, pick
     right = 1.0 + jnp.sum((candidates - jnp.array([2.0, 0.5])) ** 2, axis=1)
     left = jnp.sum((candidates - jnp.array([-1.5, -0.5])) ** 2, axis=1)
     far = jnp.maximum(jnp.sum((candidates - around) ** 2, axis=1) - 4.0, 0.0)
@@ -120,16 +120,16 @@ def funnels(candidates, around, pick):
 def test_restarts_find_the_deeper_funnel():
     populations = []
 
-    def losses(candidates, around, pick):
+    def losses(candidates, around, data, pick):
         populations.append(candidates.shape[0])
-        return funnels(candidates, around, pick)
+        return funnels(candidates, around, data, pick)
 
     start, config = np.array([2.5, 1.0]), FitConfig(population=8, generations=40, std=0.3, seed=2)
     several = search(losses, start, replace(config, restarts=4))
     assert several.loss < 1e-3
     np.testing.assert_allclose(several.z, [-1.5, -0.5], atol=0.03)
     assert several.finalists.shape == (5, 2)
-    found = [float(funnels(z[None], z, None)[0]) for z in several.finalists]
+    found = [float(funnels(z[None], z, None, None)[0]) for z in several.finalists]
     assert found == sorted(found)
     assert found[-1] == pytest.approx(1.0, abs=1e-2)
     # The large runs double; small ones keep the first population: a program each.
@@ -140,37 +140,100 @@ def test_restarts_find_the_deeper_funnel():
 
 
 def test_a_generation_sees_one_batch_and_the_end_sees_all():
-    segments, offsets = np.array([1, 3, 4, 6, 7, 9]), 1000.0 * np.arange(10.0)
-    picks = []
+    """Batches are of segments that count: the others, and what is padded, have no weight."""
+    weight, offsets = np.array([0, 1, 0, 1, 1, 0, 1, 1, 0, 1]), 1000.0 * np.arange(10.0)
+    segments, picks = np.flatnonzero(weight), []
 
-    def losses(candidates, around, pick):
+    def losses(candidates, around, data, pick):
         pick = jnp.asarray(segments) if pick is None else pick
         jax.debug.callback(lambda p: picks.append(np.asarray(p)), pick)
-        return bowl(candidates) + jnp.asarray(offsets)[pick].mean()
+        return bowl(candidates) + data[pick].mean()
 
     config = FitConfig(population=16, generations=40, std=1.0, batch=2, seed=3)
-    found = search(losses, np.zeros(2), config, segments)
+    found = search(losses, np.zeros(2), config, jnp.asarray(offsets), weight)
     jax.effects_barrier()
     # A batch's offset is far larger than what candidates differ by: were batches mixed, luck would decide.
     np.testing.assert_allclose(found.z, BOTTOM, atol=0.05)
     assert found.loss == pytest.approx(offsets[segments].mean() + float(bowl(found.z[None])[0]), rel=1e-5)
     batches = [p for p in picks if len(p) == 2]
     assert len([p for p in picks if len(p) == 6]) == 1
-    assert len(batches) >= 40
+    assert len(batches) >= len(found.history) > 20, "on other segments each time, losses show no standstill"
     assert all(len(set(p.tolist())) == 2 and set(p.tolist()) <= set(segments.tolist()) for p in batches)
     assert len({tuple(sorted(p.tolist())) for p in batches}) > 5
-    assert len(found.history) == 40
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_search_goes_on_after_a_lucky_early_candidate(seed):
+    """Its best loss is that of the first generation; the median falls, and that counts."""
+    config, asked = replace(CONFIG, std=0.3, seed=seed), []
+    bottom, weights = np.array([1.0, -2.0, 0.5, 1.5, -1.0, 0.0]), jnp.geomspace(1.0, 100.0, 6)
+
+    def losses(candidates, around, data, pick):
+        jax.debug.callback(lambda c: asked.append(np.asarray(c)), candidates)
+        lucky = jnp.sum((candidates - data) ** 2, axis=1) < 1e-3**2
+        return jnp.where(lucky, 0.5, 1.0 + (candidates - bottom) ** 2 @ weights)
+
+    programs = {}
+    plain = search(losses, np.zeros(6), config, jnp.full(6, 99.0), programs=programs)
+    jax.effects_barrier()
+    candidate = next(c for c in asked if len(c) == config.population)[0]
+    asked.clear()
+    found = search(losses, np.zeros(6), config, jnp.asarray(candidate), programs=programs)
+    jax.effects_barrier()
+    assert set(found.history.tolist()) == {0.5}
+    assert len(found.history) > 20
+    assert len(found.history) > 0.5 * len(plain.history)
+    last = [c for c in asked if len(c) == config.population][-1]
+    np.testing.assert_allclose(last.mean(axis=0), bottom, atol=0.05)
+
+
+def test_a_search_among_equals_ends_soon():
+    """Neither median nor best falls: nothing is to be found."""
+    flat = lambda c, around, data, pick: 1.0 + 0.0 * c[:, 0]  # noqa: E731
+    assert len(search(flat, np.zeros(2), CONFIG).history) == 20
 
 
 def test_a_batch_of_all_segments_is_none():
     picked = []
 
-    def losses(candidates, around, pick):
+    def losses(candidates, around, data, pick):
         picked.append(pick)
         return bowl(candidates)
 
-    search(losses, np.zeros(2), FitConfig(strategy="SNES", population=8, generations=2, batch=3), np.arange(3))
+    search(losses, np.zeros(2), FitConfig(strategy="SNES", population=8, generations=2, batch=3), weight=np.ones(3))
     assert set(picked) == {None}
+
+
+def on_host(candidates, around, pick, fresh):
+    del around, pick, fresh
+    return np.asarray(bowl(jnp.asarray(candidates, jnp.float32)), np.float64)
+
+
+@pytest.mark.parametrize("strategy", ["CMA_ES", "SNES", "DifferentialEvolution"])
+def test_losses_outside_of_programs_are_searched_alike(strategy):
+    config = replace(CONFIG, strategy=strategy, generations=30)
+    alone = lambda z: float(bowl(z[None])[0])  # noqa: E731
+    one = search(bowl, np.zeros(2), config)
+    other = search(on_host, np.zeros(2), config, alone=alone, host=True)
+    np.testing.assert_allclose(other.history, one.history, rtol=2e-3)
+    np.testing.assert_allclose(other.z, one.z, atol=5e-3)
+    assert other.evaluations == one.evaluations
+
+
+def test_outside_of_programs_a_block_begins_afresh_and_a_generation_sees_one_batch():
+    asked, weight = [], np.array([0, 1, 0, 1, 1, 0, 1, 1, 0, 1])
+
+    def losses(candidates, around, pick, fresh):
+        assert candidates.shape == (16, 2)
+        assert around.shape == (2,)
+        asked.append((fresh, tuple(sorted(pick.tolist()))))
+        return np.where(candidates[:, 0] > 3.0, np.nan, on_host(candidates, around, pick, fresh))
+
+    config = replace(CONFIG, generations=20, batch=2)
+    found = search(losses, np.zeros(2), config, None, weight, alone=lambda z: float(bowl(z[None])[0]), host=True)
+    assert [i for i, (fresh, _) in enumerate(asked) if fresh] == list(range(0, len(found.history), 10))
+    assert all(len(set(pick)) == 2 and weight[list(pick)].all() for _, pick in asked)
+    assert len({pick for _, pick in asked}) > 3
 
 
 DIVIDED = """
@@ -183,7 +246,8 @@ config, programs, found = replace(CONFIG, generations=40, restarts=2), {}, []
 for devices in (1, 2):
     programs = {}
     found.append(search(bowl, np.zeros(2), replace(config, devices=devices), programs=programs))
-    texts = [p.advance.as_text() for kind, p in programs.items() if kind != "alone" and p.population == 16]
+    runs = [p for kind, p in programs.items() if kind != "alone" and p.population == 16]
+    texts = [compiled.as_text() for p in runs for compiled in p.advance._compiled.values()]
     assert [("num_partitions=2" in t, "f32[8,2]" in t) for t in texts] == [(devices == 2,) * 2], texts[0][:300]
 np.testing.assert_allclose(found[1].history, found[0].history, rtol=1e-3)
 np.testing.assert_allclose(found[1].finalists, found[0].finalists, atol=1e-3)

@@ -251,12 +251,12 @@ def test_the_sum_of_delays_is_known_and_each_is_not(delayed):
 
 def test_time_is_centred_within_the_bounds(delayed):
     z = delayed.table.encode({"gain": 1.0, "late": 0.01, "early": 0.045})
-    x = delayed.table.scale(centred(stub(delayed.table, "free"), z))[0]
+    x = delayed.table.scale(centred(delayed.table, z))[0]
     # The measurement's delay can be 0.005 to 0.055 s: the other is 0.05 s at most, and 0 at least.
     np.testing.assert_allclose(x[1:], [0.03, 0.025], atol=1e-6)
     assert x[0] == pytest.approx(delayed.table.scale(z)[0][0])
     one = delayed.table.with_fixed({"early": 0.0})
-    np.testing.assert_array_equal(centred(stub(one, "free"), z[:2]), z[:2])
+    np.testing.assert_array_equal(centred(one, z[:2]), z[:2])
 
 
 def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
@@ -272,3 +272,20 @@ def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
     sure = np.diag([1.0, 4.0, 9.0]) + 0.5
     root = uncertainty._root_of_inverse(sure)
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(sure), rtol=1e-12)
+
+
+@pytest.mark.parametrize("freedom", [2.0, 9.0, 40.0])
+def test_intervals_widen_gradually_with_what_chance_does_not_explain(freedom):
+    ratio = np.linspace(0.5, 4.0, 7001)
+    quantile = 1.96
+    wider = uncertainty._widening(ratio, np.full(len(ratio), freedom), quantile)
+    assert np.all(np.diff(wider) >= 0.0)
+    assert np.diff(wider).max() < 0.01
+    chance = stats.chi2.sf(freedom * ratio**2, freedom)
+    np.testing.assert_array_equal(wider[chance > 0.2], 1.0)
+    full = ratio * stats.t.ppf(0.975, freedom) / quantile
+    np.testing.assert_allclose(wider[chance < 0.05], full[chance < 0.05], rtol=1e-9)
+
+
+def test_with_less_than_two_degrees_of_freedom_blocks_say_nothing():
+    assert uncertainty._widening(np.array([9.0]), np.array([1.9]), 1.96) == 1.0

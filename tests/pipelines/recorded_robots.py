@@ -126,9 +126,8 @@ def effects(problem, values, factor=0.1):
         step = factor * (p.high - p.low)
         rows[n][i + 1] += step if values[n] + step <= p.high else -step
     zero = jnp.zeros(2 * len(problem.channels))
-    run = jax.jit(
-        jax.vmap(lambda v: jax.vmap(lambda e: problem.residuals(v, e, zero)[0])(jnp.arange(problem.segments)))
-    )
+    own, every = problem.residuals, jnp.arange(problem.segments)
+    run = jax.jit(jax.vmap(lambda v: jax.vmap(lambda e: own.residuals(v, e, zero, problem.data))(every)))
     residuals = np.asarray(run({n: jnp.asarray(r) for n, r in rows.items()}))
     moved = np.abs(residuals[1:] - residuals[0]).reshape(len(names), -1).max(axis=1)
     return dict(zip(names, moved, strict=True))

@@ -18,7 +18,8 @@ LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 def burst_of(episode):
     """Return how many messages more than usual the window of a problem's commands holds."""
     model = load_pipeline("pendulum").load().identifiable(0.06)
-    return Problem(model, [episode], [Span(0, 1.0)], 3.0).graph.nodes["world"].inputs["actuator"].delay_dist.burst
+    nodes = Problem(model, [episode], [Span(0, 1.0)], 3.0).residuals.graph.nodes
+    return nodes["world"].inputs["actuator"].delay_dist.burst
 
 
 @pytest.mark.parametrize("waited", [0, 12])

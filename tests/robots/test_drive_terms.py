@@ -130,7 +130,9 @@ def engines(tmp_path_factory):
             config = FitConfig(max_delay_s=0.02, initial_state="measured", engine=engine)
             problem = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
             assert problem.engine.name == engine
-            programs[engine] = jax.jit(lambda v, p=problem: 0.002 * p.residuals(v, 0, jnp.array([0.3, -1.0]))[0])
+            programs[engine] = jax.jit(
+                lambda v, p=problem: 0.002 * p.residuals.residuals(v, 0, jnp.array([0.3, -1.0]), p.data)
+            )
         yield SimpleNamespace(**programs)
     finally:
         jax.config.update("jax_enable_x64", False)

@@ -42,8 +42,7 @@ def steps(start, stamp, end):
     return Steps(scheduled=start, start=start, woken=start, ts_overwrite=stamp, end=end, drift=none)
 
 
-@pytest.fixture(scope="module")
-def episode():
+def pair_log():
     """Goals and samples off every grid, some goals in a burst; what was measured does not matter here."""
     rng, count = np.random.default_rng(1), 60
     slots = np.arange(count) * 20_000
@@ -59,6 +58,11 @@ def episode():
     )
 
 
+@pytest.fixture(scope="module")
+def episode():
+    return pair_log()
+
+
 @pytest.fixture(scope="module", params=[ConvergedRobot, WornRobot], ids=["constant", "worn"])
 def engines(request, episode):
     """Programs that return the residuals of two segments in radians, of both engines, in double precision."""
@@ -70,11 +74,12 @@ def engines(request, episode):
             model = request.param().identifiable(MAX_DELAY_S)
             problem = Problem(model, [episode], [Span(0, 0.2), Span(0, 0.55)], SEGMENT_S, config)
             assert problem.engine.name == engine
+            own = problem.residuals
             sigmas = jnp.array([s for _, s, _ in problem.fields])
 
-            def run(values, shift, problem=problem, sigmas=sigmas):
-                errors = jax.vmap(lambda e: problem.residuals(values, e, shift)[0])(jnp.arange(2))
-                return sigmas * errors
+            def run(values, shift, own=own, data=problem.data, steps=problem.ts.shape[1], sigmas=sigmas):
+                errors = jax.vmap(lambda e: own.residuals(values, e, shift, data))(jnp.arange(2))
+                return sigmas * errors[:, :steps]
 
             programs[engine] = jax.jit(run)
         yield SimpleNamespace(**programs, worn=request.param is WornRobot)

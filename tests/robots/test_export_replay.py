@@ -144,8 +144,9 @@ def predicted(robot, values, field, commands, shape=(1,)):
     config = FitConfig(max_delay_s=0.03, initial_state="rest", jacobian="finite")
     problem = Problem(robot.identifiable(0.03), [episode], [Span(0, 0.0)], SEGMENT_S, config)
     tree = {n: jnp.float32(v) for n, v in values.items()}
-    error, ts = (np.asarray(x) for x in jax.jit(lambda v: problem.residuals(v, 0, jnp.zeros(2)))(tree))
-    counted = ts >= 0
+    error = np.asarray(jax.jit(lambda v: problem.residuals.residuals(v, 0, jnp.zeros(2), problem.data))(tree))
+    ts = problem.ts[0]
+    counted, error = ts >= 0, error[: len(ts)]
     assert counted.sum() > 80
     return ts[counted], error[counted, 0] * robot.channels[0].position_sigma
 

@@ -1,0 +1,165 @@
+"""Where compiled programs are kept between runs: a folder that JAX reads and writes, bounded in size.
+
+Imports no JAX: the folder is set in the environment, which child processes inherit, or in JAX's own configuration where
+JAX was imported before.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import os
+import platform
+import socket
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from sim2real.errors import UsageError
+
+VARIABLE = "SIM2REAL_CACHE"
+"""A folder, or ``off``."""
+OFF = "off"
+_JAX = "JAX_COMPILATION_CACHE_DIR"
+_LARGEST_BYTES = 2 * 2**30
+"""Size to which the folder is cut when a process begins; an identification leaves 10 to 40 MB, a training as much."""
+_ALWAYS = {
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.0",  # a run compiles a hundred small programs: 3 s together
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
+_MARKS: list[Path] = []
+"""Notes that this process writes programs."""
+
+
+def location(place: str | None = None) -> Path | None:
+    """Return the folder of this machine's programs; None where the cache is off.
+
+    Args:
+        place: A folder, or ``off``; None takes ``SIM2REAL_CACHE``, otherwise the platform's cache folder.
+
+    Raises:
+        UsageError: When the place is an existing file.
+    """
+    place = place or os.environ.get(VARIABLE) or None
+    if place == OFF:
+        return None
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sim2real"
+    root = Path(place).expanduser() if place else home
+    if root.exists() and not root.is_dir():
+        raise UsageError(
+            f"the compilation cache {root} is no folder", hint=f"--cache DIR or {VARIABLE}=DIR moves it, 'off' ends it"
+        )
+    return root / "programs" / _machine()
+
+
+def enable(place: str | None = None) -> Path | None:
+    """Let JAX keep compiled programs; return the folder, None where the cache is off or its folder cannot be written.
+
+    A cache that the user configured for JAX stays as it is.
+
+    Args:
+        place: See ``location``.
+    """
+    folder = location(place)
+    if folder is None or os.environ.get(_JAX):
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:  # a home directory that is read-only or full: compiling takes longer, and that is all
+        return None
+    _forget_unfinished(folder)
+    _mark(folder)
+    _cut(folder, _LARGEST_BYTES)
+    os.environ[_JAX] = str(folder)
+    for name, value in _ALWAYS.items():
+        os.environ.setdefault(name, value)
+    if (jax := sys.modules.get("jax")) is not None and jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder
+
+
+def size_bytes(folder: Path) -> int:
+    """Return how much a folder of programs holds."""
+    return sum(size for _, size, _ in _entries(folder))
+
+
+def _machine() -> str:
+    """Return a name for machines that can run each other's programs: processor features, Python's and JAX's versions.
+
+    XLA compiles for the features of the processor at hand; another one may stop at an unknown instruction.
+    """
+    features = platform.processor()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        features = next((line for line in lines if line.startswith(("flags", "Features"))), features)
+    digest = hashlib.sha256(features.encode()).hexdigest()[:10]
+    return f"{platform.machine()}-{digest}-jaxlib-{metadata.version('jaxlib')}"
+
+
+def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
+    """Yield last use [s since the epoch], size [bytes] and path of each program."""
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(folder):
+            with contextlib.suppress(OSError):  # another process has just removed it
+                if entry.name.endswith("-cache"):
+                    status = entry.stat()
+                    yield max(status.st_atime, status.st_mtime), status.st_size, Path(entry.path)
+
+
+def _cut(folder: Path, most: int) -> None:
+    """Remove the programs that were not used for longest until the folder holds no more than that [bytes]."""
+    entries = sorted(_entries(folder), reverse=True)
+    total = 0
+    for _, size, path in entries:
+        total += size
+        if total > most:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def release() -> None:
+    """Note that this process writes no more programs."""
+    while _MARKS:
+        with contextlib.suppress(OSError):
+            _MARKS.pop().unlink(missing_ok=True)
+
+
+def _mark(folder: Path) -> None:
+    """Note that this process writes here."""
+    mark = folder / f"{socket.gethostname()}-{os.getpid()}.writing"
+    with contextlib.suppress(OSError):
+        mark.touch()
+        _MARKS.append(mark)
+        owner = os.getpid()
+        atexit.register(lambda: release() if os.getpid() == owner else None)
+
+
+def _forget_unfinished(folder: Path) -> None:
+    """Remove what processes of this host wrote that were killed: JAX writes in place, and a part of a program stays."""
+    host = f"{socket.gethostname()}-"
+    for mark in folder.glob(f"{host}*.writing"):
+        with contextlib.suppress(OSError, ValueError):
+            if _runs(int(mark.name.removeprefix(host).removesuffix(".writing"))):
+                continue
+            since = mark.stat().st_mtime
+            for path in folder.glob("*-cache"):
+                if path.stat().st_mtime >= since:
+                    path.unlink(missing_ok=True)
+            mark.unlink(missing_ok=True)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -1,0 +1,103 @@
+"""What evaluates residuals on C MuJoCo, and what does in a program: the same numbers."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_robot import VALUES
+from test_engines import MAX_DELAY_S, SEGMENT_S, ConvergedRobot, pair_log
+
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import run_search
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+
+TRUTH = {**VALUES, "stribeck": 0.5, "sensor_delay": 0.006, "actuator_delay": 0.011}
+SHIFT = (0.02, -0.01, 0.1, -0.2)
+
+
+def shown_by(problem):
+    """Return what a robot from other initial states than those of the log would have measured, with noise."""
+    own, data, rng = problem.residuals, problem.data, np.random.default_rng(0)
+    values = {p.name: jnp.float32(TRUTH.get(p.name, p.nominal)) for p in problem.table}
+    run = jax.jit(jax.vmap(lambda e: own.simulate(values, e, jnp.array(SHIFT), data)))
+    shown, sigmas = run(jnp.arange(len(data.recording))), {f: s for f, s, _ in own.fields}
+    clean = {f: np.asarray(getattr(shown, f)) for f in data.measured}
+    return {f: jnp.asarray(m + sigmas[f] * rng.normal(size=m.shape), jnp.float32) for f, m in clean.items()}
+
+
+@pytest.fixture(scope="module", params=["free", "measured"])
+def problems(request):
+    """The same segments on both engines; one of them is held out."""
+    made = {}
+    for engine in ("c", "compiled"):
+        config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state=request.param, engine=engine)
+        model, spans = ConvergedRobot().identifiable(MAX_DELAY_S), [Span(0, b, b != 0.4) for b in BEGINS_S]
+        made[engine] = Problem(model, [pair_log()], spans, SEGMENT_S, config)
+    measured = shown_by(made["c"])
+    for problem in made.values():
+        problem.data = problem.data._replace(measured=measured)
+    return SimpleNamespace(**made)
+
+
+BEGINS_S = (0.2, 0.3, 0.4, 0.5, 0.55)
+
+
+def near(problems, held, given=2e-3):
+    """Return how close values are to be [deviations]: C holds the slopes of an initial state, and programs do not."""
+    return {"rtol": 1e-3, "atol": held if problems.c.config.initial_state == "free" else given}
+
+
+def test_both_engines_evaluate_alike(problems):
+    """Residuals, derivatives and losses by way of C's evaluator and by programs."""
+    c, compiled = problems.c, problems.compiled
+    z = c.table.encode({**TRUTH, "gain": 1.05 * VALUES["gain"]})
+    one, other = c.at(z), compiled.at(z)
+    assert np.abs(other.raw).max() > 5.0
+    np.testing.assert_allclose(one.raw, other.raw, **near(problems, 0.25, 0.01))
+    np.testing.assert_allclose(one.residuals, other.residuals, **near(problems, 0.25, 0.01))
+    assert np.linalg.norm(one.jacobian - other.jacobian) < 0.1 * np.linalg.norm(other.jacobian)
+    assert one.loss == pytest.approx(other.loss, rel=0.01)
+    candidates = z + 0.05 * np.random.default_rng(0).normal(size=(3, len(z)))
+    np.testing.assert_allclose(c.losses(candidates, z), compiled.losses(candidates, z), rtol=0.05)
+    # A descent keeps the derivatives by initial states of the first point, an estimate's are taken again.
+    assert c.losses(z[None], z)[0] == pytest.approx(one.loss, rel=2e-3)
+
+
+def test_both_engines_predict_alike(problems):
+    c, compiled = problems.c, problems.compiled
+    rows = {p.name: np.full(2, TRUTH.get(p.name, p.nominal)) for p in c.table}
+    one, other = (p.predict(rows, np.array([1, 2]), np.array([0.2, 0.3])) for p in (c, compiled))
+    np.testing.assert_allclose(one, other, **near(problems, 0.05, 0.01))
+
+
+def test_both_engines_take_given_values_alike(problems):
+    c, compiled = problems.c, problems.compiled
+    rows = np.full((3, len(c.table)), np.nan)
+    rows[1, c.table.names.index("friction_left")] = 0.08
+    rows[2, [c.table.names.index(n) for n in ("damping", "friction_right")]] = 0.3, 0.05
+    z = c.table.encode(TRUTH)
+    one, other = (p.with_values(z, rows) for p in (c, compiled))
+    if c.config.initial_state == "free":
+        assert np.linalg.norm(one - other) < 0.1 * np.linalg.norm(other)
+    else:
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=0.05)
+    np.testing.assert_allclose(one[0], c.at(z).residuals, atol=1e-3)
+    assert np.abs(one[1:] - one[0]).max() > 1.0
+
+
+def test_a_search_on_c_is_of_the_segments_it_is_asked_for(problems):
+    """Other segments of the same recordings share programs, and nothing of the data."""
+    problem = problems.c
+    config = replace(problem.config, population=4, generations=10, strategy="SNES")
+    spans = [Span(0, b) for b in (0.2, 0.5)]
+    first = Problem(problem.model, problem._recordings, [Span(0, 0.3), Span(0, 0.55)], SEGMENT_S, config)
+    start = first.table.start()
+    run_search(first, start)
+    shared = run_search(first.recut(spans, SEGMENT_S), start)
+    fresh = run_search(Problem(problem.model, problem._recordings, spans, SEGMENT_S, config), start)
+    np.testing.assert_allclose(shared.history, fresh.history, rtol=1e-4)
+    np.testing.assert_allclose(shared.z, fresh.z, atol=1e-3)
