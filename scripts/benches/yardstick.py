@@ -24,8 +24,8 @@ COMMIT = "51f54b7210f9034c78055b63517518bcce9c02f8"
 PATHS = ("sim2real", "pipelines", "datasets/pendulum")
 """Folders of that commit that the identification reads."""
 COMMAND = ("identify", "pendulum", "--log", "datasets/pendulum/chirp.mcap", "--runs", "runs")
-TEST_SETTINGS = ("XLA_FLAGS", "PYTEST_XDIST_WORKER", "OPENBLAS_NUM_THREADS")
-"""Environment variables of a test run that change how long a program computes; also those that begin with ``JAX_``."""
+TEST_SETTINGS = ("JAX_", "PYTEST_", "XLA_FLAGS", "OPENBLAS_NUM_THREADS")
+"""First letters of the environment variables by which a test run changes how long a program computes."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def extract(commit: str, paths: Sequence[str], folder: Path, root: Path) -> None
 
 def plain_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without the variables that change how long a program compiles or computes."""
-    return {n: v for n, v in environment.items() if n not in TEST_SETTINGS and not n.startswith("JAX_")}
+    return {n: v for n, v in environment.items() if not n.startswith(TEST_SETTINGS)}
 
 
 def _children_s() -> float:

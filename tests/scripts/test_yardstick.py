@@ -57,5 +57,5 @@ def test_processor_time_has_that_of_grandchildren_and_not_the_waiting(tmp_path):
 
 
 def test_a_yardstick_is_computed_without_the_settings_of_a_test_run():
-    settings = {"XLA_FLAGS": "--xla_backend_optimization_level=0", "JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1"}
+    settings = {"XLA_FLAGS": "--xla_backend_optimization_level=0", "JAX_PLATFORMS": "cpu", "PYTEST_XDIST_WORKER": "gw0"}
     assert yardstick.plain_environment({**settings, "HOME": "/home"}) == {"HOME": "/home"}
