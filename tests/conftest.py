@@ -138,3 +138,35 @@ def repetitions(request):
     """
     full = request.config.option.full
     return lambda few, every: every if full else few
+
+
+@pytest.fixture(scope="session")
+def shared_base(tmp_path_factory):
+    """A temporary folder that all workers of this session share."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def shared_run_dir(shared_base):
+    import shared_run  # the stages, JAX and the benches are imported for tests that need a run
+
+    return shared_run.shared(shared_base)
+
+
+@pytest.fixture
+def finished_run_dir(shared_run_dir):
+    """The folder of a finished run, on which no test may write: see ``run_copy``."""
+    import shared_run
+
+    before = shared_run.state(shared_run_dir)
+    yield shared_run_dir
+    assert shared_run.state(shared_run_dir) == before, "this test wrote into the run that all tests share"
+
+
+@pytest.fixture
+def run_copy(finished_run_dir, tmp_path):
+    """A copy of the finished run that the test may change, in a folder of runs of its own."""
+    import shared_run
+
+    return shared_run.copied(finished_run_dir, tmp_path / "runs" / "pendulum" / finished_run_dir.name)
