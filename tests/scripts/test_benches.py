@@ -93,7 +93,7 @@ def test_scaling(run):
 
 
 def test_randomise(run):
-    report = run("randomise", "--ways", "all")
+    report = run("randomise", "--ways", "all", "--record-s", 12)  # a length whose programs other tests compile, too
     found = {row["name"]: row["value"] for row in report["rows"]}
     low, share, high = (found[f"randomise/all/{n}"] for n in ("low95", "success", "high95"))
     assert 0.0 <= low <= share <= high <= 1.0
