@@ -149,6 +149,7 @@ def shared_base(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def shared_run_dir(shared_base):
+    """The folder of a finished run that one worker makes for all; tests take ``finished_run_dir`` or ``run_copy``."""
     import shared_run  # the stages, JAX and the benches are imported for tests that need a run
 
     return shared_run.shared(shared_base)
