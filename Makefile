@@ -6,7 +6,7 @@ READY := .venv/.ready
 DOCS_READY := .venv/.ready-docs
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
-.PHONY: demo test bench docs format
+.PHONY: demo test test-all bench docs format
 
 demo: $(READY)
 	$(BIN)/sim2real demo
@@ -16,6 +16,10 @@ test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	@nice $(BIN)/pyright & types=$$!; $(BIN)/python -m pytest --numprocesses 3; tests=$$?; wait $$types && exit $$tests
+
+# The tests and repetitions that `test` leaves out: together, both run everything once.
+test-all: $(READY)
+	$(BIN)/python -m pytest --full --numprocesses 3
 
 bench: $(READY)
 	for bench in graph train async log demo; do $(BIN)/python scripts/bench.py $$bench || exit 1; done

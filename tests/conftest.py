@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from repetitions import divided
 from xdist.scheduler import LoadScopeScheduling
 
 # A runner in the background ignores SIGINT, one under nohup SIGHUP; so would every command that a test interrupts.
@@ -86,7 +87,15 @@ def pytest_xdist_make_scheduler(config, log):
     return RoomScheduling(config, log)
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption(
+        "--full", action="store_true", help="run only the tests and repetitions that `make test` leaves out"
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    items[:], others = divided(items, config.option.full)
+    config.hook.pytest_deselected(items=others)
     if "PYTEST_XDIST_WORKER" in os.environ:
         rank = {name: i for i, name in enumerate(LONGEST)}
         items.sort(key=lambda item: rank.get(room(item.nodeid.split("::")[0]), len(rank)))
@@ -119,3 +128,46 @@ def frozen():
     """
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def repetitions(request):
+    """Return a function of two values: `make test` gets the first, `make test-all` the second.
+
+    Use it for the number of repetitions of a statistical test: ``seeds = range(repetitions(3, 40))``.
+    """
+    full = request.config.option.full
+    return lambda few, every: every if full else few
+
+
+@pytest.fixture(scope="session")
+def shared_base(tmp_path_factory):
+    """A temporary folder that all workers of this session share."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def shared_run_dir(shared_base):
+    """The folder of a finished run that one worker makes for all; tests take ``finished_run_dir`` or ``run_copy``."""
+    import shared_run  # the stages, JAX and the benches are imported for tests that need a run
+
+    return shared_run.shared(shared_base)
+
+
+@pytest.fixture
+def finished_run_dir(shared_run_dir):
+    """The folder of a finished run, on which no test may write: see ``run_copy``."""
+    import shared_run
+
+    before = shared_run.state(shared_run_dir)
+    yield shared_run_dir
+    assert shared_run.state(shared_run_dir) == before, "this test wrote into the run that all tests share"
+
+
+@pytest.fixture
+def run_copy(finished_run_dir, tmp_path):
+    """A copy of the finished run that the test may change, in a folder of runs of its own."""
+    import shared_run
+
+    return shared_run.copied(finished_run_dir, tmp_path / "runs" / "pendulum" / finished_run_dir.name)

@@ -1,6 +1,7 @@
 """The order of the house: a room imports only from rooms above it; modules stay short; what is public is described."""
 
 import ast
+import functools
 import graphlib
 import re
 from collections.abc import Iterator
@@ -25,19 +26,30 @@ TWICE = {
 """Public classes of one name."""
 
 
-def room_of(module: Path) -> str:
-    parts = module.relative_to(PACKAGE).with_suffix("").parts
-    return "" if parts == ("__init__",) else parts[0]
+def room_of(module: str) -> str:
+    return "" if module == "__init__.py" else module.split("/")[0].removesuffix(".py")
 
 
-def imported_names(source: str, folder: tuple[str, ...]) -> set[str]:
-    """Return what a module imports, anywhere in it: inside functions and for type checkers too.
+@functools.cache
+def sources() -> dict[str, str]:
+    """Return the text of every module by its path inside the package."""
+    return {path.relative_to(PACKAGE).as_posix(): path.read_text(encoding="utf-8") for path in MODULES}
+
+
+@functools.cache
+def trees() -> dict[str, ast.Module]:
+    """Return the syntax tree of every module by its path inside the package; each is parsed once for all tests."""
+    return {module: ast.parse(text) for module, text in sources().items()}
+
+
+def imported_names(tree: ast.Module, folder: tuple[str, ...]) -> set[str]:
+    """Return the names that a module imports, also inside functions and for type checkers.
 
     ``folder`` is the module's folder inside the package; relative imports start there. ``from a import b`` is ``a.b``.
     """
     package = ("sim2real", *folder)
     names = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -47,10 +59,33 @@ def imported_names(source: str, folder: tuple[str, ...]) -> set[str]:
     return names
 
 
-def imported_rooms(source: str, folder: tuple[str, ...]) -> set[str]:
-    """Return the rooms that a module imports from."""
-    parts = [name.split(".") for name in imported_names(source, folder)]
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    """Return the imported names of every module by its path inside the package."""
+    return {module: imported_names(tree, tuple(module.split("/")[:-1])) for module, tree in trees().items()}
+
+
+def rooms_of(names: set[str]) -> set[str]:
+    """Return the rooms that imported names belong to."""
+    parts = [name.split(".") for name in names]
     return {p[1] for p in parts if p[0] == "sim2real" and len(p) > 1}
+
+
+def rooms_below(room: str, names: set[str]) -> set[str]:
+    """Return the rooms below a module's room that it imports from; the public names import lazily from everywhere."""
+    if room == "":
+        return set()
+    above = set(ROOMS[: ROOMS.index(room) + 1]) if room in ROOMS else set()
+    return rooms_of(names) - above - EVERYWHERE
+
+
+def other_stages(module: str, names: set[str]) -> set[str]:
+    """Return the stages that the module of a stage imports; an empty set for every other module."""
+    room, stage = room_of(module), Path(module).stem
+    if room != "stages" or stage not in STAGES:
+        return set()
+    parts = [name.split(".") for name in names if name.startswith("sim2real.stages.")]
+    return {p[2] for p in parts} & (STAGES - {stage})
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
@@ -62,18 +97,19 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def dotted(module: Path) -> str:
-    return ".".join(module.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+def dotted(module: str) -> str:
+    return f"sim2real.{module.removesuffix('.py').replace('/', '.')}".removesuffix(".__init__")
 
 
 def test_no_modules_import_each_other_in_a_circle():
-    graph = {dotted(module): set[str]() for module in MODULES}
-    for module in MODULES:
-        for name in imported_names(module.read_text(encoding="utf-8"), module.relative_to(PACKAGE).parent.parts):
+    graph = {dotted(module): set[str]() for module in trees()}
+    for module, names in imports().items():
+        for name in names:
             known = name if name in graph else name.rpartition(".")[0]
             if known in graph:
                 graph[dotted(module)].add(known)
-    assert not circle(graph)
+    assert sum(map(len, graph.values())) > len(graph), "imports are found at all"
+    assert not (found := circle(graph)), f"each of these modules imports the one before or after it: {found}"
 
 
 @pytest.mark.parametrize(("graph", "found"), [({"a": {"b"}, "b": {"a"}}, ["a", "b", "a"]), ({"a": {"b"}}, [])])
@@ -82,38 +118,53 @@ def test_circles_are_seen(graph, found):
 
 
 def test_the_house_has_no_other_rooms():
-    assert {room_of(module) for module in MODULES} - {""} <= {*ROOMS, *EVERYWHERE}
+    assert {room_of(module) for module in trees()} - {""} <= {*ROOMS, *EVERYWHERE}
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
-def test_a_room_imports_only_from_rooms_above(module):
-    room = room_of(module)
-    if room == "":
-        return  # the public names: imported lazily, from everywhere
-    above = set() if room in EVERYWHERE else set(ROOMS[: ROOMS.index(room) + 1])
-    found = imported_rooms(module.read_text(encoding="utf-8"), module.relative_to(PACKAGE).parent.parts)
-    below = found - above - EVERYWHERE
-    assert not below, f"{module.relative_to(PACKAGE)} imports from {sorted(below)}, which {room} must not know"
+def test_a_room_imports_only_from_rooms_above():
+    wrong = {m: sorted(below) for m, names in imports().items() if (below := rooms_below(room_of(m), names))}
+    assert not wrong, f"modules, and the rooms that they must not know: {wrong}"
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
-def test_no_stage_knows_another(module):
+@pytest.mark.parametrize(
+    ("room", "name", "below"),
+    [
+        ("log", "sim2real.view.page", {"view"}),
+        ("log", "sim2real.graph.base", set()),
+        ("errors", "sim2real.graph", {"graph"}),
+        ("graph", "sim2real.errors", set()),
+        ("", "sim2real.cli", set()),
+    ],
+)
+def test_every_import_from_a_room_below_is_seen(room, name, below):
+    assert rooms_below(room, {name}) == below
+
+
+def test_no_stage_knows_another():
     """Each is a function from artifacts to an artifact."""
-    parts = module.relative_to(PACKAGE).with_suffix("").parts
-    if parts[0] != "stages" or parts[-1] not in STAGES:
-        return
-    found = set()
-    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module == "sim2real.stages":
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sim2real.stages."):
-            found.add(str(node.module).split(".")[2])
-    assert not found & (STAGES - {parts[-1]})
+    wrong = {module: sorted(stages) for module, names in imports().items() if (stages := other_stages(module, names))}
+    assert not wrong, f"stages, and the other stages that they import: {wrong}"
+    assert {Path(module).stem for module in imports() if room_of(module) == "stages"} >= STAGES
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
-def test_modules_stay_short(module):
-    assert len(module.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+@pytest.mark.parametrize(
+    ("module", "source", "stages"),
+    [
+        ("stages/train.py", "from sim2real.stages import record, config", {"record"}),
+        ("stages/train.py", "from sim2real.stages.identify import run", {"identify"}),
+        ("stages/train.py", "import sim2real.stages.deploy", {"deploy"}),
+        ("stages/train.py", "from . import check", {"check"}),
+        ("stages/train.py", "from sim2real.stages.train import run", set()),
+        ("stages/config.py", "from sim2real.stages import record", set()),
+    ],
+)
+def test_every_import_of_another_stage_is_seen(module, source, stages):
+    assert other_stages(module, imported_names(ast.parse(source), ("stages",))) == stages
+
+
+def test_modules_stay_short():
+    long = {module: n for module, text in sources().items() if (n := len(text.splitlines())) > MAX_LINES}
+    assert not long, f"modules of more than {MAX_LINES} lines: {long}"
 
 
 @pytest.mark.parametrize(
@@ -128,7 +179,7 @@ def test_modules_stay_short(module):
     ],
 )
 def test_every_kind_of_import_is_seen(source, rooms):
-    assert imported_rooms(source, ("log",)) == rooms
+    assert rooms_of(imported_names(ast.parse(source), ("log",))) == rooms
 
 
 Documented = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
@@ -176,32 +227,23 @@ def undescribed(tree: ast.Module) -> list[str]:
     return [name for name, given, told in found if (len(given) >= MANY or (given and told)) and given != told]
 
 
-@pytest.fixture(scope="module")
-def trees() -> dict[str, ast.Module]:
-    return {m.relative_to(PACKAGE).as_posix(): ast.parse(m.read_text(encoding="utf-8")) for m in MODULES}
-
-
-@pytest.fixture(scope="module")
-def found(trees) -> dict[str, list[str]]:
-    return {module: names for module, tree in trees.items() if (names := undescribed(tree))}
-
-
-def test_no_two_public_classes_have_one_name(trees):
+def test_no_two_public_classes_have_one_name():
     homes: dict[str, set[str]] = {}
-    for module, tree in trees.items():
+    for module, tree in trees().items():
         for name, node, _ in public(tree.body):
             if isinstance(node, ast.ClassDef):
                 homes.setdefault(name, set()).add(module)
     assert {name: where for name, where in homes.items() if len(where) > 1} == TWICE
 
 
-def test_whatever_is_public_has_a_docstring(trees):
-    bare = [module for module, tree in trees.items() if not ast.get_docstring(tree)]
-    bare += [f"{module}: {name}" for module, tree in trees.items() for name, _, text in public(tree.body) if not text]
-    assert not bare
+def test_whatever_is_public_has_a_docstring():
+    bare = [module for module, tree in trees().items() if not ast.get_docstring(tree)]
+    bare += [f"{module}: {name}" for module, tree in trees().items() for name, _, text in public(tree.body) if not text]
+    assert not bare, f"no docstring: {bare}"
 
 
-def test_functions_describe_their_parameters(found):
+def test_functions_describe_their_parameters():
+    found = {module: names for module, tree in trees().items() if (names := undescribed(tree))}
     assert not found, f"no Args section that names each parameter, in their order: {found}"
 
 

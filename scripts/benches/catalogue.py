@@ -151,6 +151,11 @@ BENCHES = {
         (*_STAGES, "datasets/pendulum", "pipelines"),
     ),
     "so101": Bench("arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
+    "suite": Bench(
+        "suite",
+        "the processor time of the tests, all programs compiled",
+        ("sim2real", "pipelines", "datasets", "tests", "scripts/bench.py", "scripts/benches", "pyproject.toml"),
+    ),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
 }
 

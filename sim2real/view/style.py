@@ -113,6 +113,21 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     return figure
 
 
+def render(figure: Figure) -> str:
+    """Return a figure as an SVG document.
+
+    ``Figure.savefig`` draws a figure twice, the first time only for its layout; here the layout is computed alone.
+    """
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+    buffer = io.StringIO()
+    canvas = cast(FigureCanvasSVG, figure.canvas)
+    canvas.print_svg(buffer, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return buffer.getvalue()
+
+
 def to_svg(figure: Figure, name: str, label: str) -> str:
     """Return a figure as an ``<svg>`` element, for a page or a file.
 
@@ -121,9 +136,7 @@ def to_svg(figure: Figure, name: str, label: str) -> str:
         name: Prefix of all ids in it, which must be unique on a page.
         label: Description of the figure, for screen readers.
     """
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = buffer.getvalue()
+    text = render(figure)
     text = text[text.index("<svg") :].strip()  # without XML declaration and DOCTYPE, which HTML does not allow
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
     text = text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1)

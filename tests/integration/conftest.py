@@ -1,21 +1,16 @@
-"""The stages for real: one recorded session for all tests, robots with faults, and robots that outlive their host."""
+"""The stages for real: robots with faults, and robots that outlive their host."""
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import textwrap
 from dataclasses import asdict
 
 import pytest
-from live_robots import PATIENT, TINY
 
-from sim2real import cli, errors
 from sim2real.hardware.truth import read_truth
 from sim2real.stages.pipeline import load_pipeline
-
-RECORDING = ["--duration-s", "12", "--seed", "1", *PATIENT]
 
 FAULTY = """
 import time
@@ -45,38 +40,10 @@ ROBOT = type("Faulty", (type(robot),), {n: staticmethod(f) if callable(f) else f
 """
 
 
-@pytest.fixture(scope="session")
-def root(tmp_path_factory):
-    """Folder of the runs that all tests share."""
-    return tmp_path_factory.mktemp("runs")
-
-
-@pytest.fixture(scope="session")
-def recorded(root):
-    """The run folder of a recording of 12 s; recorded anew where a busy machine held the emulated servo up."""
-    for _ in range(3):
-        code = cli.main(["record", "pendulum", *RECORDING, "--runs", str(root)])
-        (run_dir,) = (root / "pendulum").iterdir()
-        if code != errors.HARDWARE_LOST:
-            break
-        shutil.rmtree(run_dir)
-    assert code == errors.OK
-    return run_dir
-
-
-@pytest.fixture(scope="session")
-def completed(root, recorded):
-    """The same run folder after `run --resume` with tiny budgets."""
-    before = (recorded / "record" / "manifest.json").read_bytes()
-    assert cli.main(["run", "pendulum", "--resume", str(recorded), "--runs", str(root), *TINY]) == 0
-    assert (recorded / "record" / "manifest.json").read_bytes() == before
-    return recorded
-
-
 @pytest.fixture
-def log(recorded):
+def log(finished_run_dir):
     """A recorded log of the pendulum."""
-    return recorded / "record" / "session.mcap"
+    return finished_run_dir / "record" / "session.mcap"
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@
 
 import json
 import os
-import shutil
 
 import numpy as np
 import pytest
 import serial
+from shared_run import copied
 
 from sim2real import cli, errors
 from sim2real.stages.parameters import open_identification
@@ -48,7 +48,7 @@ def test_log_of_another_pipeline(fails, tmp_path, log, make_pipeline):
 def test_files_that_are_no_logs(fails, tmp_path, log):
     whole = log.read_bytes()
     cut = tmp_path / "cut.mcap"
-    for content, word in ((b"hello", "no MCAP"), (whole[:800], "cut before"), (whole[:4], "cut before"), (b"", "cut")):
+    for content, word in ((b"hello", "no MCAP"), (whole[:200], "cut before"), (whole[:4], "cut before"), (b"", "cut")):
         cut.write_bytes(content)
         assert word in fails(errors.ERROR, "identify", "pendulum", "--log", cut, "--runs", tmp_path)
     assert "there is no log" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path / "none.mcap")
@@ -90,13 +90,13 @@ def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
         (["actuator_delay", "0", "0.2"], "--max-delay-s"),
     ],
 )
-def test_bounds(fails, root, recorded, flags, word):
-    del recorded
+def test_bounds(fails, finished_run_dir, flags, word):
+    root = finished_run_dir.parent.parent
     assert word in fails(errors.USAGE, "identify", "pendulum", "--runs", root, "--bounds", *flags, hint=False)
 
 
-def test_several_bounds(root, recorded, fails):
-    del recorded
+def test_several_bounds(finished_run_dir, fails):
+    root = finished_run_dir.parent.parent
     bounds = ["--bounds", "gain", "5", "60", "--bounds", "gravity", "200", "300"]
     assert "'gravity'" in fails(errors.USAGE, "identify", "pendulum", "--runs", root, *bounds)
     bounds = ["--bounds", "gain", "50", "60", "--bounds", "gravity", "100", "300"]
@@ -153,8 +153,8 @@ def test_limits_that_are_none(fails, tmp_path, flags):
     assert not (tmp_path / "runs").exists()
 
 
-def test_damaged_parameters(fails, tmp_path, completed):
-    good = json.loads((completed / "identify" / "parameters.json").read_text())
+def test_damaged_parameters(fails, tmp_path, finished_run_dir):
+    good = json.loads((finished_run_dir / "identify" / "parameters.json").read_text())
     path = tmp_path / "parameters.json"
 
     def damaged(text):
@@ -176,19 +176,19 @@ def test_damaged_parameters(fails, tmp_path, completed):
     assert not (tmp_path / "pendulum").exists()
 
 
-def test_parameters_that_are_whole_are_read(completed):
-    found = open_identification(completed / "identify" / "parameters.json", load_pipeline("pendulum"))
+def test_parameters_that_are_whole_are_read(finished_run_dir):
+    found = open_identification(finished_run_dir / "identify" / "parameters.json", load_pipeline("pendulum"))
     assert np.isfinite(list(found.values.values())).all()
 
 
-def test_damaged_bundles(fails, tmp_path, completed):
+def test_damaged_bundles(fails, tmp_path, finished_run_dir):
     bundle = tmp_path / "bundle"
 
     def damaged():
         return fails(errors.ERROR, "deploy", "pendulum", "--bundle", bundle, "--runs", tmp_path)
 
     assert "no policy bundle" in damaged()
-    shutil.copytree(completed / "train" / "bundle", bundle)
+    copied(finished_run_dir / "train" / "bundle", bundle)
     weights = (bundle / "policy.safetensors").read_bytes()
     (bundle / "policy.safetensors").write_bytes(weights[:-8])
     assert "is not what was exported" in damaged()
@@ -205,9 +205,9 @@ def test_damaged_bundles(fails, tmp_path, completed):
 
 
 @pytest.mark.parametrize("what", ["observation", "action", "rate_hz"])
-def test_bundles_of_another_robot(fails, tmp_path, completed, what):
+def test_bundles_of_another_robot(fails, tmp_path, finished_run_dir, what):
     bundle = tmp_path / "bundle"
-    shutil.copytree(completed / "train" / "bundle", bundle)
+    copied(finished_run_dir / "train" / "bundle", bundle)
     about = json.loads((bundle / "policy.json").read_text())
     if what == "rate_hz":
         about["rate_hz"] = 100.0

@@ -1,7 +1,6 @@
 """The benches of whole runs, on a run that the tests of the stages share: what they read must be what stages write."""
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 import bench
 from benches import arm, stages
+from shared_run import copied
 
 from sim2real import cli
 
@@ -18,14 +18,14 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture
-def commands(monkeypatch, completed):
+def commands(monkeypatch, finished_run_dir):
     """Commands that the benches ran; instead of running the stages again, a finished run of the pendulum is copied."""
     called = []
 
     def sim2real(command, pipeline, *flags):
         called.append([command, pipeline, *flags])
         if command == "run":
-            shutil.copytree(completed, Path(flags[flags.index("--runs") + 1]) / pipeline / completed.name)
+            copied(finished_run_dir, Path(flags[flags.index("--runs") + 1]) / pipeline / finished_run_dir.name)
         assert cli.main([command, pipeline, *flags]) == 0, "flags that the command does not have"
 
     for runs_stages in ("_run_all", "_call_stage"):
@@ -72,11 +72,11 @@ def test_arm(name, commands, tmp_path, monkeypatch):
     assert rows[f"{name}/distance/identified"] == [20.0]
 
 
-def test_the_arms_training_alone(commands, completed, tmp_path):
+def test_the_arms_training_alone(commands, finished_run_dir, tmp_path):
     path = tmp_path / "report.json"
     flags = ["--ppo.num-envs", "1024"]
-    run_dir = tmp_path / "runs" / "arm" / completed.name
-    shutil.copytree(completed, run_dir)
+    run_dir = tmp_path / "runs" / "arm" / finished_run_dir.name
+    copied(finished_run_dir, run_dir)
     for manifest in run_dir.glob("*/manifest.json"):
         manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "pipeline": "arm"}))
     assert bench.main(["arm", "--train", str(run_dir), "--json", str(path), "--", *flags]) == 0

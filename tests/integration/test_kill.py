@@ -76,9 +76,9 @@ def test_kill_9_of_record(tmp_path, lone_robot, start_cli):
     assert manifest_of(log.parent)["status"] == "running"
 
 
-def test_kill_9_of_deploy(tmp_path, lone_robot, start_cli, completed):
+def test_kill_9_of_deploy(tmp_path, lone_robot, start_cli, finished_run_dir):
     port, end_robot = lone_robot
-    bundle = completed / "train" / "bundle"
+    bundle = finished_run_dir / "train" / "bundle"
     flags = ["--port", port, "--bundle", bundle, "--duration-s", 20, "--runs", tmp_path, *PATIENT, "--no-measure-delay"]
     process = start_cli("deploy", "pendulum", *flags)
     log = wait_until_running(tmp_path, "pendulum/*/deploy/episode_0.mcap", process)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_robots import PATIENT, TINY, manifest_of
+from shared_run import copied
 
 import sim2real
 from sim2real import cli
@@ -32,38 +33,41 @@ def strict_json(path):
     return json.loads(path.read_text(), parse_constant=refuse)
 
 
-def test_a_resumed_run_is_complete(completed):
+def test_a_resumed_run_is_complete(finished_run_dir):
     for stage in STAGES:
-        manifest = manifest_of(completed / stage)
+        manifest = manifest_of(finished_run_dir / stage)
         assert manifest["status"] == "finished"
         for output in manifest["outputs"].values():
-            assert (completed / stage / output["path"]).exists()
-    assert strict_json(completed / "record" / "timing.json")["nodes"]["sensor"]["steps"] > 500
-    rows = {p["name"]: p for p in strict_json(completed / "identify" / "parameters.json")["parameters"]}
+            assert (finished_run_dir / stage / output["path"]).exists()
+    assert strict_json(finished_run_dir / "record" / "timing.json")["nodes"]["sensor"]["steps"] > 500
+    rows = {p["name"]: p for p in strict_json(finished_run_dir / "identify" / "parameters.json")["parameters"]}
     assert set(rows) == {"gain", "gravity", "damping", "friction", "sensor_delay", "actuator_delay", "round_trip_delay"}
-    result = strict_json(completed / "deploy" / "result.json")
+    result = strict_json(finished_run_dir / "deploy" / "result.json")
     assert {g["quantity"] for g in result["gap"]} >= {"success", "angle_rms_rad"}
     assert all(g["simulation"] is not None for g in result["gap"] if g["quantity"] != "first_upright_s")
-    inputs = manifest_of(completed / "train")["inputs"]
+    inputs = manifest_of(finished_run_dir / "train")["inputs"]
     assert set(inputs) == {"parameters"}, "training reads what identify left, not the log"
-    assert inputs["parameters"]["sha256"] == manifest_of(completed / "identify")["outputs"]["parameters"]["sha256"]
+    assert (
+        inputs["parameters"]["sha256"] == manifest_of(finished_run_dir / "identify")["outputs"]["parameters"]["sha256"]
+    )
     # Relative to the run folder: a run that is moved can still be trained.
     assert inputs["parameters"]["path"] == "identify/parameters.json"
-    (log,) = strict_json(completed / "identify" / "parameters.json")["logs"]
-    recorded = manifest_of(completed / "record")["outputs"]["log"]
+    (log,) = strict_json(finished_run_dir / "identify" / "parameters.json")["logs"]
+    recorded = manifest_of(finished_run_dir / "record")["outputs"]["log"]
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
-def test_resuming_a_finished_run_does_nothing(completed, root, capsys):
-    before = {stage: manifest_of(completed / stage)["started"] for stage in STAGES}
-    assert cli.main(["run", "pendulum", "--resume", str(completed), "--runs", str(root)]) == 0
+def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
+    before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
+    root = run_copy.parent.parent
+    assert cli.main(["run", "pendulum", "--resume", str(run_copy), "--runs", str(root)]) == 0
     assert capsys.readouterr().err.count("finished before, skipped") == 4
-    assert before == {stage: manifest_of(completed / stage)["started"] for stage in STAGES}
+    assert before == {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
 
 
-def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
+def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
     run_dir = tmp_path / "runs" / "pendulum" / "copy"
-    shutil.copytree(completed, run_dir)
+    copied(finished_run_dir, run_dir)
     first = manifest_of(run_dir / "deploy")["started"]
     flags = ["--episodes", "2", "--duration-s", "1", "--runs", str(tmp_path / "runs"), "--strict-timing"]
     flags += [*PATIENT, "--no-measure-delay"]  # what it was trained with is hardly identified
@@ -75,30 +79,30 @@ def test_deploying_again_keeps_the_first_deployment(completed, tmp_path):
     assert len(strict_json(again / "result.json")["episodes"]) == 2
 
 
-def test_a_run_that_was_copied_goes_on_without_its_origin(completed, tmp_path, monkeypatch):
+def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_path, monkeypatch):
     """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
     run_dir = tmp_path / "elsewhere" / "pendulum" / "copy"
-    shutil.copytree(completed, run_dir)
+    copied(finished_run_dir, run_dir)
     (run_dir / "record" / "session.mcap").unlink()
     monkeypatch.chdir(tmp_path)
     for path in run_dir.rglob("*.json"):
         typed = {"command", "config"} if path.name == "manifest.json" else set()  # as the user typed them
         told = {name: value for name, value in strict_json(path).items() if name not in typed}
-        assert str(completed.parent) not in json.dumps(told), path
+        assert str(finished_run_dir.parent) not in json.dumps(told), path
     home = ["--run", str(run_dir), "--runs", "elsewhere"]
     tiny = [f.removeprefix("--train.") for f in TINY if f.startswith("--train.")]
     assert cli.main(["train", "pendulum", *home, *(f"--{f}" for f in tiny)]) == 0
-    shutil.copy(completed / "record" / "session.mcap", run_dir / "record")
+    shutil.copy(finished_run_dir / "record" / "session.mcap", run_dir / "record")
     assert cli.main(["report", str(run_dir)]) == 0
     before, after = (Bundle.load(run_dir / n) for n in ("train", "train.2"))
     assert all(np.array_equal(before.weights[n], after.weights[n]) for n in before.weights)
     assert set(after.episodes.draws) == {"gain", "gravity", "damping", "friction", "round_trip_delay"}
 
 
-def test_training_on_what_is_not_accepted_must_be_asked_for(completed, tmp_path, capsys):
+def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tmp_path, capsys):
     """And ``--explain`` shows what episodes are drawn from, and trains nothing."""
     run_dir = tmp_path / "pendulum" / "copy"
-    shutil.copytree(completed, run_dir)
+    copied(finished_run_dir, run_dir)
     file = run_dir / "identify" / "parameters.json"
     document = json.loads(file.read_text())
     document["verdict"] = {"status": "hit a bound", "reasons": ["friction is at its bound"], "next": "widen it"}
@@ -121,12 +125,12 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(completed, tmp_path,
     assert not (run_dir / "train.2").exists()
 
 
-def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
+def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkeypatch):
     """Each stage is a function of a robot and of the artifact of another one, opened from Python."""
     text = "\n".join(re.findall(r"^```python\n(.*?)^```", NOTEBOOK.read_text(), re.DOTALL | re.MULTILINE))
     monkeypatch.chdir(tmp_path)
     had: dict = {}
-    text = text.replace("runs/pendulum/TIME/record", str(completed / "record"))
+    text = text.replace("runs/pendulum/TIME/record", str(finished_run_dir / "record"))
     patient = (
         "pendulum = sim2real.load_pipeline('pendulum')\nGATE = replace(pendulum.record.gate, servo_watchdog_s=0.4)\n"
     )
@@ -135,10 +139,10 @@ def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
     pendulum, recording, found = had["pendulum"], had["recording"], had["found"]
     assert (tmp_path / "notebook" / "session.mcap").is_file()
     assert recording.units["th"] == "rad"
-    assert found.values.keys() == sim2real.Identification.load(completed / "identify").values.keys()
+    assert found.values.keys() == sim2real.Identification.load(finished_run_dir / "identify").values.keys()
     assert (found.pipeline, found.world) == ("pendulum", None)
     assert found.timing.nodes["sensor"].steps == len(recording.episode.steps["sensor"])
-    recorded = manifest_of(completed / "record")["outputs"]["log"]
+    recorded = manifest_of(finished_run_dir / "record")["outputs"]["log"]
     assert [vars(log) for log in found.logs] == [{"path": "session.mcap", "sha256": recorded["sha256"]}]
     assert had["bundle"].contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
     assert len(had["deployment"].recordings) == len(had["summaries"]) == 1
@@ -152,23 +156,23 @@ def test_what_the_page_for_notebooks_has_runs(completed, tmp_path, monkeypatch):
         sim2real.train(had["robot"], replace(config, world="moon"), found)
 
 
-def test_a_new_recording_is_what_identify_takes_next(completed, root, tmp_path):
-    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):
+    copied(finished_run_dir, tmp_path / "pendulum" / finished_run_dir.name)
     assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path), *PATIENT]) == 0
     latest = newest(tmp_path, "pendulum", "record")
-    assert latest.run_dir.name != completed.name
+    assert latest.run_dir.name != finished_run_dir.name
     # Too short to identify from: the stage says so instead of falling back to the older one.
     assert cli.main(["identify", "pendulum", "--runs", str(tmp_path)]) == 2
     assert finished(latest.run_dir, "identify") is None
     # Named, the older run is used, and gets the new attempt.
-    flags = ["--run", completed.name, "--runs", str(tmp_path), "--generations", "0", "--refine-steps", "3"]
+    flags = ["--run", finished_run_dir.name, "--runs", str(tmp_path), "--generations", "0", "--refine-steps", "3"]
     assert cli.main(["identify", "pendulum", "--folds", "0", "--free-run-s", "0", *flags]) == 0
-    assert (tmp_path / "pendulum" / completed.name / "identify.2").is_dir()
+    assert (tmp_path / "pendulum" / finished_run_dir.name / "identify.2").is_dir()
 
 
-def test_an_interrupted_stage_is_run_again(completed, tmp_path, capsys):
+def test_an_interrupted_stage_is_run_again(finished_run_dir, tmp_path, capsys):
     run_dir = tmp_path / "pendulum" / "copy"
-    shutil.copytree(completed, run_dir)
+    copied(finished_run_dir, run_dir)
     path = run_dir / "deploy" / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "status": "running", "exit_code": None}))
     flags = ["--resume", "copy", "--runs", str(tmp_path), "--deploy.episodes", "1", "--deploy.duration-s", "1"]
@@ -180,6 +184,6 @@ def test_an_interrupted_stage_is_run_again(completed, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("command", ["info", "report"])
-def test_a_finished_run_can_be_looked_at(completed, command, capsys):
-    assert cli.main([command, str(completed)]) == 0
+def test_a_finished_run_can_be_looked_at(run_copy, command, capsys):
+    assert cli.main([command, str(run_copy)]) == 0
     assert capsys.readouterr().out

@@ -20,8 +20,8 @@ from sim2real.errors import Sim2RealError
 from sim2real.log import TruncatedLogWarning, read_log, recover, summary
 from sim2real.log.session_file import SessionFile
 
-BUDGET_S = 1.5
-"""Processor time for each kind of file; set it to minutes to hunt."""
+FEW_S, EVERY_S = 0.4, 20.0
+"""Processor time for each kind of file [s], in `make test` and in `make test-all`."""
 WEIRD = [
     "", "O", "|V16", "<f8", "-1", "9" * 40, "\x1b[2J", "null", "[]", "{}", "[" * 5000, '[{"name": "x"}]', "٣٤",
     '[{"name": "x", "original": "x", "dtype": "<f8", "shape": [-1]}]',
@@ -94,15 +94,20 @@ def survive(tmp_path):
     return call
 
 
-def for_a_while(attempt):
-    begin, seed = time.process_time(), 0
-    while time.process_time() - begin < BUDGET_S:
-        attempt(np.random.default_rng(seed))
-        seed += 1
-    assert seed > 5
+@pytest.fixture
+def for_a_while(repetitions):
+    """Repeat an attempt with one seed after the other, for some processor time and ten times at least."""
+
+    def repeat(attempt):
+        begin, seed = time.process_time(), 0
+        while seed < 10 or time.process_time() - begin < repetitions(FEW_S, EVERY_S):
+            attempt(np.random.default_rng(seed))
+            seed += 1
+
+    return repeat
 
 
-def test_bytes_bent_at_random(content, survive):
+def test_bytes_bent_at_random(content, survive, for_a_while):
     def attempt(rng):
         bent = bytearray(content)
         for _ in range(rng.integers(1, 8)):
@@ -122,7 +127,7 @@ def test_bytes_bent_at_random(content, survive):
     for_a_while(attempt)
 
 
-def test_channels_that_say_weird_things(content, survive):
+def test_channels_that_say_weird_things(content, survive, for_a_while):
     def attempt(rng):
         def change(channel):
             if rng.random() < 0.3:

@@ -172,7 +172,7 @@ def by_hands_log(tmp_path_factory):
     sought = [ParameterPattern(what) for what in PLAY]
     config = RobotConfig(path, ("servo",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=(*held, *sought))
     model = MjcfRobot(config).identifiable(0.02)
-    spans = [Span(0, 0.1 + 0.5 * i) for i in range(10)]
+    spans = [Span(0, 0.1 + 0.5 * i) for i in range(4)]
     return Problem(model, [episode], spans, 0.5, FitConfig(max_delay_s=0.02, engine="c"))
 
 

@@ -13,7 +13,7 @@ import pytest
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 import bench  # noqa: E402
-from benches import compose, graph_mjx, provenance  # noqa: E402
+from benches import compose, graph_mjx, provenance, suite  # noqa: E402
 from benches.catalogue import BENCHES  # noqa: E402
 
 MODULES = sorted(SCRIPTS.rglob("*.py"))
@@ -93,7 +93,7 @@ def test_scaling(run):
 
 
 def test_randomise(run):
-    report = run("randomise", "--ways", "all")
+    report = run("randomise", "--ways", "all", "--record-s", 12)  # a length whose programs other tests compile, too
     found = {row["name"]: row["value"] for row in report["rows"]}
     low, share, high = (found[f"randomise/all/{n}"] for n in ("low95", "success", "high95"))
     assert 0.0 <= low <= share <= high <= 1.0
@@ -177,6 +177,33 @@ def test_log(run):
     rows = {row["name"]: row["value"] for row in report["rows"]}
     assert rows["log/truncations/recovered"] == 3
     assert {"log/loop_200hz/p99_ms", "log/range_read_ms"} <= set(rows)
+
+
+def test_suite(run):
+    report = run("suite")
+    rows = {r["name"].removeprefix("suite/"): r["value"] for r in report["rows"]}
+    assert (rows["passed"], rows["skipped"], rows["failed"], report["failed"]) == (3, 0, 0, [])
+    assert rows["processor_over_cold"] == pytest.approx(rows["processor_s"], abs=0.1), "the yardstick is set to 1 s"
+    assert 0.5 < rows["processor_s"] < 60.0
+    assert list(report["rooms"]) == ["test_repetitions"]
+
+
+def test_the_outcome_of_tests_is_read_from_pytests_report(tmp_path):
+    path = tmp_path / "report.xml"
+    cases = {"log.test_a": "", "log.test_b": "<skipped/>", "view.test_c": "<failure/>", "view.test_d": "<error/>"}
+    rows = "".join(f'<testcase classname="tests.{n}" name="t" time="1.5">{e}</testcase>' for n, e in cases.items())
+    path.write_text(f"<testsuites><testsuite>{rows}</testsuite></testsuites>")
+    found = suite.outcome(path)
+    assert (found.passed, found.skipped) == (1, 1)
+    assert found.failed == ("tests.view.test_c::t", "tests.view.test_d::t")
+    assert found.rooms == {"log": 3.0, "view": 3.0}
+
+
+def test_tests_that_cannot_run_are_an_error_with_a_hint(capsys):
+    assert bench.main(["suite", "--quick", "--paths", "tests/no_such_room"]) == 1
+    told = capsys.readouterr().err
+    assert "pytest ended with exit code 4" in told
+    assert "\nhint: " in told
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The figures: well-formed, readable without colour, and showing what they are given."""
+"""The figures as data: their lines, texts and colours; one of them is drawn, and is well-formed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import synthetic_run
+from matplotlib.colors import to_hex
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
+from sketches import sketched, texts
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Identification, Quantity
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import Source, finished_stages
-from sim2real.view import figures, identify_figures, intervals, residuals, timing
+from sim2real.view import figures, identify_figures, intervals, residuals, style, timing
 from sim2real.view.signals import signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -40,67 +44,121 @@ def log(artifacts):
 
 
 @pytest.fixture(scope="module")
-def drawn(artifacts, found, log):
-    """Every figure there is, by name."""
+def calls(artifacts, found, log):
+    """Every figure there is, as a function and its arguments, by name."""
     deployed = Deployment.load(artifacts["deploy"].folder)
     episode, simulation = signals_of(deployed.recordings[1]), simulated_series(deployed.simulated[1])
     training = History.load(artifacts["train"].folder)
     return {
-        "record": figures.recording(log, "record"),
-        "intervals": intervals.intervals(found.parameters, "intervals"),
-        "predictions": identify_figures.predictions(found, "predictions"),
-        "errors": identify_figures.prediction_errors(found, "errors"),
-        "free": identify_figures.free_runs(found, "free"),
-        "residuals": residuals.figure(found, "residuals"),
-        "search": identify_figures.search(found, "search"),
-        "correlation": identify_figures.correlation(found.correlation.names, found.correlation.matrix, "correlation"),
-        "aggregate": intervals.aggregate(QUANTITIES, "aggregate"),
-        "training": figures.training(training, "training"),
-        "best": figures.training(replace(training, best_seed=1), "best"),
-        "deployment": figures.deployment(episode, simulation, deployed.units, 1, "deployment"),
-        "histograms": timing.histograms(log.episode, "histograms"),
-        "schedule": timing.schedule(log.episode, "schedule"),
+        "record": (figures.recording, log),
+        "intervals": (intervals.intervals, found.parameters),
+        "predictions": (identify_figures.predictions, found),
+        "errors": (identify_figures.prediction_errors, found),
+        "free": (identify_figures.free_runs, found),
+        "residuals": (residuals.figure, found),
+        "search": (identify_figures.search, found),
+        "correlation": (identify_figures.correlation, found.correlation.names, found.correlation.matrix),
+        "aggregate": (intervals.aggregate, QUANTITIES),
+        "training": (figures.training, training),
+        "deployment": (figures.deployment, episode, simulation, deployed.units, 1),
+        "histograms": (timing.histograms, log.episode),
+        "schedule": (timing.schedule, log.episode),
     }
 
 
-def texts(svg: str) -> list[str]:
-    return ["".join(t.itertext()) for t in ET.fromstring(svg).iter(f"{SVG}text")]
+def figure_of(draw, *arguments):
+    """Return the one figure that a function of the room makes."""
+    with sketched() as made:
+        draw(*arguments, "name")
+    (figure,) = made
+    return figure
 
 
-def test_every_figure_is_one_well_formed_element_with_a_label(drawn):
-    for name, svg in drawn.items():
-        root = ET.fromstring(svg)
-        assert root.tag == f"{SVG}svg", name
-        assert root.get("role") == "img"
-        assert root.get("aria-label")
-        assert "<metadata" not in svg
-        assert "<image" not in svg, f"{name} holds pixels"
+@pytest.fixture(scope="module")
+def drawn(calls):
+    """Every figure as data, by name."""
+    return {name: figure_of(*call) for name, call in calls.items()}
+
+
+@pytest.fixture(scope="module")
+def picture(calls):
+    """The one figure that is drawn: it has lines, bars, hatching, arrows, a legend and a node's own colour."""
+    draw, *arguments = calls["schedule"]
+    return draw(*arguments, "schedule")
+
+
+def lines_of(axes):
+    """Return the lines of axes by colour and dash, ``(x, y)`` each; lines of no points stand in legends."""
+    return {(to_hex(line.get_color()), line.get_linestyle()): line.get_data() for line in axes.lines}
+
+
+def test_a_figure_is_one_well_formed_element_with_a_label(picture):
+    root = ET.fromstring(picture)
+    assert root.tag == f"{SVG}svg"
+    assert root.get("role") == "img"
+    assert root.get("aria-label") == "Excerpts of the schedule: when each node waited and computed, and its messages"
+    assert "<metadata" not in picture
+
+
+def test_every_figure_has_a_label_and_no_pixels(calls, drawn):
+    for name, (draw, *arguments) in calls.items():
+        with sketched():
+            assert ET.fromstring(draw(*arguments, name)).get("aria-label"), name
+        artists = drawn[name].findobj()
+        assert not [a for a in artists if isinstance(a, AxesImage) or a.get_rasterized()], f"{name} holds pixels"
 
 
 def test_ids_differ_between_the_figures_of_a_page(drawn):
-    ids = [element.get("id") for svg in drawn.values() for element in ET.fromstring(svg).iter() if element.get("id")]
-    assert len(ids) == len(set(ids))
+    svgs = [style.to_svg(drawn["search"], name, name) for name in ("one", "two")]
+    ids = [element.get("id") for svg in svgs for element in ET.fromstring(svg).iter() if element.get("id")]
+    assert len(ids) == len(set(ids)) > 10
 
 
-def test_every_reference_in_a_figure_leads_somewhere(drawn):
+def test_every_reference_in_a_figure_leads_somewhere(picture):
     link = "{http://www.w3.org/1999/xlink}href"
-    for name, svg in drawn.items():
-        elements = list(ET.fromstring(svg).iter())
-        ids = {e.get("id") for e in elements}
-        references = {e.get(link)[1:] for e in elements if e.get(link)}
-        references |= {e.get("clip-path")[5:-1] for e in elements if e.get("clip-path")}
-        assert references <= ids, name
+    elements = list(ET.fromstring(picture).iter())
+    ids = {e.get("id") for e in elements}
+    references = {e.get(link)[1:] for e in elements if e.get(link)}
+    references |= {e.get("clip-path")[5:-1] for e in elements if e.get("clip-path")}
+    assert references
+    assert references <= ids
 
 
-def test_text_is_text_and_is_never_parsed_as_mathematics(drawn):
+def test_colours_follow_the_page_and_stand_alone(picture):
+    assert "var(--ink, #1b2430)" in picture
+    assert synthetic_run.COLOR in picture
+
+
+def test_measured_and_predicted_are_drawn_as_they_are(drawn, found):
+    (axes, closer), rows = drawn["predictions"].axes[:2], found.disjoint()
+    lines, whole = lines_of(axes), found.samples["recording"] == 0
+    for color, model, own in (
+        (style.INK, "measured", whole), (style.BLUE, "identified", rows), (style.ORANGE, "nominal", rows)
+    ):  # fmt: skip
+        ((_, dash),) = [look for look in lines if look[0] == color]
+        t_s, values = (values[np.isfinite(values)] for values in lines[color, dash])
+        at = np.unique(found.samples["t"][own], return_index=True)
+        np.testing.assert_allclose(t_s, at[0])
+        np.testing.assert_allclose(values, found.samples[f"th_{model}"][own][at[1]])
+    assert lines_of(closer).keys() == lines.keys()
+    assert closer.get_xlim() == (3.0, 5.1)
+
+
+def test_a_recording_is_drawn_with_its_truth_and_its_command(drawn, log):
+    rows = {axes.get_ylabel(): lines_of(axes) for axes in drawn["record"].axes if axes.get_ylabel()}
+    th, true = (next(s for s in log.measured if s.name == "th"), log.truth["th"])
+    np.testing.assert_array_equal(rows["th [rad]"][style.INK, "-"], (th.t_s, th.values))
+    ((_, dash),) = [look for look in rows["th [rad]"] if look[0] == style.GREEN]
+    np.testing.assert_array_equal(rows["th [rad]"][style.GREEN, dash], (true.t_s, true.values))
+    ((_, sent),) = rows["actuator.action [V]"].items()
+    np.testing.assert_allclose(sent[1], np.sin(3 * 0.02 * np.arange(len(sent[1]))), atol=1e-6)
+
+
+def test_text_is_never_parsed_as_mathematics(drawn, picture):
     assert synthetic_run.EVIL in texts(drawn["intervals"])
-    for name, svg in drawn.items():
-        assert not [t for t in texts(svg) if "mathdefault" in t], name
-
-
-def test_colours_follow_the_page_and_stand_alone(drawn):
-    for svg in drawn.values():
-        assert "var(--ink, #1b2430)" in svg
+    for name, figure in drawn.items():
+        assert not [t for t in figure.findobj(Text) if t.get_parse_math()], name
+    assert "late awakening" in ["".join(t.itertext()) for t in ET.fromstring(picture).iter(f"{SVG}text")]
 
 
 def test_units_stand_at_the_axes(drawn):
@@ -109,7 +167,8 @@ def test_units_stand_at_the_axes(drawn):
 
 
 def test_lines_differ_by_more_than_colour(drawn):
-    assert "stroke-dasharray" in drawn["predictions"]
+    lines = [line for line in drawn["predictions"].axes[0].lines if len(line.get_xdata())]
+    assert [line.is_dashed() for line in lines] == [False, True, True]
     legend = texts(drawn["predictions"])
     assert {"measured", "identified model", "nominal model", "held out"} <= set(legend)
 
@@ -122,8 +181,9 @@ def test_nodes_have_their_own_order_and_colour(drawn, log):
     assert timing.in_order(log.episode) == ["actuator", "sensor", "agent"]
     colors = [timing.color_of(log.episode, n, "mine") for n in ("actuator", "agent", "sensor")]
     assert colors == [synthetic_run.COLOR, "mine", "mine"], "a name that nobody knows is no colour"
-    for name in ("schedule", "histograms"):
-        assert synthetic_run.COLOR in drawn[name]
+    histogram = drawn["histograms"].axes[0]
+    assert histogram.get_ylabel() == "actuator\nsteps"
+    assert {to_hex(patch.get_edgecolor()) for patch in histogram.patches} >= {synthetic_run.COLOR}
     assert "computing, or in the node's own colour" in texts(drawn["schedule"])
 
 
@@ -143,7 +203,7 @@ def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
         replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
         for e in found.parameters
     ]
-    labels = texts(intervals.intervals(bare, "bare"))
+    labels = texts(figure_of(intervals.intervals, bare))
     assert "truth" not in labels
     assert labels.count("no standard error") == len(bare)
 
@@ -159,9 +219,9 @@ def test_recordings_do_not_hide_each_other(found):
         found, samples=synthetic_run.three_recordings(), logs=tuple(Source(f"../{n}.mcap", "") for n in "abc")
     )
     assert several.disjoint().sum() == 3 * found.disjoint().sum()
-    labels = texts(identify_figures.predictions(several, "several"))
+    labels = texts(figure_of(identify_figures.predictions, several))
     assert [labels.count(f"{n}.mcap") for n in "abc"] == [2, 2, 2]
-    assert "time, log after log [s]" in texts(residuals.figure(several, "several"))
+    assert "time, log after log [s]" in texts(figure_of(residuals.figure, several))
     assert np.all(np.diff(residuals.residuals(several, "th").t_s) > 0)
 
 
@@ -174,7 +234,7 @@ def test_more_fields_than_panels_leave_the_last_ones_out(found):
 
 def test_a_free_run_says_its_errors_and_is_not_squeezed_by_one_that_runs_away(drawn):
     assert any("identified RMSE 0.0123, MAE 0.00984 · no delay" in t for t in texts(drawn["free"]))
-    assert "20" not in texts(drawn["free"])
+    assert max(axes.get_ylim()[1] for axes in drawn["free"].axes) < 2.0, "one model's values reach 30"
 
 
 def test_residuals_are_white_or_not():
@@ -195,14 +255,14 @@ def test_only_what_lies_behind_the_fitted_start_counts_as_residual(found):
 
 
 def test_the_assumed_deviation_is_drawn_where_it_is_known(found):
-    told = texts(residuals.figure(replace(found, sigma={"th": 0.002}), "told"))
+    told = texts(figure_of(residuals.figure, replace(found, sigma={"th": 0.002})))
     assert "assumed of the measurement" in told
     assert any("5 times the assumed" in t for t in told)
 
 
 def test_a_parameter_that_may_be_zero_is_drawn_between_its_bounds(found):
     zero = replace(found.parameters[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
-    assert "place between the bounds [%]" in texts(intervals.intervals([zero, *found.parameters], "zero"))
+    assert "place between the bounds [%]" in texts(figure_of(intervals.intervals, [zero, *found.parameters]))
 
 
 def test_recordings_that_disagree_are_named(drawn):

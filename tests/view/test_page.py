@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import synthetic_run
+from sketches import sketched
 
 from sim2real.artifacts.identification import Identification, Judgement, Left
 from sim2real.artifacts.posterior import Alternative, Posterior
@@ -59,9 +60,25 @@ class Page(HTMLParser):
         return [attrs[name] or "" for _, attrs in self.elements if name in attrs]
 
 
+@pytest.fixture(autouse=True)
+def figures_as_data():
+    """Sketch the figures of all pages: tests/view/test_figures.py compares them."""
+    with sketched():
+        yield
+
+
 @pytest.fixture(scope="module")
-def page(finished_run):
-    return Page(report(finished_run).read_text(encoding="utf-8"))
+def path(finished_run):
+    """The report of a run, whose first figure is drawn."""
+    with sketched(pictures=1) as figures:
+        written = report(finished_run)
+    assert len(figures) > 10
+    return written
+
+
+@pytest.fixture(scope="module")
+def page(path):
+    return Page(path.read_text(encoding="utf-8"))
 
 
 def test_the_numbers_are_there(page):
@@ -302,9 +319,9 @@ def test_a_quantity_says_its_unit():
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_it_without_an_error(finished_run, tmp_path):
+def test_a_browser_shows_it_without_an_error(path, tmp_path):
     assert CHROMIUM is not None
-    url = report(finished_run).resolve().as_uri()
+    url = path.resolve().as_uri()
     command = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path}", "--dump-dom", url]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert "CONSOLE" not in done.stderr

@@ -1,0 +1,171 @@
+"""One run of the pendulum for all tests that need any finished run: made once a session, on a simulated clock.
+
+The stages identify, train and deploy are the real ones with tiny budgets. The robot is the pendulum of the benches,
+which is simulated by hand: a recording of 12 s takes milliseconds, and a busy machine does not disturb it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
+from benches import hidden_robots as hidden
+from benches import randomise
+from live_robots import TINY
+from sketches import sketched
+
+from sim2real import cli
+from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.recording import LOG, TRUTH, Recording
+from sim2real.artifacts.run_folder import finished, open_stage
+from sim2real.graph.episode import MessageRecord, StepRecord
+from sim2real.hardware.truth import Kind, TruthLog
+from sim2real.log.writer import McapRecorder
+from sim2real.stages import deploy
+from sim2real.stages.pipeline import load_pipeline
+
+RECORD_S, VOLTS = 12.0, 2.0
+ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
+NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
+EPOCH_NS = 1_790_000_000_000_000_000
+SUMMARY = {
+    "transactions": 1200, "lost_replies": 0, "late_replies": 0, "late_s": [0.0] * 3, "suspects": [],
+    "command_timeouts": 0, "monotonic_ns": 0,
+}  # fmt: skip
+
+
+def make(root: Path) -> Path:
+    """Make a run with all four stages below ``root``; return its folder."""
+    pipeline = load_pipeline("pendulum")
+    config = replace(pipeline.record, duration_s=RECORD_S, seed=1)
+    with open_stage(root, pipeline.name, "record", config) as stage:
+        played = hidden.play(ROBOT, hidden.excited(RECORD_S, 0), RECORD_S, 0)
+        write(stage.output("log", LOG), stage.output("truth", TRUTH), played)
+        recording = Recording.load(stage.folder / LOG, stage.folder / TRUTH)
+        for name, path in recording.timing.save(stage.folder).items():
+            stage.output(name, path)
+    run_dir = stage.run_dir
+    with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
+        patch.setattr(deploy, "opened", lambda *_: nullcontext())
+        patch.setattr(deploy, "_episode", lambda *given: deployed(run_dir, *given))
+        assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0
+    return run_dir
+
+
+def deployed(run_dir: Path, *given: Any) -> dict[str, Any]:
+    """Run the policy of a run on the simulated robot and write its log; takes what ``deploy._episode`` takes."""
+    *_, log, config = given
+    bundle = Bundle.load(finished(run_dir, "train").output("bundle"))
+    played = hidden.play(ROBOT, randomise.controller(bundle, VOLTS), config.duration_s, 1)
+    return write(log, log.parent / TRUTH, played)
+
+
+def write(log: Path, truth: Path, played: hidden.Played) -> dict[str, Any]:
+    """Write a session's log and the account of its true motion; return the summary that ends the log."""
+    outputs = {
+        "sensor": [{"th": np.float32(th), "thdot": np.float32(thdot)} for th, thdot in played.measured],
+        "agent": [{"action": np.array([volts], np.float32)} for volts in played.volts],
+    }
+    outputs["actuator"] = outputs["agent"]
+    graph = {
+        n: {"rate_hz": hidden.RATE_HZ, "delay_s": 0.002, "inputs": {s: {"from": s, "blocking": True}} if s else {}}
+        for n, s in NODES.items()
+    }
+    metadata = {"pipeline": "pendulum", "graph": graph, "units": {"th": "rad", "thdot": "rad/s", "action": "V"}}
+    inputs = [(n, s) for n, s in NODES.items() if s]
+    recorder = McapRecorder(log, metadata, {}, {n: rows[0] for n, rows in outputs.items()}, inputs, {})
+    recorder.start(EPOCH_NS, 0)
+    starts, ends = ({n: np.round(1e6 * t).astype(int) for n, t in of.items()} for of in (played.starts, played.ends))
+    for k in range(len(played.volts)):
+        for node, sender in NODES.items():
+            start = int(starts[node][k])
+            recorder.step(StepRecord(node, k, start, start, start, -1, int(ends[node][k]), 0), outputs[node][k])
+            if sender:
+                recorder.message(MessageRecord(node, sender, k, k, start, start))
+    quantiles = {"period_s": [1 / hidden.RATE_HZ] * 3, "lateness_s": [0.0] * 3, "overruns": 0}
+    timing = {
+        n: {"steps": len(played.volts), **quantiles, "age_s": {s: [0.0] * 3} if s else {}} for n, s in NODES.items()
+    }
+    summary = {**SUMMARY, "timing": timing}
+    recorder.close("finished", 0, summary)
+    write_truth(truth, played, 1000 * starts["sensor"], 1000 * starts["actuator"], 1000 * ends["actuator"])
+    return summary
+
+
+def write_truth(
+    path: Path, played: hidden.Played, read_ns: np.ndarray, begin_ns: np.ndarray, end_ns: np.ndarray
+) -> None:
+    """Write true parameters, states, and when samples were taken and commands took effect."""
+    values = {name: getattr(ROBOT, name) for name in ("gain", "gravity", "damping", "friction")}
+    account = TruthLog(path, {"state_names": ["th", "thdot"], "truth": values, "servo_ids": [1]})
+    for i in range(0, len(played.t), round(0.005 / hidden.STEP_S)):  # 200 Hz, as an emulated robot does
+        state = float(played.angle[i]), float(played.speed[i])
+        account.write(Kind.STATE, 0, 0, round(1e9 * played.t[i]), 0, 0, state)
+    sensing_ns, acting_ns = round(1e9 * ROBOT.sensing), round(1e9 * ROBOT.acting)
+    for k, volts in enumerate(played.volts):
+        read, end = int(read_ns[k]), int(end_ns[k])
+        account.write(Kind.SAMPLE, 1, read, read - sensing_ns, read, 0, (0.0, 0.0, 0.0))
+        account.write(Kind.EFFECT, 1, int(begin_ns[k]), end + acting_ns, 0, 0, (16.0, float(volts)))
+    account.close()
+
+
+def shared(base: Path) -> Path:
+    """Return the session's run folder, which the first process to come makes and makes read-only.
+
+    Args:
+        base: Folder that all processes of the session share.
+    """
+    root = base / "shared_run"
+    with locked(base / "shared_run.lock"):
+        if not (base / "shared_run.finished").is_file():
+            make(root)
+            protect(root)
+            (base / "shared_run.finished").touch()
+    (run_dir,) = (root / "pendulum").iterdir()
+    return run_dir
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock between processes for the block."""
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def protect(root: Path) -> None:
+    """Take the permission to write from all files and folders below ``root``."""
+    for folder, _, files in os.walk(root):
+        for name in files:
+            (Path(folder) / name).chmod(0o444)
+        Path(folder).chmod(0o555)
+
+
+def state(folder: Path) -> dict[str, tuple[int, int]]:
+    """Return size and time of change [ns] of every file and folder below a folder.
+
+    A process of the user root writes in spite of missing permissions: the fixture compares states around each test.
+    """
+    about = {path: path.stat() for path in (folder, *folder.rglob("*"))}
+    return {str(path): (found.st_size, found.st_mtime_ns) for path, found in about.items()}
+
+
+def copied(run_dir: Path, target: Path) -> Path:
+    """Copy the run to a folder and return it: tests may write into the copy."""
+    for path in (run_dir, *run_dir.rglob("*")):
+        at = target / path.relative_to(run_dir)
+        if path.is_dir():
+            at.mkdir(parents=True)
+        else:
+            at.write_bytes(path.read_bytes())
+    return target
