@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
@@ -21,9 +22,10 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.runtime.fit import check_fit, nodes_of, supervisor_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.program import Rollout, RowProgram
+from sim2real.runtime.program import Rollout, RowProgram, has_mjx_data, scan_rows
+from sim2real.runtime.repetition import Repetition
 from sim2real.runtime.walk import Walk
-from sim2real.runtime.wiring import Wiring, wire
+from sim2real.runtime.wiring import Wiring, wire, wire_pattern
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
@@ -78,6 +80,15 @@ class CompiledGraph:
         # Unrolling halves how often a GPU copies the carried state: 100,000 pendulums on an H200 take 0.63 of the time
         # with two rows (three: 0.66, four: 0.68). On a CPU it only makes compilation longer.
         self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
+
+    @cached_property
+    def repetition(self) -> Repetition | None:
+        """Runs whole episodes in a pattern that they all repeat; None without one, and where outputs are given."""
+        pattern = None if self.given else wire_pattern(self.nodes, self.supervisor, self.timeline)
+        if pattern is not None and np.diff(pattern.full) < 2:
+            return None
+        with jax.ensure_compile_time_eval():  # the first rollout may be traced
+            return pattern and Repetition(self.nodes, pattern, self.episodes)
 
     @property
     def rows(self) -> int:
@@ -200,7 +211,9 @@ class CompiledGraph:
         Args:
             gs: What ``init`` or another rollout returned.
             record: Nodes whose outputs are returned.
-            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced.
+            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced. A whole
+                episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
+                order of the records' places.
 
         Returns:
             The last state, and the records by node.
@@ -209,13 +222,19 @@ class CompiledGraph:
             UsageError: When fewer than ``rows`` rows are left, or a node in ``record`` does not run.
         """
         self._check_row_start(gs, "rollout")
+        fresh = rows is None and not _traced(gs.step) and not int(gs.step)
+        # XLA compiles each tick of MJX for seconds, and masks do not slow it down: rows have fewer ticks.
+        if fresh and not has_mjx_data(gs.state) and self.repetition is not None:
+            self._check_record(record)
+            gs, records = self.repetition.rollout(gs, record)
+            return gs.replace(step=np.int32(self.rows)), records
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
             raise UsageError(f"{left} of this graph's {self.rows} rows are left, {rows} were asked for")
         self._check_record(record)
         inside = not _traced(gs.step)
-        return self._scan(gs, record, rows, lambda state: self._run_row(state, inside))
+        return scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
 
     def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
         """Run the world's ticks alone, by another function in place of its step.
@@ -260,23 +279,7 @@ class CompiledGraph:
             gs = program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside=True)
             return gs.replace(step=gs.step + 1), outputs
 
-        return self._scan(gs, record, self.rows, row)[1]
-
-    def _scan(
-        self,
-        gs: GraphState,
-        record: Sequence[str],
-        rows: int,
-        row: Callable[[GraphState], tuple[GraphState, dict[str, list[Rollout]]]],
-    ) -> tuple[GraphState, dict[str, Rollout]]:
-        def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
-            state, outputs = row(state)
-            kept = {n: outputs.get(n, []) for n in record}
-            return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
-
-        gs, records = jax.lax.scan(body, gs, length=rows, unroll=self.rows_per_pass)
-        merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
-        return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
+        return scan_rows(row, gs, record, self.rows, self.rows_per_pass)[1]
 
     def _check_record(self, record: Sequence[str]) -> None:
         for name in record:
