@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.runtime.bounds import DelayBounds, bounds_of
 from sim2real.runtime.match import check_match, matched
 from sim2real.runtime.wiring import SlotTable, Wiring
 
@@ -45,6 +47,7 @@ class RowProgram:
         episodes: Number of episodes E.
         ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
             the sender's ring has.
+        reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
 
     Attributes:
         replayed: The world's messages where its ticks were run elsewhere, leaves ``(1 + ticks, ...)``: the default
@@ -58,16 +61,29 @@ class RowProgram:
         given: Mapping[str, Any],
         episodes: int,
         ages: Sequence[Mapping[str, Ages]] | None = None,
+        reusable: bool = False,
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
+        self.bounds: DelayBounds = bounds_of(nodes)
         self.replayed: Any = None
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
-        self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
+        self._always = [bool((t.seq >= 0).all()) and not reusable for t in wiring.tables]
         self._ages = ages or [{} for _ in wiring.tables]
+
+    @property
+    def data(self) -> Any:
+        """The tables, and the bounds of trainable delays; see ``HoldsData``."""
+        return self._tables, self._world, self.bounds
+
+    def with_data(self, nodes: Mapping[str, BaseNode], data: Any) -> RowProgram:
+        """Return the program with other nodes and data, which may be traced."""
+        program = copy.copy(self)
+        program.nodes, (program._tables, program._world, program.bounds) = nodes, data
+        return program
 
     def check_given(self, outputs: Mapping[str, Any]) -> None:
         """Check that recorded outputs have the form of their nodes' default outputs."""
@@ -235,7 +251,8 @@ class RowProgram:
             state = InputState(t["seq"], t["sent"], t["received"], data)
             if dist is not None:
                 period = 1.0 / self.nodes[name].rate
-                served = dist.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
+                own = self.bounds[name][input_name].opened(dist)
+                served = own.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
                 state = served.replace(delay_dist=dist)
             inputs[input_name] = state
         rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))

@@ -105,7 +105,11 @@ class Wiring:
 
 
 def wire(
-    nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, given: frozenset[str] = frozenset()
+    nodes: Mapping[str, BaseNode],
+    supervisor: str,
+    timeline: Timeline,
+    given: frozenset[str] = frozenset(),
+    reusable: bool = False,
 ) -> Wiring:
     """Turn timelines into index tables.
 
@@ -114,6 +118,8 @@ def wire(
         supervisor: The supervisor's name; a row is at most as long as its period.
         timeline: The timelines.
         given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
+        reusable: Whether rings are made longer than these timelines need, so that most timelines of a robot have rings
+            of the same lengths.
 
     Raises:
         UsageError: When the supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
@@ -123,7 +129,7 @@ def wire(
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
     check_bursts(nodes, timeline)
     placer = Placer(nodes, supervisor, timeline, given)
-    return _Tables(placer, placer.place()).wiring()
+    return _Tables(placer, placer.place(), reusable).wiring()
 
 
 def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> Wiring | None:
@@ -142,8 +148,8 @@ def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timel
 class _Tables:
     """Makes the tables of one placement."""
 
-    def __init__(self, placer: Placer, placement: Placement) -> None:
-        self.placer, self.placement = placer, placement
+    def __init__(self, placer: Placer, placement: Placement, reusable: bool = False) -> None:
+        self.placer, self.placement, self.reusable = placer, placement, reusable
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
         self.total = (placement.rows - 1) * placement.ticks + placement.last
@@ -264,5 +270,8 @@ class _Tables:
                 sender = connection.output_node.name
                 if sender in self.placer.given:
                     continue
-                rings[sender] = max(rings[sender], int(t.age.max(initial=0)) + connection.total_window)
+                room = int(t.age.max(initial=0))
+                if self.reusable and room:  # 2, 4, 8 ...
+                    room = max(2, 1 << (room - 1).bit_length())
+                rings[sender] = max(rings[sender], room + connection.total_window)
         return rings
