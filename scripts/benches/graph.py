@@ -213,7 +213,7 @@ def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[in
     graph_nodes = nodes(*rates)
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, kind == "hiccups"))
     world = graph_nodes["world"]
-    total = graph.rows * graph.wiring.ticks
+    total = (graph.repetition or graph).wiring.total
     pattern_rows = total // sum(ticks)
     programs = {
         "bare": bare_program(pattern_rows, ticks, world),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from sim2real.artifacts.noise import Noise
@@ -16,6 +18,14 @@ from sim2real.graph.node import BaseNode
 from sim2real.robots.loop import DelayParams, delay_of
 from sim2real.robots.messages import Goals
 from sim2real.robots.roles import ROLES
+
+
+class NoiseSizes(NamedTuple):
+    """Sizes of a sensor's noise, each of shape ``(noise,)`` in the units of ``Noise``."""
+
+    deviation: Any
+    quantum: Any
+    bias: Any
 
 
 class SimSensor(BaseNode):
@@ -35,6 +45,21 @@ class SimSensor(BaseNode):
         super().__init__(name, rate, **options)
         self._world = world
         self.noise: tuple[Noise, ...] = ()
+        self._sizes: NoiseSizes | None = None
+
+    @property
+    def data(self) -> NoiseSizes | None:
+        """The sizes of the noise; see ``HoldsData``."""
+        if self._sizes is not None or not self.noise:
+            return self._sizes
+        numbers = np.array([(n.deviation, n.quantum, n.bias) for n in self.noise], np.float32)
+        return NoiseSizes(*numbers.T)
+
+    def with_data(self, data: NoiseSizes) -> SimSensor:
+        """Return a copy whose noise has other sizes, which may be traced."""
+        sensor = copy.copy(self)
+        sensor._sizes = data
+        return sensor
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
@@ -52,30 +77,30 @@ class SimSensor(BaseNode):
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return the biases of an episode, ``(noise,)``; without any noise there is no state."""
-        if not self.noise:
+        if (sizes := self.data) is None:
             return super().init_state(rng, graph_state)
         drawn = jnp.zeros(len(self.noise)) if rng is None else jax.random.normal(rng, (len(self.noise),))
         params = (graph_state or GraphState()).params.get(self.name)
-        return SensorBias(_scale(params) * drawn * jnp.array([n.bias for n in self.noise]))
+        return SensorBias(_scale(params) * drawn * sizes.bias)
 
     def step(self, step_state: StepState) -> tuple[StepState, Any]:
         """Return the world's message, with noise if there is any."""
         message = step_state.inputs[self._world.name][-1].data
-        return step_state, self._noisy(message, step_state) if self.noise else message
+        return step_state, message if (sizes := self.data) is None else self._noisy(message, step_state, sizes)
 
-    def _noisy(self, message: Any, step_state: StepState) -> Any:
+    def _noisy(self, message: Any, step_state: StepState, sizes: NoiseSizes) -> Any:
         if step_state.rng is None:
             raise UsageError(f"sensor {self.name!r} has noise and no random numbers to draw it from")
         # A key of its own for each step; the sensor has no other use for its random numbers.
         key = jax.random.fold_in(step_state.rng, step_state.seq)
-        added = jax.random.normal(key, (len(self.noise),)) * jnp.array([n.deviation for n in self.noise])
+        added = jax.random.normal(key, (len(self.noise),)) * sizes.deviation
         added = _scale(step_state.params) * added + step_state.state.bias
         changed: dict[str, Any] = {}
-        for noise, error in zip(self.noise, added, strict=True):
+        for noise, error, quantum in zip(self.noise, added, sizes.quantum, strict=True):
             field, index = noise.place
             value = jnp.asarray(changed.get(field, getattr(message, field)))
             own = (value if index is None else value[index]) + error
-            own = noise.quantum * jnp.round(own / noise.quantum) if noise.quantum else own
+            own = quantum * jnp.round(own / quantum) if noise.quantum else own
             changed[field] = own if index is None else value.at[index].set(own)
         return message.replace(**changed)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
@@ -92,12 +93,24 @@ class LoopTask:
         values: Mapping[str, float],
         draws: Mapping[str, np.ndarray],
     ) -> None:
-        self.robot, self.agent, self.values = robot, agent, dict(values)
+        self.robot, self.agent = robot, agent
+        self.values: dict[str, Any] = dict(values)
         self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.observation_size = robot.observation_size
         self.start = (0.0, 0.0)
         self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.action], np.float32).T
+
+    @property
+    def data(self) -> Any:
+        """The values and samples of the parameters; see ``HoldsData``."""
+        return {n: jnp.asarray(v, jnp.float32) for n, v in self.values.items()}, self.draws
+
+    def with_data(self, data: Any) -> LoopTask:
+        """Return a copy with other values and samples, which may be traced."""
+        task = copy.copy(self)
+        task.values, task.draws = data
+        return task
 
     def params(self, key: jax.Array) -> dict[str, Any]:
         """Draw the parameters of an episode."""

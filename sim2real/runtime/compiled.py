@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
@@ -17,13 +18,16 @@ from jax.core import Tracer
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.held import data_of, with_data
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.runtime.fit import check_fit, nodes_of, supervisor_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.program import Rollout, RowProgram
+from sim2real.runtime.program import Rollout, RowProgram, has_mjx_data, scan_rows
+from sim2real.runtime.repetition import Repetition
+from sim2real.runtime.report import report_of
 from sim2real.runtime.walk import Walk
-from sim2real.runtime.wiring import Wiring, wire
+from sim2real.runtime.wiring import Wiring, wire, wire_pattern
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
@@ -52,9 +56,11 @@ class CompiledGraph:
         supervisor: The node whose steps the caller of ``reset`` and ``step`` makes, usually the policy; or its name.
         timeline: Timelines of one or more episodes.
         given: Nodes that are not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
+        reusable: Whether the program should be that of the robot's other timelines too, given as ``data``.
 
     Attributes:
         rows_per_pass: Unroll factor of ``rollout``'s loop over rows.
+        walk: Where the supervisor makes its steps.
 
     Raises:
         UsageError: When nodes, connections and timeline do not fit each other.
@@ -66,18 +72,41 @@ class CompiledGraph:
         supervisor: str | BaseNode,
         timeline: Timeline,
         given: Mapping[str, Any] | None = None,
+        reusable: bool = False,
     ) -> None:
         self.nodes = nodes_of(nodes, timeline)
         self.supervisor = supervisor_of(supervisor, self.nodes)
         self.timeline = timeline
         self.given = tuple(given or ())
         check_fit(self.nodes, timeline, given or {})
-        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given))
-        self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes)
-        self._walk = Walk(self.program, self.supervisor)
+        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given), reusable)
+        self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
+        self.walk = Walk(self.program, self.supervisor)
         # Unrolling halves how often a GPU copies the carried state: 100,000 pendulums on an H200 take 0.63 of the time
         # with two rows (three: 0.66, four: 0.68). On a CPU it only makes compilation longer.
         self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
+
+    @cached_property
+    def repetition(self) -> Repetition | None:
+        """Runs whole episodes in a pattern that they all repeat; None without one, and where outputs are given."""
+        pattern = None if self.given else wire_pattern(self.nodes, self.supervisor, self.timeline)
+        if pattern is not None and np.diff(pattern.full) < 2:
+            return None
+        with jax.ensure_compile_time_eval():  # the first rollout may be traced
+            return pattern and Repetition(self.nodes, pattern, self.episodes)
+
+    @property
+    def data(self) -> Any:
+        """The numbers that follow from timelines, delays and nodes' own data; see ``HoldsData``."""
+        return self.program.data, {n: data_of(node) for n, node in self.nodes.items()}
+
+    def with_data(self, data: Any) -> CompiledGraph:
+        """Return a copy with other data, which may be traced; its rollouts run in rows."""
+        graph, (numbers, own) = copy.copy(self), data
+        graph.nodes = {n: with_data(node, own[n]) for n, node in self.nodes.items()}
+        graph.program = self.program.with_data(graph.nodes, numbers)
+        graph.walk, graph.repetition = Walk(graph.program, self.supervisor), None
+        return graph
 
     @property
     def rows(self) -> int:
@@ -92,16 +121,16 @@ class CompiledGraph:
     @property
     def steps(self) -> int:
         """Number of the supervisor's steps in the shortest episode; ``reset`` returns the first."""
-        return int(self._walk.counts.min())
+        return int(self.walk.counts.min())
 
     def last_row(self, steps: np.ndarray) -> np.ndarray:
         """Return the row of the last of the supervisor's first ``steps (E,)`` steps in each episode, ``(E,)``."""
-        return self._walk.last_row(steps)
+        return self.walk.last_row(steps)
 
     @property
     def turns(self) -> np.ndarray:
         """Where the supervisor makes a step, bool of shape ``(episodes, rows)``."""
-        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self._walk.turns], axis=0)
+        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self.walk.turns], axis=0)
 
     def init(
         self,
@@ -123,7 +152,7 @@ class CompiledGraph:
         """
         if not _traced(eps) and not 0 <= int(eps) < self.episodes:
             raise UsageError(f"there is no episode {int(eps)}: the timeline has {self.episodes}")
-        gs = init_graph_state(self.nodes, self.supervisor, rng, params, order)
+        gs = init_graph_state(self.nodes, self.supervisor, rng, params, order, self.program.bounds)
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
         self.program.check_given(outputs)
@@ -142,7 +171,7 @@ class CompiledGraph:
             The graph's state, whose ``seq`` has the number of the supervisor's next step; and what the supervisor sees.
         """
         self._check_row_start(gs, "reset")
-        return self._walk.to_first(gs)
+        return self.walk.to_first(gs)
 
     def step(
         self, gs: GraphState, step_state: StepState | None = None, output: Any = None
@@ -160,20 +189,20 @@ class CompiledGraph:
         Raises:
             UsageError: Before ``reset``, or when the episode has no further step.
         """
-        self._walk.first_turn()
+        self.walk.first_turn()
         k = self._awaited(gs, "step")
         if not (_traced(k) or _traced(gs.eps)):
-            last = int(self._walk.counts[int(gs.eps)]) - 1
+            last = int(self.walk.counts[int(gs.eps)]) - 1
             if not 0 <= int(k) < last:
                 raise UsageError(
                     f"the timeline ends after step {last} of the supervisor {self.supervisor!r}",
                     hint="start again with init() and reset(), or draw longer timelines",
                 )
-        turn = self._walk.turn_of(gs, k)
-        before = self._walk.seen(gs, turn) if step_state is None else step_state
+        turn = self.walk.turn_of(gs, k)
+        before = self.walk.seen(gs, turn) if step_state is None else step_state
         after, made = self.program.call(self.supervisor, before) if output is None else (before, output)
         gs = self.program.commit(gs, self.supervisor, after, made, k >= 0)
-        return self._walk.to_next(gs, turn, k < 0)
+        return self.walk.to_next(gs, turn, k < 0)
 
     def run(self, gs: GraphState) -> GraphState:
         """Let the supervisor make its next step itself, and run to the step after it.
@@ -200,7 +229,9 @@ class CompiledGraph:
         Args:
             gs: What ``init`` or another rollout returned.
             record: Nodes whose outputs are returned.
-            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced.
+            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced. A whole
+                episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
+                order of the records' places.
 
         Returns:
             The last state, and the records by node.
@@ -209,13 +240,19 @@ class CompiledGraph:
             UsageError: When fewer than ``rows`` rows are left, or a node in ``record`` does not run.
         """
         self._check_row_start(gs, "rollout")
+        fresh = rows is None and not _traced(gs.step) and not int(gs.step)
+        # XLA compiles each tick of MJX for seconds, and masks do not slow it down: rows have fewer ticks.
+        if fresh and not has_mjx_data(gs.state) and self.repetition is not None:
+            self._check_record(record)
+            gs, records = self.repetition.rollout(gs, record)
+            return gs.replace(step=np.int32(self.rows)), records
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
             raise UsageError(f"{left} of this graph's {self.rows} rows are left, {rows} were asked for")
         self._check_record(record)
         inside = not _traced(gs.step)
-        return self._scan(gs, record, rows, lambda state: self._run_row(state, inside))
+        return scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
 
     def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
         """Run the world's ticks alone, by another function in place of its step.
@@ -260,23 +297,7 @@ class CompiledGraph:
             gs = program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside=True)
             return gs.replace(step=gs.step + 1), outputs
 
-        return self._scan(gs, record, self.rows, row)[1]
-
-    def _scan(
-        self,
-        gs: GraphState,
-        record: Sequence[str],
-        rows: int,
-        row: Callable[[GraphState], tuple[GraphState, dict[str, list[Rollout]]]],
-    ) -> tuple[GraphState, dict[str, Rollout]]:
-        def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
-            state, outputs = row(state)
-            kept = {n: outputs.get(n, []) for n in record}
-            return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
-
-        gs, records = jax.lax.scan(body, gs, length=rows, unroll=self.rows_per_pass)
-        merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
-        return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
+        return scan_rows(row, gs, record, self.rows, self.rows_per_pass)[1]
 
     def _check_record(self, record: Sequence[str]) -> None:
         for name in record:
@@ -311,7 +332,7 @@ class CompiledGraph:
             UsageError: When the supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
-        turn = self._walk.only_turn()
+        turn = self.walk.only_turn()
         inside = inside or not _traced(gs.step)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
@@ -329,7 +350,7 @@ class CompiledGraph:
         Returns:
             The state at the start of the next row.
         """
-        turn, k = self._walk.only_turn(), self._awaited(gs, "advance")
+        turn, k = self.walk.only_turn(), self._awaited(gs, "advance")
         inside = inside or not _traced(gs.step)
         ran = None if inside and self.program.always(turn) else k >= 0
         gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
@@ -346,22 +367,7 @@ class CompiledGraph:
             by node), ``bursts`` (``node/input`` -> the most messages that one step consumes, the first step left out,
             and the length of its window), ``bytes_per_copy`` (size of the carried state).
         """
-        w = self.wiring
-        shapes = jax.eval_shape(self.init, jax.random.key(0))
-        windows = {(n, i): self.nodes[n].inputs[i].total_window for n, i in w.bursts}
-        return {
-            "episodes": self.episodes,
-            "rows": w.rows,
-            "ticks_per_row": w.ticks,
-            "slots": list(w.slots),
-            "supervisor_slots": len(self._walk.turns),
-            "supervisor_steps": self.steps if self._walk.turns else 0,
-            "longest_gap": self._walk.longest_gap,
-            "discarded": w.discarded,
-            "rings": dict(w.rings),
-            "bursts": {f"{n}/{i}": {"burst": b, "window": windows[n, i]} for (n, i), b in w.bursts.items()},
-            "bytes_per_copy": sum(x.size * x.dtype.itemsize for x in jax.tree_util.tree_leaves(shapes)),
-        }
+        return report_of(self.walk, jax.eval_shape(self.init, jax.random.key(0)))
 
     def _run_row(self, gs: GraphState, inside: bool) -> tuple[GraphState, dict[str, list[Rollout]]]:
         outputs: dict[str, list[Rollout]] = {}

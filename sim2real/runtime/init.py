@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.collection import by_name, check_senders
-from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, phase_ticks
 from sim2real.graph.rules import waits_for_schedule
+from sim2real.runtime.bounds import DelayBounds, bounds_of
 
 OUTPUTS = "outputs"
 """Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""
@@ -47,6 +47,7 @@ def init_graph_state(
     rng: jax.Array,
     params: Mapping[str, Any] | None = None,
     order: Sequence[str] | None = None,
+    bounds: DelayBounds | None = None,
 ) -> GraphState:
     """Return the state in which a graph starts; a pure function that can be traced and mapped.
 
@@ -60,6 +61,7 @@ def init_graph_state(
         rng: A JAX key.
         params: Parameters that are used as given; for nodes without an entry ``init_params`` is called.
         order: Names of nodes that are initialised first; then comes the supervisor, then the others.
+        bounds: Those of the trainable delays; None: as the connections have them.
 
     Raises:
         UsageError: When ``supervisor``, ``params`` or ``order`` names an unknown node.
@@ -83,7 +85,7 @@ def init_graph_state(
         state = state.replace(state={**state.state, n: made})
     outputs = {n: jax.tree_util.tree_map(_strong, nodes[n].init_output(keys[n][3], state)) for n in names}
     state = state.replace(aux={**state.aux, OUTPUTS: outputs})
-    return state.replace(delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state))})
+    return state.replace(delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state, bounds))})
 
 
 def default_output(graph_state: GraphState, node: str) -> Any:
@@ -104,13 +106,12 @@ def _order(
     return list(dict.fromkeys([*order, supervisor, *nodes]))
 
 
-def _delays(node: BaseNode, key: jax.Array, state: GraphState) -> dict[str, TrainableDist]:
+def _delays(node: BaseNode, key: jax.Array, state: GraphState, bounds: DelayBounds | None) -> dict[str, Any]:
     """Return the distributions of a node's trainable inputs, at the delays that ``init_delays`` gives."""
-    trainable = {n: c.delay_dist for n, c in node.inputs.items() if isinstance(c.delay_dist, TrainableDist)}
-    if not trainable:
-        return {}
-    given = node.init_delays(key, state)
-    return {n: dist.with_delay(given[n]) if n in given else dist for n, dist in trainable.items()}
+    own = (bounds or bounds_of({node.name: node})).get(node.name, {})
+    given = node.init_delays(key, state) if own else {}
+    dists: dict[str, Any] = {n: c.delay_dist for n, c in node.inputs.items()}
+    return {n: b.at(dists[n], given.get(n)) for n, b in own.items()}
 
 
 def _fixed(node: BaseNode, tree: T) -> T:

@@ -35,6 +35,8 @@ class Placement:
         row: Each step's row; steps with a row after the last one are not computed.
         slot: Each step's slot in its row.
         slots: The node of each slot, in the order in which slots run.
+        offsets: Number of the row's ticks before each slot: 0, except in a pattern (``pattern.py``).
+        last: Number of ticks in the last row.
     """
 
     ticks: int
@@ -42,6 +44,8 @@ class Placement:
     row: Steps
     slot: Steps
     slots: tuple[str, ...]
+    offsets: tuple[int, ...]
+    last: int
 
 
 class Placer:
@@ -80,7 +84,7 @@ class Placer:
         """
         if self.world is None:
             row = self._rows_of_supervisor()
-            placement = self._fill(1, int(self.timeline.vertices[self.supervisor].count.min()), row)
+            placement = self.fill(1, int(self.timeline.vertices[self.supervisor].count.min()), row)
         else:
             placement = self._cheapest(int(self.timeline.vertices[self.world].count.min()))
         if placement.rows < 1:
@@ -111,23 +115,37 @@ class Placer:
         """
         rate = self.nodes[self.world or ""].rate
         most = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
-        lowest = self._earliest()
-        highest = self._latest(lowest, 2 * most)
+        lowest, highest = self.slack(2 * most)
         found = []
         for n in range(most, 0, -1):
             if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self.valid(o)].all() for o in self.others):
                 continue
-            found.append(self._fill(n, world_ticks // n, self._rows(lowest, highest, n)))
+            found.append(self.fill(n, world_ticks // n, self._rows(lowest, highest, n)))
         if not found:
             raise UsageError("these timelines have no tick of the world", hint="draw longer timelines")
         return min(found, key=lambda p: (p.slots.count(self.supervisor), len(p.slots) / p.ticks))
 
-    def _fill(self, ticks: int, rows: int, row: Steps) -> Placement:
-        """Return the placement for given rows of the steps; steps after the last row need no slot."""
+    def slack(self, most: int) -> tuple[Steps, Steps]:
+        """Return the earliest and the latest tick before which each step can be computed.
+
+        Args:
+            most: Largest number of ticks from a step's start to the latest.
+        """
+        lowest = self._earliest()
+        return lowest, self._latest(lowest, most)
+
+    def fill(self, ticks: int, rows: int, row: Steps) -> Placement:
+        """Return the placement for given rows of the steps; steps after the last row need no slot.
+
+        Args:
+            ticks: Number of world ticks in a row.
+            rows: Number of rows.
+            row: Each step's row.
+        """
         counted = {n: self.valid(n) & (row[n] < rows) for n in self.others}
         heard = [Heard(n, e.sender, at) for n, e, at in self.live() if self.world not in (n, e.sender)]
         slots, slot = arrange(self.supervisor, rows, {n: row[n] for n in self.others}, counted, heard)
-        return Placement(ticks, rows, row, slot, slots)
+        return Placement(ticks, rows, row, slot, slots, (0,) * len(slots), ticks)
 
     def _earliest(self) -> Steps:
         """Return the earliest boundary for each step, in ticks: the number of ticks that it depends on.
@@ -141,7 +159,7 @@ class Placer:
             for reader, edge, newest in self.live():
                 if reader == self.world:
                     continue
-                bound = newest + 1 if edge.sender == self.world else _heard(earliest[edge.sender], newest)
+                bound = newest + 1 if edge.sender == self.world else get_heard(earliest[edge.sender], newest)
                 new = np.maximum.accumulate(np.maximum(earliest[reader], bound), axis=1)
                 changed |= bool((new != earliest[reader]).any())
                 earliest[reader] = new
@@ -182,7 +200,7 @@ class Placer:
                 row = rows[name]
                 for reader, edge, newest in self.live():
                     if reader == name and edge.sender != self.world:
-                        row = np.maximum(row, _heard(rows[edge.sender], newest))
+                        row = np.maximum(row, get_heard(rows[edge.sender], newest))
                 step = self.steps(name)
                 spread = np.maximum.accumulate(row - step, axis=1) + step
                 row = np.maximum(row, np.minimum(spread, highest[name] // n))
@@ -201,13 +219,13 @@ class Placer:
             for reader, edge, newest in self.live():
                 if reader == self.supervisor:
                     continue
-                new = np.maximum.accumulate(np.maximum(rows[reader], _heard(rows[edge.sender], newest)), axis=1)
+                new = np.maximum.accumulate(np.maximum(rows[reader], get_heard(rows[edge.sender], newest)), axis=1)
                 changed |= bool((new != rows[reader]).any())
                 rows[reader] = new
         return {n: rows[n] for n in self.others}
 
 
-def _heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:
+def get_heard(of_sender: np.ndarray, newest: np.ndarray) -> np.ndarray:
     """Look up a value of the sender's step that made the newest message of each reader's step; 0 without a message.
 
     ``of_sender`` has a value for each step of the sender.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.runtime.bounds import DelayBounds, bounds_of
 from sim2real.runtime.match import check_match, matched
 from sim2real.runtime.wiring import SlotTable, Wiring
 
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+Ages = tuple[int, int]
+"""Smallest and largest age of an input's newest message, counted in the sender's outputs."""
 
 
 class Rollout(NamedTuple):
@@ -40,21 +45,45 @@ class RowProgram:
         wiring: The tables.
         given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
         episodes: Number of episodes E.
+        ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
+            the sender's ring has.
+        reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
 
     Attributes:
         replayed: The world's messages where its ticks were run elsewhere, leaves ``(1 + ticks, ...)``: the default
             output, then those of its ticks; None where it runs here.
     """
 
-    def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, given: Mapping[str, Any], episodes: int) -> None:
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        wiring: Wiring,
+        given: Mapping[str, Any],
+        episodes: int,
+        ages: Sequence[Mapping[str, Ages]] | None = None,
+        reusable: bool = False,
+    ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
+        self.bounds: DelayBounds = bounds_of(nodes)
         self.replayed: Any = None
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
-        self._always = [bool((t.seq >= 0).all()) for t in wiring.tables]
+        self._always = [bool((t.seq >= 0).all()) and not reusable for t in wiring.tables]
+        self._ages = ages or [{} for _ in wiring.tables]
+
+    @property
+    def data(self) -> Any:
+        """The tables, and the bounds of trainable delays; see ``HoldsData``."""
+        return self._tables, self._world, self.bounds
+
+    def with_data(self, nodes: Mapping[str, BaseNode], data: Any) -> RowProgram:
+        """Return the program with other nodes and data, which may be traced."""
+        program = copy.copy(self)
+        program.nodes, (program._tables, program._world, program.bounds) = nodes, data
+        return program
 
     def check_given(self, outputs: Mapping[str, Any]) -> None:
         """Check that recorded outputs have the form of their nodes' default outputs."""
@@ -67,7 +96,13 @@ class RowProgram:
         return self._always[slot]
 
     def run_slots(
-        self, gs: GraphState, begin: int, end: int, outputs: dict[str, list[Rollout]], inside: bool = False
+        self,
+        gs: GraphState,
+        begin: int,
+        end: int,
+        outputs: dict[str, list[Rollout]],
+        inside: bool = False,
+        full: bool = False,
     ) -> GraphState:
         """Run some slots of the row; after the last row nothing changes.
 
@@ -77,12 +112,13 @@ class RowProgram:
             end: Slot after the last.
             outputs: Node -> its steps; those of these slots are appended.
             inside: Promise that this is not after the last row, which saves masking every update.
+            full: Promise that each of the slots makes a step.
         """
         for i in range(begin, end):
             name = self.wiring.slots[i]
             step_state = self.step_state(gs, i, inside)
             new, output = self.call(name, step_state)
-            ran = None if inside and self._always[i] else step_state.seq >= 0
+            ran = None if full or (inside and self._always[i]) else step_state.seq >= 0
             gs = self.commit(gs, name, new, output, ran)
             outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
         return gs
@@ -97,16 +133,10 @@ class RowProgram:
         """
         name, before, here = self.wiring.world, gs, None if inside else gs.step < self.wiring.rows
         if name is not None:
-
-            def tick(gs: GraphState, now: dict[str, Any]) -> tuple[GraphState, Rollout]:
-                step_state = self._step_state(gs, name, now)
-                new, output = self.call(name, step_state)
-                return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
-
             # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
             # worlds compile in half the time.
             unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
-            gs, made = jax.lax.scan(tick, gs, _at(self._world, gs), unroll=unroll)
+            gs, made = jax.lax.scan(partial(self.run_tick, name), gs, self.world_row(gs), unroll=unroll)
             if here is not None:
                 made = made._replace(seq=jnp.where(here, made.seq, -1))
             outputs.setdefault(name, []).extend(
@@ -115,12 +145,31 @@ class RowProgram:
         gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
+    def world_row(self, gs: GraphState) -> Any:
+        """Return the entries of the world's table for a row, leaves ``(ticks, ...)``."""
+        return _at(self._world, gs)
+
+    def run_tick(
+        self, name: str, gs: GraphState, now: Mapping[str, Any], ages: Mapping[str, Ages] | None = None
+    ) -> tuple[GraphState, Rollout]:
+        """Run one tick of the world.
+
+        Args:
+            name: The world's name.
+            gs: The graph's state.
+            now: The tick's entries of ``world_row``.
+            ages: As for slots.
+        """
+        step_state = self._step_state(gs, name, now, ages or {})
+        new, output = self.call(name, step_state)
+        return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
+
     def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
         """Run the world's ticks of a whole episode by another function; see ``CompiledGraph.drive``."""
         world: Any = self.wiring.world
         flat = lambda t: t[:, gs.eps].reshape(-1, *t.shape[3:])  # noqa: E731 - (R, E, ticks, ...) -> (R * ticks, ...)
         # What a tick hears does not depend on the ticks before it: looked up for all of them at once.
-        seen = jax.vmap(lambda now: self._step_state(gs, world, now))(jax.tree_util.tree_map(flat, self._world))
+        seen = jax.vmap(lambda now: self._step_state(gs, world, now, {}))(jax.tree_util.tree_map(flat, self._world))
 
         def tick(state: Any, now: tuple[dict[str, InputState], Number, Number]) -> tuple[Any, T]:
             inputs, seq, ts = now
@@ -148,7 +197,7 @@ class RowProgram:
         table = _at(self._tables[slot], gs)
         if not inside:
             table["seq"] = self.seq(gs, slot)
-        return self._step_state(gs, self.wiring.slots[slot], table)
+        return self._step_state(gs, self.wiring.slots[slot], table, self._ages[slot])
 
     def seq(self, gs: GraphState, slot: int) -> jax.Array:
         """Return the number of the step that a slot makes; -1 if it makes none, and after the last row."""
@@ -185,7 +234,7 @@ class RowProgram:
             changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, kept)}
         return gs.replace(**changed)
 
-    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any]) -> StepState:
+    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any], ages: Mapping[str, Ages]) -> StepState:
         inputs = {}
         for input_name, t in table["inputs"].items():
             connection = self.nodes[name].inputs[input_name]
@@ -196,12 +245,14 @@ class RowProgram:
             elif self.replayed is not None and sender == self.wiring.world:
                 data = jax.tree_util.tree_map(lambda leaf, seq=t["seq"]: leaf[jnp.maximum(seq, -1) + 1], self.replayed)
             else:
-                data = _window(gs.buffer[sender], age, width)
+                kept = gs.buffer[sender]
+                data = _window(kept, age, width, *ages.get(input_name, (0, len(kept) - width)))
             dist = gs.delays.get(name, {}).get(input_name)
             state = InputState(t["seq"], t["sent"], t["received"], data)
             if dist is not None:
                 period = 1.0 / self.nodes[name].rate
-                served = dist.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
+                own = self.bounds[name][input_name].opened(dist)
+                served = own.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
                 state = served.replace(delay_dist=dist)
             inputs[input_name] = state
         rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
@@ -217,17 +268,48 @@ class RowProgram:
         return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
 
 
-def _window(kept: tuple[T, ...], age: jax.Array, width: int) -> T:
+def _window(kept: tuple[T, ...], age: jax.Array, width: int, least: int, most: int) -> T:
     """Return a window of ``width`` of a node's last outputs, oldest first; ``age`` newer ones are left out.
 
-    The outputs are kept as separate arrays and chosen by selects, which XLA fuses with other elementwise operations.
-    One stacked array would cost a GPU a concatenation, a copy and a gather per leaf.
+    ``age`` is from ``least`` to ``most``. The outputs are kept as separate arrays and chosen by selects, which XLA
+    fuses with other elementwise operations. One stacked array would cost a GPU a concatenation, a copy and a gather per
+    leaf.
     """
-    spare = len(kept) - width
-    window = list(kept[spare:])
-    for a in range(1, spare + 1):
-        window = [select(age == a, kept[spare - a + i], window[i]) for i in range(width)]
+    begin = len(kept) - width
+    window = list(kept[begin - least : len(kept) - least])
+    for a in range(least + 1, most + 1):
+        window = [select(age == a, kept[begin - a + i], window[i]) for i in range(width)]
     return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
+
+
+def scan_rows(
+    row: Callable[[GraphState], tuple[GraphState, dict[str, list[Rollout]]]],
+    gs: GraphState,
+    record: Sequence[str],
+    rows: int,
+    unroll: int,
+) -> tuple[GraphState, dict[str, Rollout]]:
+    """Run a number of rows in a loop.
+
+    Args:
+        row: Runs one row: state -> (state, node -> its steps).
+        gs: The graph's state.
+        record: Nodes whose outputs are returned.
+        rows: Number of rows.
+        unroll: Rows in one pass of the loop.
+
+    Returns:
+        The last state, and the records by node.
+    """
+
+    def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
+        state, outputs = row(state)
+        kept = {n: outputs.get(n, []) for n in record}
+        return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
+
+    gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
+    merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
+    return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
 
 def select(mask: Number, new: T, old: T) -> T:
@@ -247,6 +329,11 @@ def select(mask: Number, new: T, old: T) -> T:
         return b.where(mask, a) if _is_mjx_data(b) else jnp.where(mask, a, b)
 
     return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
+
+
+def has_mjx_data(tree: Any) -> bool:
+    """Return whether a state of MJX is among the leaves of a tree."""
+    return any(_is_mjx_data(leaf) for leaf in jax.tree_util.tree_leaves(tree, is_leaf=_is_mjx_data))
 
 
 def _is_mjx_data(leaf: object) -> bool:

@@ -71,11 +71,17 @@ def interpret(
             rings[name] = [*rings[name][1:], (seq, output)]
 
     for row in range(wiring.rows):
-        for name, table in zip(wiring.slots, wiring.tables, strict=True):
-            one(name, table, (episode, row))
-        if wiring.world is not None and wiring.world_table is not None:
-            for tick in range(wiring.ticks):
-                one(wiring.world, wiring.world_table, (episode, row, tick))
+        last = wiring.last if row == wiring.rows - 1 else wiring.ticks
+        done = 0
+        for name, table, offset in zip(
+            (*wiring.slots, ""), (*wiring.tables, None), (*wiring.offsets, wiring.ticks), strict=True
+        ):
+            if wiring.world is not None and wiring.world_table is not None:
+                for tick in range(done, min(offset, last)):
+                    one(wiring.world, wiring.world_table, (episode, row, tick))
+            done = max(done, min(offset, last))
+            if table is not None:
+                one(name, table, (episode, row))
     return made
 
 

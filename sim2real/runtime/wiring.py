@@ -1,8 +1,8 @@
 """Turns timelines into index tables: which step each slot of each row computes, and which messages the step reads.
 
-A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks;
-``placement.py`` decides which step is computed where. Pure numpy, before anything is compiled;
-``sim2real.runtime.testing`` interprets the tables for tests.
+A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks. In a
+pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` decides which step is computed where. Pure
+numpy, before anything is compiled; ``sim2real.runtime.testing`` interprets the tables for tests.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER, Vertex, search_rows
 from sim2real.graph.windows import check_bursts, longest_burst
+from sim2real.runtime.pattern import find_pattern
 from sim2real.runtime.placement import Placement, Placer
 
 EMPTY_AGE_S = 1e6
@@ -71,6 +72,8 @@ class Wiring:
         rings: Node -> how many of its last outputs are kept.
         discarded: Fraction of the slots, over all rows, that compute no step.
         bursts: (node, input) -> the most messages that one step consumes, the first step left out.
+        offsets: Number of the row's ticks before each slot.
+        last: Number of ticks in the last row.
     """
 
     world: str | None
@@ -82,10 +85,31 @@ class Wiring:
     rings: Mapping[str, int]
     discarded: float
     bursts: Mapping[tuple[str, str], int]
+    offsets: tuple[int, ...]
+    last: int
+
+    @property
+    def total(self) -> int:
+        """Number of world ticks in an episode."""
+        return (self.rows - 1) * self.ticks + self.last
+
+    @property
+    def full(self) -> tuple[int, int]:
+        """The longest range of whole rows, begin and end, in which each slot makes a step in all episodes."""
+        gaps = np.any([(t.seq < 0).any(axis=0) for t in self.tables], axis=0)
+        gaps[-1] |= self.last < self.ticks
+        ends = np.flatnonzero([*gaps, True])
+        begins = np.concatenate([[0], ends[:-1] + 1])
+        i = int(np.argmax(ends - begins))
+        return int(begins[i]), int(ends[i])
 
 
 def wire(
-    nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, given: frozenset[str] = frozenset()
+    nodes: Mapping[str, BaseNode],
+    supervisor: str,
+    timeline: Timeline,
+    given: frozenset[str] = frozenset(),
+    reusable: bool = False,
 ) -> Wiring:
     """Turn timelines into index tables.
 
@@ -94,6 +118,8 @@ def wire(
         supervisor: The supervisor's name; a row is at most as long as its period.
         timeline: The timelines.
         given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
+        reusable: Whether rings are made longer than these timelines need, so that most timelines of a robot have rings
+            of the same lengths.
 
     Raises:
         UsageError: When the supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
@@ -103,16 +129,30 @@ def wire(
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
     check_bursts(nodes, timeline)
     placer = Placer(nodes, supervisor, timeline, given)
-    return _Tables(placer, placer.place()).wiring()
+    return _Tables(placer, placer.place(), reusable).wiring()
+
+
+def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> Wiring | None:
+    """Turn timelines into index tables whose rows are patterns; None if they have no pattern.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name.
+        timeline: The timelines.
+    """
+    placer = Placer(nodes, supervisor, timeline, frozenset())
+    placement = find_pattern(placer)
+    return None if placement is None else _Tables(placer, placement).wiring()
 
 
 class _Tables:
     """Makes the tables of one placement."""
 
-    def __init__(self, placer: Placer, placement: Placement) -> None:
-        self.placer, self.placement = placer, placement
+    def __init__(self, placer: Placer, placement: Placement, reusable: bool = False) -> None:
+        self.placer, self.placement, self.reusable = placer, placement, reusable
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
+        self.total = (placement.rows - 1) * placement.ticks + placement.last
         # When the program computes each step, as a number that increases with row and slot.
         self.done = {
             n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
@@ -135,6 +175,8 @@ class _Tables:
             rings=self._rings(names, tables, world_table),
             discarded=1.0 - float(np.mean(ran)) if ran else 0.0,
             bursts={k: longest_burst(e, self.timeline.vertices[k[0]]) for k, e in self.placer.edges.items()},
+            offsets=self.placement.offsets,
+            last=self.placement.last,
         )
 
     def _moment(self, row: np.ndarray, slot: np.ndarray | int) -> np.ndarray:
@@ -146,14 +188,18 @@ class _Tables:
         e, k = np.nonzero((slots == slot) & (rows < self.rows) & self.placer.valid(name))
         seq[e, rows[e, k]] = k
         row = np.arange(self.rows, dtype=np.int64)
-        return self._table(name, seq, self._moment(row, slot), row * self.ticks)
+        # In the last row, which may have fewer ticks, the slots behind its last tick run too.
+        ticks = np.minimum(row * self.ticks + self.placement.offsets[slot], self.total)
+        return self._table(name, seq, self._moment(row, slot), ticks)
 
     def _world_table(self) -> SlotTable:
         world = self.world or ""
         episodes = self.timeline.episodes
-        tick = np.arange(self.rows * self.ticks, dtype=np.int64)
+        # The last row's table is as long as the others', also where the row has fewer ticks.
+        tick = np.minimum(np.arange(self.rows * self.ticks, dtype=np.int64), self.total - 1)
+        before = np.searchsorted(self.placement.offsets, tick % self.ticks, side="right")
+        after = self._moment(tick // self.ticks, before)  # the slots before this tick are done
         seq = np.broadcast_to(tick, (episodes, tick.size))
-        after = self._moment(tick // self.ticks, len(self.placement.slots))  # the whole boundary is done
         flat = self._table(world, seq, after, tick)
         split = lambda a: a.reshape(episodes, self.rows, self.ticks, *a.shape[2:])  # noqa: E731
         inputs = {
@@ -224,5 +270,8 @@ class _Tables:
                 sender = connection.output_node.name
                 if sender in self.placer.given:
                     continue
-                rings[sender] = max(rings[sender], int(t.age.max(initial=0)) + connection.total_window)
+                room = int(t.age.max(initial=0))
+                if self.reusable and room:  # 2, 4, 8 ...
+                    room = max(2, 1 << (room - 1).bit_length())
+                rings[sender] = max(rings[sender], room + connection.total_window)
         return rings

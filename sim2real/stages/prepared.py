@@ -101,7 +101,7 @@ def prepare(
         recorded.transport_to(nodes)
     noise = _disturb(nodes[robot.roles.sensor], found, config)
     drawn = draw_timelines(nodes, robot.roles.supervisor, config.episode_s, config.timelines, config.seed, recorded)
-    graph = CompiledGraph(nodes, robot.roles.supervisor, drawn.timeline)
+    graph = CompiledGraph(nodes, robot.roles.supervisor, drawn.timeline, reusable=True)
     _move_start(task, config)
     pushes = Pushes.of(config.vary, nodes[robot.roles.world], robot.rate_hz)
     env = GraphEnvironment(graph, task, drawn.steps, pushes, config.vary.curriculum if config.vary.grows else None)

@@ -56,7 +56,8 @@ class TrainingIdentity:
     Attributes:
         config: The settings by name.
         key: The source of randomness.
-        program: Digest of the program: it has the environment, its timing, and the versions of code and compiler.
+        program: Digest of the program and the environment's data: they have its timing, and the versions of code and
+            compiler.
     """
 
     config: Mapping[str, Any]
@@ -64,7 +65,7 @@ class TrainingIdentity:
     program: str
 
     @staticmethod
-    def of(config: PPOConfig, key: jax.Array, lowered: Any, sweep: Sweep) -> TrainingIdentity:
+    def of(config: PPOConfig, key: jax.Array, lowered: Any, sweep: Sweep, data: Any) -> TrainingIdentity:
         """Describe a training.
 
         Args:
@@ -72,12 +73,15 @@ class TrainingIdentity:
             key: Its source of randomness.
             lowered: Its program, traced.
             sweep: The settings that are swept.
+            data: The environment's data, arrays.
         """
         settings = {n: v for n, v in dataclasses.asdict(config).items() if n not in _MAY_DIFFER}
         settings |= {"sweep": dict(sweep.values)}
-        digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()
+        digest = hashlib.sha256(lowered.as_text().encode())
+        for leaf in jax.tree.leaves(data):
+            digest.update(np.asarray(leaf).tobytes())
         plain = json.loads(json.dumps(settings))  # as a file has them: lists for tuples
-        return TrainingIdentity(plain, np.asarray(jax.random.key_data(key)).tolist(), digest)
+        return TrainingIdentity(plain, np.asarray(jax.random.key_data(key)).tolist(), digest.hexdigest())
 
     def said(self) -> dict[str, Any]:
         """Return what it consists of, settings one by one."""

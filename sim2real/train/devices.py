@@ -59,16 +59,24 @@ def place(state: T, layout: Shardings | None) -> T:
         state: The state, in this process's memory.
         layout: Where its arrays go; None: where they are.
     """
-    if layout is None:
-        return state
+    return state if layout is None else jax.tree.map(_put, state, layout.state)
 
-    def put(leaf: Any, where: NamedSharding) -> jax.Array:
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(put(jax.random.key_data(leaf), where), impl=jax.random.key_impl(leaf))
-        array = np.asarray(leaf)
-        return jax.make_array_from_callback(array.shape, where, lambda index: array[index])
 
-    return jax.tree.map(put, state, layout.state)
+def whole(tree: T, layout: Shardings | None) -> T:
+    """Return arrays of which all devices have a copy.
+
+    Args:
+        tree: The arrays, in this process's memory.
+        layout: Where they go; None: to the one device.
+    """
+    return jax.tree.map(jnp.asarray if layout is None else lambda leaf: _put(leaf, layout.whole), tree)
+
+
+def _put(leaf: Any, where: NamedSharding) -> jax.Array:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), where), impl=jax.random.key_impl(leaf))
+    array = np.asarray(leaf)
+    return jax.make_array_from_callback(array.shape, where, lambda index: array[index])
 
 
 def gather(state: T, layout: Shardings | None) -> T:

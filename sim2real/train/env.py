@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.held import data_of, with_data
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.train.protocol import Step
 from sim2real.train.pushes import Pushes
@@ -133,14 +135,25 @@ class GraphEnvironment:
         # The row of an episode's last step is not played: what the policy sees there is the final observation.
         counts = graph.timeline.vertices[graph.supervisor].count if steps is None else steps
         self._last = jnp.asarray(graph.last_row(np.asarray(counts)), jnp.int32)
+        self._data: Any = None
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
-        self._start, self.step = jax.jit(self._reset), jax.jit(self._step)
+        self._start, self._play = jax.jit(self._reset), jax.jit(self._step)
         # Worlds of composed tasks have a method `ends`. Looked up by name: importing their class would import MuJoCo.
         found: dict[str, Callable[[Any], tuple[jax.Array, jax.Array]] | None] = {
             name: getattr(node, "ends", None) for name, node in graph.nodes.items()
         }
         self._ending = {name: ends for name, ends in found.items() if ends is not None}
-        self._terminated = task.terminated if isinstance(task, EndingTask) else None
+
+    @property
+    def data(self) -> Any:
+        """The numbers that follow from recordings: graph's, task's, and when episodes end; see ``HoldsData``."""
+        return (self.graph.data, data_of(self.task), self._last) if self._data is None else self._data
+
+    def with_data(self, data: Any) -> GraphEnvironment:
+        """Return a copy with other data, which may be traced."""
+        env = copy.copy(self)
+        env._data = data
+        return env
 
     def privileged(self, state: EnvState) -> jax.Array:
         """Return what is true in a state, shape ``(P,)``.
@@ -157,47 +170,57 @@ class GraphEnvironment:
 
     def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode on a random timeline; with a curriculum, one with as many differences as at its end."""
-        return self._start(key, None if self.curriculum is None else jnp.float32(self.curriculum[1]))
+        return self._start(self.data, key, None if self.curriculum is None else jnp.float32(self.curriculum[1]))
 
     def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[EnvState, jax.Array]:
         """Start an episode that differs from others by a share, shape ``()``, of what it might."""
-        return self._start(key, width)
+        return self._start(self.data, key, width)
 
-    def _reset(self, key: jax.Array, width: jax.Array | None) -> tuple[EnvState, jax.Array]:
+    def step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
+        """Make the supervisor's step with the policy's action, then run the graph up to its next step.
+
+        Args:
+            state: What ``reset`` or ``step`` returned.
+            action: Shape ``(A,)``.
+            key: JAX key of the row's pushes.
+        """
+        return self._play(self.data, state, action, key)
+
+    def _reset(self, data: Any, key: jax.Array, width: jax.Array | None) -> tuple[EnvState, jax.Array]:
+        graph, task = self.graph.with_data(data[0]), with_data(self.task, data[1])
         k_eps, k_params, k_init = jax.random.split(key, 3)
-        eps = jax.random.randint(k_eps, (), 0, self.graph.episodes)
-        task = self.task
+        eps = jax.random.randint(k_eps, (), 0, graph.episodes)
         if width is not None and isinstance(task, WideningTask):
             params = task.params_at(k_params, width)
         else:
             params = task.params(k_params)
-        gs = self.graph.init(k_init, params=params, eps=eps)
-        gs, step_state, _ = self.graph.observe(gs, inside=True)
-        terms = terms_of(jax.eval_shape(self.task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
+        gs = graph.init(k_init, params=params, eps=eps)
+        gs, step_state, _ = graph.observe(gs, inside=True)
+        terms = terms_of(jax.eval_shape(task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
         zero = jnp.float32(0.0)
         state = EnvState(gs, step_state, zero, {n: zero for n in terms}, zero, width)
-        return state, self.task.observe(step_state)
+        return state, task.observe(step_state)
 
-    def _step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
-        """Make the supervisor's step with the policy's action, then run the graph up to its next step."""
+    def _step(self, data: Any, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
+        graph, task = self.graph.with_data(data[0]), with_data(self.task, data[1])
         valid: Any = state.step_state.seq >= 0
-        step_state, output = self.task.act(state.step_state, action)
-        gs = self.graph.advance(state.graph, step_state, output, inside=True)
-        made = self.task.reward(gs, action)
+        step_state, output = task.act(state.step_state, action)
+        gs = graph.advance(state.graph, step_state, output, inside=True)
+        made = task.reward(gs, action)
         reward = total_of(made)
-        last = self._last[gs.eps]
+        last = data[2][gs.eps]
         second_half = gs.step > last // 2
-        good = state.good + jnp.where(second_half & self.task.success(gs), 1.0, 0.0)
+        good = state.good + jnp.where(second_half & task.success(gs), 1.0, 0.0)
         total = state.total + reward
         terms = {name: state.terms[name] + term for name, term in terms_of(made).items()}
         ended = [ends(gs.state[name]) for name, ends in self._ending.items()]
-        fallen = [] if self._terminated is None else [checked_end(self._terminated(gs), self.task)]
+        fallen = [checked_end(task.terminated(gs), task)] if isinstance(task, EndingTask) else []
         terminated = jnp.any(jnp.array([e[0] for e in ended] + fallen, bool))
         truncated: Any = (gs.step >= last) | jnp.any(jnp.array([e[1] for e in ended], bool))
         if self.pushes is not None:
             gs = self.pushes.apply(gs, key, state.width)
-        gs, step_state, _ = self.graph.observe(gs, inside=True)
+        gs, step_state, _ = graph.observe(gs, inside=True)
         metrics = {"return": total, "success": good / (last - last // 2)}
         metrics |= {f"{REWARD}{name}": term for name, term in terms.items()}
         new = EnvState(gs, step_state, total, terms, good, state.width)
-        return Step(new, self.task.observe(step_state), reward, terminated, truncated, valid, metrics)
+        return Step(new, task.observe(step_state), reward, terminated, truncated, valid, metrics)

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.held import data_of, with_data
 from sim2real.train.architectures import Factory
 from sim2real.train.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.checks import FINITE, check_values
 from sim2real.train.compilation import compile_lowered, small_random_numbers
 from sim2real.train.config import PPOConfig as PPOConfig
-from sim2real.train.devices import Shardings, gather, place, shardings_of
+from sim2real.train.devices import Shardings, gather, place, shardings_of, whole
 from sim2real.train.networks import Policy
 from sim2real.train.processes import agree, leads
 from sim2real.train.protocol import TrainingEnvironment, check_environment, get_width, metric_names
@@ -86,16 +87,18 @@ def train(
     shared = with_numbers(config, {"num_seeds": config.num_seeds * len(sweep.grid)})
     layout = shardings_of(state, shared)
     state = place(state, layout)
-    lowered = _lowered(env, shared, networks, state, numbers, layout)
+    # What follows from recordings is an argument: a training after another recording finds its program in the cache.
+    data = whole(data_of(env), layout)
+    lowered = _lowered(env, shared, networks, (state, numbers, data), layout)
     now = Checkpoint(state, None, None, [])
-    identity = TrainingIdentity.of(config, key, lowered, sweep) if checkpoint or resume or layout else None
+    identity = TrainingIdentity.of(config, key, lowered, sweep, data) if checkpoint or resume or layout else None
     if identity:
         agree({**identity.said(), "saves": checkpoint is not None, "resumes": resume is not None})
     if resume and identity:
         now = _resumed(resume, identity, state, lowered, layout)
     first, before_s = len(now.log), now.log[-1].elapsed_s if now.log else 0.0
     names = sweep.names(config.num_seeds)
-    epoch = partial(_advance, compile_lowered(lowered), numbers, config, names, before_s - start)
+    epoch = partial(_advance, compile_lowered(lowered), (numbers, data), config, names, before_s - start)
     compiled = time.perf_counter()
     report = on_progress or (lambda _: None)
     for progress in now.log:
@@ -114,14 +117,16 @@ def _lowered(
     env: TrainingEnvironment,
     config: PPOConfig,
     networks: ActorCritic,
-    state: TrainState,
-    numbers: dict[str, Any],
+    arguments: tuple[TrainState, dict[str, Any], Any],
     layout: Shardings | None,
 ) -> Any:
-    one = jax.vmap(lambda state, numbers: _epoch(env, with_numbers(config, numbers), networks, state))
+    def one(state: TrainState, numbers: dict[str, Any], data: Any) -> Any:
+        return _epoch(with_data(env, data), with_numbers(config, numbers), networks, state)
+
     where = layout and (layout.state, layout.whole, layout.whole)
     with small_random_numbers():
-        return jax.jit(one, donate_argnums=0, out_shardings=where).lower(state, numbers)
+        program = jax.jit(jax.vmap(one, in_axes=(0, 0, None)), donate_argnums=0, out_shardings=where)
+        return program.lower(*arguments)
 
 
 def _resumed(
@@ -140,7 +145,7 @@ def _save(path: Path, identity: TrainingIdentity, now: Checkpoint, layout: Shard
 
 def _advance(
     program: Callable[..., Any],
-    numbers: dict[str, np.ndarray],
+    arguments: tuple[dict[str, np.ndarray], Any],
     config: PPOConfig,
     names: list[str],
     offset_s: float,
@@ -150,13 +155,13 @@ def _advance(
 
     Args:
         program: What ``_epoch`` was compiled to.
-        numbers: Its settings that are swept.
+        arguments: Its settings that are swept, and the environment's data.
         config: All settings.
         names: Who is who on the leading axis.
         offset_s: Turns the clock into the time that training took so far.
         now: The training before.
     """
-    state, policies, values = program(now.state, numbers)
+    state, policies, values = program(now.state, *arguments)
     policies, values = jax.device_get((policies, values))
     count = len(now.log) + 1
     env_steps = count * config.updates_per_evaluation * config.steps_per_update

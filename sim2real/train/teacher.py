@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.graph.held import data_of, with_data
 from sim2real.train.architectures import is_recurrent
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks import Policy
@@ -31,6 +33,18 @@ class TeacherEnvironment:
         self.observation_size = env.observation_size + self.privileged_size
         self.action_low, self.action_high = env.action_low, env.action_high
         self.curriculum = env.curriculum if isinstance(env, WideningEnvironment) else None
+
+    @property
+    def data(self) -> Any:
+        """The environment's data; see ``HoldsData``."""
+        return data_of(self._env)
+
+    def with_data(self, data: Any) -> TeacherEnvironment:
+        """Return a copy of the environment with other data, which may be traced."""
+        env = copy.copy(self)
+        env._env = with_data(self._env, data)
+        env._knows = sees_more(env._env)
+        return env
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         """Return the state at the start of an episode and the first observation."""

@@ -20,6 +20,8 @@ from sim2real.runtime.compiled import CompiledGraph
 
 KEY = jax.random.key(0)
 DURATION_S = 0.45
+PATTERNS = (34, 37, 57)
+"""Seeds of random graphs whose timelines repeat a pattern."""
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,58 @@ def test_floats_that_contract_agree_to_1e_6(topology):
     for name in nodes:
         got = by_seq(records[name]).x
         np.testing.assert_allclose(got, episode.outputs[name]["x"][: len(got)], rtol=1e-6, atol=1e-6)
+
+
+# Patterns of ticks and steps
+
+
+def without_pattern(graph):
+    rows = CompiledGraph(graph.nodes, graph.supervisor, graph.timeline)
+    rows.repetition = None
+    return rows
+
+
+@pytest.mark.parametrize("topology", [topologies.three_in_ten, topologies.two_in_five], ids=lambda t: t.__name__)
+def test_a_pattern_of_ticks_and_steps_equals_rows(topology, compiled):
+    graph = compiled(topology)
+    check_pattern(graph)
+
+
+@pytest.mark.parametrize("seed", PATTERNS)
+def test_a_random_pattern_equals_rows(seed):
+    nodes, supervisor = topologies.random_pattern(seed, jax_hash_node)
+    check_pattern(CompiledGraph(nodes, supervisor, draw(nodes, 0.7, 2, seed)))
+
+
+def check_pattern(graph):
+    assert graph.repetition is not None
+    by_pattern, by_row = (
+        jax.jit(jax.vmap(lambda e, g=g: rolled(g, e)))(np.arange(2)) for g in (graph, without_pattern(graph))
+    )
+    for name in graph.nodes:
+        for eps in range(2):
+            a, b = (by_seq(jax.tree.map(lambda x, eps=eps: x[eps], r[1][name])).x for r in (by_pattern, by_row))
+            np.testing.assert_array_equal(a[: len(b)], b[: len(a)], err_msg=name)
+            assert abs(len(a) - len(b)) <= graph.repetition.wiring.ticks
+    assert jax.tree.structure(by_pattern[0]) == jax.tree.structure(by_row[0])
+    world = graph.wiring.world
+    assert len(a) > 0
+    assert int(by_pattern[1][world].seq.max()) + 1 == graph.repetition.wiring.total
+    for name, made in by_pattern[1].items():  # the newest output stays in the buffer
+        if name in by_pattern[0].buffer:
+            last = np.asarray(made.output.x)[0][np.asarray(made.seq)[0].argmax()]
+            assert by_pattern[0].buffer[name][-1].x[0] == last
+
+
+def test_a_timeline_that_departs_from_the_pattern_takes_rows():
+    nodes, supervisor = topologies.three_in_ten(jax_hash_node)
+    nodes["sensor"].delay_dist = topologies.hiccups(0.001, 0.15)
+    graph = CompiledGraph(nodes, supervisor, draw(nodes, 0.9, 2, 7))
+    assert graph.repetition is None
+    steady, _ = topologies.three_in_ten(jax_hash_node)
+    mixed = Timeline.stack([draw(steady, 0.9, 2, 7), graph.timeline])
+    assert CompiledGraph(steady, supervisor, mixed[:2]).repetition is not None
+    assert CompiledGraph(steady, supervisor, mixed).repetition is None
 
 
 # reset and step

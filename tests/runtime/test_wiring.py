@@ -2,7 +2,8 @@
 
 import jax
 import numpy as np
-from hypothesis import given, settings
+import topologies
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sim2real.graph import Timeline
@@ -13,7 +14,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS
 from sim2real.runtime.testing import interpret_hashes
-from sim2real.runtime.wiring import wire
+from sim2real.runtime.wiring import wire, wire_pattern
 
 
 def simulate(nodes, supervisor, timeline, eps=0, seed=0):
@@ -27,7 +28,7 @@ def simulate(nodes, supervisor, timeline, eps=0, seed=0):
     return initial, recorder.episode()
 
 
-def compare(nodes, supervisor, timeline, eps=0):
+def compare(nodes, supervisor, timeline, eps=0, wire=wire):
     """Check every output of the tables against the simulated clock; return the wiring."""
     wiring = wire(nodes, supervisor, timeline)
     initial, episode = simulate(nodes, supervisor, timeline, eps)
@@ -43,7 +44,7 @@ def compare(nodes, supervisor, timeline, eps=0):
 def soon(nodes, supervisor, wiring, timeline, eps, name):
     """Return how many steps a node must have made by the last row: those that start a few rows before."""
     if wiring.world:
-        last = wiring.rows * wiring.ticks / nodes[wiring.world].rate * 1e6
+        last = wiring.total / nodes[wiring.world].rate * 1e6
         wait = 3 * np.ceil(nodes[wiring.world].rate / nodes[supervisor].rate) / nodes[wiring.world].rate * 1e6
     else:
         last, wait = timeline.vertices[supervisor].start[eps, wiring.rows - 1], 0
@@ -69,6 +70,19 @@ def test_random_graphs(seed, which):
     timeline = draw(nodes, 0.5, 2, seed)
     supervisor = [n for n in nodes if not n.startswith("world")][which % sum(n.startswith("n") for n in nodes)]
     compare(nodes, supervisor, timeline, eps=1)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6))
+def test_random_graphs_whose_rates_do_not_divide(seed):
+    """Tables whose rows are a pattern of ticks and steps."""
+    nodes, supervisor = topologies.random_pattern(seed)
+    timeline = draw(nodes, 0.7, 2, seed)
+    assume(wire_pattern(nodes, supervisor, timeline) is not None)
+    wiring = compare(nodes, supervisor, timeline, eps=1, wire=wire_pattern)
+    assert wiring.total == timeline.vertices["world0"].count.min()
+    begin, end = wiring.full
+    assert all((table.seq[:, begin:end] >= 0).all() for table in wiring.tables)
 
 
 @settings(max_examples=25)

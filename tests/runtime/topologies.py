@@ -1,7 +1,9 @@
 """A dozen small graphs, one for each thing that a compiled graph must get right."""
 
+import numpy as np
+
 from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
-from sim2real.graph.testing import random_graph
+from sim2real.graph.testing import hash_node, random_graph
 
 
 def by_name(*nodes: BaseNode):
@@ -38,6 +40,20 @@ def robot(make, world_hz=100, policy_hz=50, **agent):
 def unequal_rates(make):
     """Nothing divides anything."""
     return robot(make, world_hz=125, policy_hz=30)
+
+
+def three_in_ten(make):
+    """The policy makes 3 steps in 10 ticks, with some jitter: rows of a pattern."""
+    return robot(make, world_hz=100, policy_hz=30, delay_dist=hiccups(0.001, 0.003), delay=0.002)
+
+
+def two_in_five(make):
+    """The same for 2 steps in 5 ticks, and a second sensor at 80 Hz."""
+    nodes, supervisor = robot(make, world_hz=100, policy_hz=40)
+    nodes["fast"] = make("fast", 80, False, delay_dist=0.001)
+    nodes["fast"].connect(nodes["world"], skip=True, window=3)
+    nodes["policy"].connect(nodes["fast"], skip=True, window=2)
+    return nodes, supervisor
 
 
 def slow_world(make):
@@ -140,7 +156,18 @@ def random_one(make):
     return random_graph(13, size=3, worlds=2, make=make), "n0"
 
 
+def random_pattern(seed, make=hash_node):
+    """A random graph under a world of 100 Hz, with rates that do not divide; its jitter often leaves a pattern."""
+    nodes, rng = random_graph(seed, worlds=1, make=make), np.random.default_rng(seed)
+    for node in nodes.values():
+        node.rate = 100.0 if node.name == "world0" else float(rng.choice([30, 40, 60, 70, 150]))
+        node.delay_dist = EmpiricalDist([round(1e-4 + 0.1 * float(rng.random()) / node.rate, 4)])
+        for connection in node.inputs.values():
+            connection.delay_dist, connection.delay = EmpiricalDist(rng.choice([0.0, 0.001, 0.003], 20)), 0.003
+    return nodes, "n0"
+
+
 ALL = [
-    loop, robot, unequal_rates, slow_world, policy_with_hiccups, diamond, two_worlds, twice_the_same, buffered,
-    advancing, open_loop, slow_supervisor, random_one,
+    loop, robot, unequal_rates, three_in_ten, two_in_five, slow_world, policy_with_hiccups, diamond, two_worlds,
+    twice_the_same, buffered, advancing, open_loop, slow_supervisor, random_one,
 ]  # fmt: skip

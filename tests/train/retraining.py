@@ -1,0 +1,48 @@
+"""The pendulum after one of two recordings, which differ in every number. As a script, trains and counts programs."""
+
+import sys
+from collections import Counter
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2real.artifacts.noise import Noise
+from sim2real.graph.delays import EmpiricalDist
+from sim2real.graph.schedule import draw
+from sim2real.runtime.compiled import CompiledGraph
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.train.config import PPOConfig
+from sim2real.train.env import GraphEnvironment
+from sim2real.train.ppo import train
+
+
+def environment(recording: int) -> GraphEnvironment:
+    """Return the environment after recording 0 or 1."""
+    robot: Any = load_pipeline("pendulum").load()
+    rng = np.random.default_rng(recording)
+    values = {n: v * (1 + 0.02 * recording) for n, v in robot.nominal().items()}
+    values |= {"sensor_delay": 0.020 + 0.0007 * recording, "actuator_delay": 0.024 - 0.0003 * recording}
+    draws = {n: v * (1 + 0.01 * rng.standard_normal(64)) for n, v in values.items() if "delay" not in n}
+    draws["actuator_delay"] = values["actuator_delay"] + rng.uniform(-0.002, 0.002, 64)
+    late = rng.gamma(4.0, 3e-4 + 2e-4 * recording, 500)
+    nodes, task = robot.training(values, draws, {n: EmpiricalDist(late) for n in ("sensor", "agent", "actuator")}, True)
+    noise = 1e-3 * (1 + recording)
+    nodes["sensor"].noise = (Noise("th", "rad", noise, 2 * noise, noise),)
+    return GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.0, 4, recording), reusable=True), task)
+
+
+def main() -> None:
+    """Train after the recording that the command line names; print how many programs were compiled, and found."""
+    events: Counter[str] = Counter()
+    jax.monitoring.register_event_listener(lambda event, **_: events.update([event.rsplit("/", 1)[-1]]))
+    env = environment(int(sys.argv[1]))
+    config = PPOConfig(
+        num_envs=4, rollout_steps=4, minibatches=2, epochs=1, total_steps=32, evaluations=2, eval_steps=env.length + 1
+    )
+    train(env, config, jax.random.key(0))
+    print(events["cache_misses"], events["cache_hits"])
+
+
+if __name__ == "__main__":
+    main()
