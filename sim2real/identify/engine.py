@@ -173,7 +173,15 @@ class CRollouts:
     def rollout(
         self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any], record: str
     ) -> Any:
-        """Return a node's outputs in an episode by a callback to C; a program with it is in no compilation cache."""
+        """Return a node's outputs in an episode by a callback to C; no compilation cache keeps a program with it.
+
+        Args:
+            gs: What the graph's ``begin`` returned.
+            params: The nodes' parameters, as ``begin`` got them.
+            tables: As in the graph's ``run``.
+            given: As in the graph's ``run``.
+            record: The node.
+        """
         inputs = self.inputs(gs, params, tables, given)
         dtype, count = jnp.result_type(float), inputs.controls.shape[0]
         widths = (self._model.nq, self._model.nv, self._model.nv)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.identify.programs import OnCompile
-from sim2real.identify.residuals import Linearised, Residuals
+from sim2real.identify.residuals import LinearisedSegments, SegmentResiduals
 from sim2real.identify.robust import tamed
 from sim2real.identify.segments import Data
 
@@ -28,12 +28,24 @@ class Evaluator(Protocol):
     precision: float
     fresh: bool
 
-    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> Linearised:
-        """Return the residuals of the fitted segments and their derivatives at ``z (P,)``."""
+    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
+        """Return the residuals of the fitted segments and their derivatives at a point.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            data: What is fitted.
+            on_compile: Called around a compilation.
+        """
         ...
 
     def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
-        """Return the loss at ``z (P,)``, initial states linearised there."""
+        """Return the loss at a point, initial states linearised there.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            data: What is fitted.
+            on_compile: Called around a compilation.
+        """
         ...
 
     def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
@@ -46,7 +58,13 @@ class Evaluator(Protocol):
         ...
 
     def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
-        """Return the loss of each candidate ``(N, P)``, their initial states linearised around one point."""
+        """Return the loss of each candidate, ``(N,)``, their initial states linearised around one point.
+
+        Args:
+            candidates: Shape ``(N, P)``.
+            around: Shape ``(P,)``.
+            data: What is fitted.
+        """
         ...
 
     def searched(self, data: Data) -> Any:
@@ -54,11 +72,24 @@ class Evaluator(Protocol):
         ...
 
     def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
-        """Return the residuals ``(R, K, F)`` of segments whose initial states are fitted to their first parts."""
+        """Return the residuals ``(R, K, F)`` of segments whose initial states are fitted to their first parts.
+
+        Args:
+            values: Parameters by name, ``(R, ...)``.
+            eps: Shape ``(R,)``: numbers of the segments.
+            fit_s: Shape ``(R,)``: lengths of the first parts [s].
+            data: The recordings.
+        """
         ...
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
-        """Return the robust residuals ``(G, S, K, F)`` with the values of ``rows (G, P)``, where they are no NaN."""
+        """Return the robust residuals ``(G, S, K, F)`` with some values given.
+
+        Args:
+            z: Shape ``(P,)``: initial states are linearised there.
+            rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
+            data: What is fitted.
+        """
         ...
 
 
@@ -71,11 +102,11 @@ class CompiledEvaluator:
 
     precision, fresh = 1e-6, True
 
-    def __init__(self, residuals: Residuals) -> None:
+    def __init__(self, residuals: SegmentResiduals) -> None:
         self._residuals = residuals
-        self._last: tuple[bytes, Data, Linearised] | None = None
+        self._last: tuple[bytes, Data, LinearisedSegments] | None = None
 
-    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> Linearised:
+    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
         """See ``Evaluator``; the last point is kept: descents ask for value, derivative and loss in turn."""
         point = np.asarray(z, np.float32)
         if self._last is None or self._last[0] != point.tobytes() or self._last[1] is not data:
@@ -125,8 +156,14 @@ class CompiledEvaluator:
         return jax.vmap(one)(rows)
 
 
-def replaced(residuals: Residuals, z: Any, row: Any) -> dict[str, Any]:
-    """Return parameters by name at ``z (P,)``, with the values of ``row (P,)`` where they are no NaN; traceable."""
+def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
+    """Return parameters by name at a point, with some values given; traceable.
+
+    Args:
+        residuals: Has the table.
+        z: Shape ``(P,)``: the point.
+        row: Shape ``(P,)``: values that replace those at ``z``, where they are no NaN.
+    """
     values = residuals.table.decode(z)
     for i, c in enumerate(residuals.table.columns):
         if c.recording is None:
@@ -134,7 +171,7 @@ def replaced(residuals: Residuals, z: Any, row: Any) -> dict[str, Any]:
     return values
 
 
-def stacked(at: Linearised) -> tuple[np.ndarray, np.ndarray]:
+def stacked(at: LinearisedSegments) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals ``(N,)`` and Jacobian ``(N, P)``, those of the priors behind them."""
     r, J, prior, slope = (np.asarray(a, np.float64) for a in (at.residuals, at.jacobian, at.prior, at.prior_jacobian))
     return np.concatenate([r.reshape(-1), prior]), np.concatenate([J.reshape(-1, J.shape[-1]), slope])

@@ -16,7 +16,7 @@ import numpy as np
 from sim2real.identify.engine import CRollouts, Outside
 from sim2real.identify.evaluator import Stacked, replaced
 from sim2real.identify.programs import OnCompile
-from sim2real.identify.residuals import STATE_DIFFERENCE, InitialState, Linearised, Residuals
+from sim2real.identify.residuals import STATE_DIFFERENCE, InitialState, LinearisedSegments, SegmentResiduals
 from sim2real.identify.robust import tamed
 from sim2real.identify.segments import Data
 from sim2real.identify.sizes import padded
@@ -37,14 +37,14 @@ class OutsideEvaluator:
 
     precision = 1e-4
 
-    def __init__(self, residuals: Residuals, rollouts: CRollouts) -> None:
+    def __init__(self, residuals: SegmentResiduals, rollouts: CRollouts) -> None:
         self._residuals, self._rollouts = residuals, rollouts
         self._n, self._prior = len(residuals.prior), np.asarray(residuals.prior, np.float64)
         self._free = residuals.config.initial_state == "free"
         self.fresh = not self._free
-        self._last: tuple[bytes, Data, Linearised] | None = None
+        self._last: tuple[bytes, Data, LinearisedSegments] | None = None
 
-    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> Linearised:
+    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
         """See ``Evaluator``; the last point is kept, since several judgements of an estimate begin there."""
         del on_compile  # both programs compile within two seconds
         if self._last is None or self._last[0] != z.tobytes() or self._last[1] is not data:
@@ -56,14 +56,14 @@ class OutsideEvaluator:
         del on_compile
         return float(self.losses(z[None], z, data)[0])
 
-    def _linearised(self, z: np.ndarray, data: Data) -> Linearised:
+    def _linearised(self, z: np.ndarray, data: Data) -> LinearisedSegments:
         states = self._states(z, data, again=True)
         raw = self._raw(z[None], states, data)[0]
         J = self._slope(z, states, data)
         r, slope = self._tamed(raw), self._tamed_slope(raw)
         prior, of_prior = self._of_prior(z)
         loss = self._loss(r, prior, data)
-        return Linearised(r, slope[..., None] * J, raw, prior, of_prior, loss)
+        return LinearisedSegments(r, slope[..., None] * J, raw, prior, of_prior, loss)
 
     def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
         """See ``Evaluator``: initial states keep the derivatives that they have at ``z``.
@@ -105,7 +105,13 @@ class OutsideEvaluator:
         return losses
 
     def losses_with(self, candidates: np.ndarray, states: InitialState | None, data: Data) -> np.ndarray:
-        """Return the loss of each candidate ``(N, P)``, for initial states that were linearised before."""
+        """Return the loss of each candidate, ``(N,)``.
+
+        Args:
+            candidates: Shape ``(N, P)``.
+            states: Their initial states, linearised before; None: they are not fitted.
+            data: What is fitted.
+        """
         raw = self._raw(candidates, states, data)
         priors = [self._of_prior(z)[0] for z in candidates]
         return np.array([self._loss(self._tamed(r), p, data) for r, p in zip(raw, priors, strict=True)])

@@ -23,7 +23,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.outside import OutsideEvaluator
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.programs import OnCompile
-from sim2real.identify.residuals import Residuals
+from sim2real.identify.residuals import SegmentResiduals
 from sim2real.identify.segments import Data, Retimed, Span, cut, data_of
 from sim2real.identify.sizes import padded, rounded
 from sim2real.runtime.bursts import make_room
@@ -117,11 +117,11 @@ class Problem:
         on_c = self.engine.name == "c"
         self.evaluator: Evaluator = like.evaluator if like else _evaluator(self.residuals, on_c)
 
-    def _residuals(self) -> Residuals:
+    def _residuals(self) -> SegmentResiduals:
         nodes = self.model.nodes(self.config.max_delay_s)
         engine = choose(self.config.engine, nodes, self.model.given, self.config.jacobian)
         check_devices(self.config.devices, engine)
-        return Residuals(self.model, nodes, self.table, self.config, engine)
+        return SegmentResiduals(self.model, nodes, self.table, self.config, engine)
 
     @property
     def engine(self) -> Any:
@@ -181,7 +181,13 @@ class Problem:
         return Evaluation(r, J, raw, prior, slope, float(found.loss))
 
     def loss(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
-        """Return the loss at a point; arguments as in ``at``."""
+        """Return the loss at a point.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            data: What is fitted; default: all fitted segments.
+            on_compile: Called around a compilation.
+        """
         return self.evaluator.loss(np.asarray(z), self.data if data is None else data, on_compile)
 
     def losses(self, candidates: Any, around: Any, data: Data | None = None) -> np.ndarray:
@@ -233,5 +239,5 @@ class Problem:
         return Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
 
 
-def _evaluator(residuals: Residuals, on_c: bool) -> Evaluator:
+def _evaluator(residuals: SegmentResiduals, on_c: bool) -> Evaluator:
     return OutsideEvaluator(residuals, residuals.outside) if on_c else CompiledEvaluator(residuals)

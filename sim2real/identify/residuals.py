@@ -46,7 +46,7 @@ class InitialState(NamedTuple):
     residuals: Any
 
 
-class Linearised(NamedTuple):
+class LinearisedSegments(NamedTuple):
     """The residuals of all fitted segments and their derivatives.
 
     Attributes:
@@ -66,7 +66,7 @@ class Linearised(NamedTuple):
     loss: Any
 
 
-class Residuals:
+class SegmentResiduals:
     """The residuals of a model, for any data of one robot.
 
     Args:
@@ -159,12 +159,27 @@ class Residuals:
         return params, self._first(params, given, eps), tables, given
 
     def inputs(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Outside:
-        """Return what C needs to simulate a segment; arguments as in ``simulate``."""
+        """Return the inputs with which C simulates a segment.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+            data: The recordings.
+        """
         params, gs, tables, given = self._begun(values, eps, shift, data)
         return self.outside.inputs(gs, params, tables, given)
 
     def errors(self, values: Mapping[str, Any], eps: Any, shift: Any, moved: Any, data: Data) -> Any:
-        """Return ``residuals`` of a segment that C simulated; ``moved`` is what it returned."""
+        """Return ``residuals`` of a segment that C simulated.
+
+        Args:
+            values: Parameters by name.
+            eps: Number of the segment.
+            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+            moved: What ``CRollouts.step`` returned for it.
+            data: The recordings.
+        """
         _, gs, tables, given = self._begun(values, eps, shift, data)
         return self._compared(self.outside.outputs(gs, moved, tables, given, self.model.sensor), eps, data)
 
@@ -253,7 +268,13 @@ class Residuals:
         return self.initial_state(values, eps, data, fit_s, _STATE_STEPS + 1).residuals
 
     def initial_states(self, z: Any, data: Data, pick: Any) -> InitialState | None:
-        """Return ``initial_state`` of segments ``pick (B,)``; None where states are not fitted."""
+        """Return ``initial_state`` of several segments, leaves ``(B, ...)``; None where states are not fitted.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            data: The recordings.
+            pick: Shape ``(B,)``: numbers of the segments.
+        """
         if self.config.initial_state != "free":
             return None
         values = self.table.decode(z, data.kept)
@@ -280,7 +301,7 @@ class Residuals:
 
         return jax.vmap(loss)(candidates)
 
-    def linearised(self, z: Any, data: Data) -> Linearised:
+    def linearised(self, z: Any, data: Data) -> LinearisedSegments:
         """Return the residuals of all fitted segments and their derivatives at ``z (P,)``.
 
         Initial states are linearised at ``z``; how their slopes change with ``z`` is left out of the derivative
@@ -293,7 +314,7 @@ class Residuals:
         r, slope = jax.jvp(self._tamed, (raw,), (jnp.ones_like(raw),))
         of_prior = self.table.prior_residuals
         prior = of_prior(z), jax.jacfwd(of_prior)(z)
-        return Linearised(r, slope[..., None] * J, raw, *prior, self._loss(r, z, data, pick))
+        return LinearisedSegments(r, slope[..., None] * J, raw, *prior, self._loss(r, z, data, pick))
 
     def start(self, eps: Any, delay_s: Any, data: Data) -> Any:
         """Return the initial state ``(2 * channels,)`` as measured around the start.

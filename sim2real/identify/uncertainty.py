@@ -99,10 +99,15 @@ def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
 
 
 def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Linearised:
-    """Compute residuals and Jacobian at ``z (P,)``, of some data; default: all fitted segments.
+    """Compute residuals and Jacobian at a point.
 
     At a bound nothing changes with ``z`` any more, but it does with the parameter: there both are computed at a point a
     little inside, and the residuals carried on to the estimate along the Jacobian.
+
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the point.
+        data: What is fitted; default: all fitted segments.
     """
     table = problem.table
     most = np.log((1.0 - _INSIDE) / _INSIDE)
@@ -278,7 +283,13 @@ def _verdict(error: float, margin: float, shifts: bool) -> str:
 
 
 def shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
-    """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift."""
+    """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift.
+
+    Args:
+        table: The parameters.
+        x: Shape ``(P,)``: the point, on their scales.
+        shift: Shape ``(P,)``: what ``time_shift`` returns.
+    """
     moved = shift != 0.0
     if not moved.any():
         return 0.0, 0.0

@@ -10,7 +10,7 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
 from sim2real.identify.derivative import finite_differences
-from sim2real.identify.residuals import Residuals
+from sim2real.identify.residuals import SegmentResiduals
 
 POINT = jnp.array([0.4, -0.7, 1.1])
 
@@ -76,7 +76,7 @@ def test_a_callback_can_be_differentiated_by_what_is_closed_over():
 @pytest.mark.parametrize(("step", "slope"), [(3e-3, 1.0), (0.5, 0.2)])
 def test_a_wide_difference_looks_past_a_kink(step, slope):
     problem = SimpleNamespace(forward=False, config=FitConfig(difference=step))
-    differentiable = Residuals.differentiable(problem, jnp.abs)
+    differentiable = SegmentResiduals.differentiable(problem, jnp.abs)
     assert jax.jacfwd(differentiable)(jnp.array([0.1]))[0, 0] == pytest.approx(slope, rel=1e-3)
 
 

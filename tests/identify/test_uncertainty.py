@@ -264,13 +264,13 @@ def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
     column = np.random.default_rng(0).normal(size=400) * 1e6
     J = np.stack([column, column * (1.0 + 1e-12), 0.0 * column], axis=1)
     precision = J.T @ J + np.diag([1e-5, 1e-5, 1e-5])
-    root = uncertainty._root_of_inverse(precision)
+    root = uncertainty.root_of_inverse(precision)
     assert np.isfinite(root).all()
     variance = np.diag(root @ root.T)
     assert variance[2] == pytest.approx(1e5)
     assert (variance[:2] > 100.0 / float(column @ column)).all(), "neither is known by itself"
     sure = np.diag([1.0, 4.0, 9.0]) + 0.5
-    root = uncertainty._root_of_inverse(sure)
+    root = uncertainty.root_of_inverse(sure)
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(sure), rtol=1e-12)
 
 

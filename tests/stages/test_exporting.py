@@ -108,10 +108,16 @@ def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
     assert document["verdict"]["status"] == "hit a bound"
 
 
-def test_an_interrupted_search_is_refused(arm, here, capsys):
-    file = save(replace(arm, posterior=None), here / "found")
+@pytest.mark.parametrize(
+    ("status", "said"), [("interrupted", "was interrupted"), ("not converged", "did not converge")]
+)
+def test_an_identification_without_intervals_is_refused(arm, here, capsys, status, said):
+    verdict = Judgement(status, ("why",), "sim2real identify arm --begin parameters.json")
+    file = save(replace(arm, posterior=None, verdict=verdict), here / "found")
     assert cli.main(["export", "identified", str(file)]) == errors.USAGE
-    assert "was interrupted" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert said in told
+    assert "hint: sim2real identify arm --begin parameters.json" in told
 
 
 @pytest.mark.parametrize(

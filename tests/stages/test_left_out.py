@@ -15,6 +15,7 @@ from sim2real.identify.verdict import Position
 from sim2real.stages import identify
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.left_out import further, promises, sentences, widened, widest
+from sim2real.stages.partial import Best
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -148,7 +149,7 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
     monkeypatch.setattr(identify, "_fit", fit)
     monkeypatch.setattr(identify.left_out, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    identify._with_terms(None, [], [], config, table, ["log"], None)
+    identify._with_terms(None, [], [], config, table, ["log"], Best())
     fewer = tables[1][1]
     assert fewer.terms == ("cogging",)
     assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]

@@ -71,6 +71,8 @@ def test_a_composed_task_ends_the_episode_of_its_graph(ends):
         last_row=lambda steps: steps - 1,
         advance=lambda *_, **__: state,
         observe=lambda gs, **_: (gs, heard, None),
+        data=None,
+        with_data=lambda _: graph,
     )
     task = SimpleNamespace(
         observation_size=1,
@@ -83,7 +85,7 @@ def test_a_composed_task_ends_the_episode_of_its_graph(ends):
     )
     env = GraphEnvironment(graph, task, np.array([9]))
     before = SimpleNamespace(step_state=heard, graph=state, total=0.0, good=0.0, width=None)
-    step = env._step(before, jnp.zeros(1), jax.random.key(0))
+    step = env._step(env.data, before, jnp.zeros(1), jax.random.key(0))
     assert (bool(step.terminated), bool(step.truncated)) == ends
 
 
