@@ -129,7 +129,7 @@ class OutsideEvaluator:
             "replaced", jax.vmap(lambda z, row: replaced(self._residuals, z, row), (None, 0))
         )
         values = jax.tree_util.tree_map(np.asarray, program(_single(z), _single(rows)))
-        return self._tamed(self._projected(values, self._states(z, data), data))
+        return self._tamed(self._projected(values, self._states(z, data, again=True), data))
 
     def _states(self, z: np.ndarray, data: Data, again: bool = False) -> InitialState | None:
         """Return the initial states of the fitted segments, leaves ``(S, ...)``; None where they are not fitted.
