@@ -188,6 +188,13 @@ def test_suite(run):
     assert list(report["rooms"]) == ["test_repetitions"]
 
 
+def test_identify_time(run):
+    """The second log of the same length finds all programs of the first."""
+    rows = {r["name"].removeprefix("identify-time/"): r["value"] for r in run("identify-time")["rows"]}
+    assert rows["pendulum/second_log/misses"] == 0
+    assert 1.0 < rows["pendulum/second_log/over_cold"] < 300.0, "the yardstick is set to 1 s"
+
+
 def test_the_outcome_of_tests_is_read_from_pytests_report(tmp_path):
     path = tmp_path / "report.xml"
     cases = {"log.test_a": "", "log.test_b": "<skipped/>", "view.test_c": "<failure/>", "view.test_d": "<error/>"}
