@@ -20,7 +20,7 @@ from benches.provenance import ROOT
 from sim2real.errors import Sim2RealError
 
 COMMIT = "51f54b7210f9034c78055b63517518bcce9c02f8"
-"""The commit at which the goals of issue 32 were measured."""
+"""The commit from which the goals of the benches count."""
 PATHS = ("sim2real", "pipelines", "datasets/pendulum")
 """Folders of that commit that the identification reads."""
 COMMAND = ("identify", "pendulum", "--log", "datasets/pendulum/chirp.mcap", "--runs", "runs")

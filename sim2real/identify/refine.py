@@ -28,8 +28,8 @@ from sim2real.identify.uncertainty import (
 
 _COARSE = 1e-3
 """Relative gain of the loss at which the descent from each start ends; that from the best goes on."""
-_ROUNDS, _ROUND_GAIN, _BACK = 4, 1e-4, 4
-"""Most rounds of a descent; a round that gains a smaller share of the loss is the last; how often one goes back."""
+_ROUNDS, _BACK = 4, 4
+"""Most rounds of a descent, and how often a round goes half the way back to its start."""
 _NEAR = 1e-5
 """Relative change of the point at which a descent ends, where the evaluator resolves it."""
 _PIN = 10.0
@@ -104,7 +104,7 @@ def refine(
     if coarse:
         return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     fine = problem.evaluator.precision
-    if time_shift(problem.table).any():
+    if descent.shift.any():
         z, loss = descent.down(z, fine, _PIN)
     z, loss = descent.down(z, fine)
     if not settle:
@@ -153,12 +153,16 @@ class _Descent:
         on_compile: Called around a compilation.
 
     Attributes:
+        shift: Shape ``(P,)``: the delays' common shift, which a log does not determine; zeros where initial states are
+            not fitted, and the log does.
         steps: Evaluations so far.
     """
 
     def __init__(self, problem: Problem, data: Data, on_step: OnStep | None, on_compile: OnCompile | None) -> None:
         self._problem, self._data, self._on_step, self._on_compile = problem, data, on_step, on_compile
         self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
+        free = problem.config.initial_state == "free"
+        self.shift = time_shift(problem.table) if free else np.zeros(len(problem.table))
         self.steps = 0
 
     def at(self, z: np.ndarray) -> float:
@@ -179,7 +183,7 @@ class _Descent:
             pin: How stiffly the delays' common shift is held in the middle, see ``_PIN``.
         """
         z = np.asarray(z, np.float64)
-        if pin and self._problem.config.initial_state == "free":
+        if pin and self.shift.any():
             z = centred(self._problem.table, z)
         loss = self.at(z)
         for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
@@ -193,7 +197,7 @@ class _Descent:
             if not after < loss:
                 break
             gained, z, loss = loss - after, end, after
-            if gained < max(gain, _ROUND_GAIN) * loss:
+            if gained < gain * loss:
                 break
         return z, loss
 
@@ -241,9 +245,8 @@ class _Descent:
 
     def _pinned(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far the delays' common shift is from its middle, ``(1,)`` in shares of it, and the slope."""
-        table = self._problem.table
-        shift = time_shift(table)
-        if self._problem.config.initial_state != "free" or not shift.any():
+        table, shift = self._problem.table, self.shift
+        if not shift.any():
             return np.zeros(0), np.zeros((0, z.size))
         x, stretch = table.scale(z)
         width = float(table.span[shift != 0.0].min())

@@ -119,7 +119,9 @@ class SegmentResiduals:
 
     def program(self, name: str, function: Callable[..., Any]) -> Program:
         """Return a compiled program that other problems of the same model share, made of a function at first."""
-        return self.programs.setdefault(name, Program(function))
+        if name not in self.programs:
+            self.programs[name] = Program(function)
+        return self.programs[name]
 
     def simulate(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Any:
         """Return the sensor's predictions of a segment, leaves ``(K, ...)``.

@@ -105,8 +105,7 @@ def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters:
     """
     segments = len(cuts.spans)
     fitted = np.flatnonzero([s.fitted for s in cuts.spans])
-    seq = np.asarray(cuts.ts)  # (E, N), and 0 behind the last measurement
-    ts = np.where(seq >= from_s, seq, -1.0)
+    ts = np.where(cuts.ts >= from_s, cuts.ts, -1.0)
     steps, size = rounded(ts.shape[1]), rounded(segments)
     ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
     measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
