@@ -23,7 +23,7 @@ from sim2real.graph.windows import check_bursts, newest_message
 from sim2real.runtime.fit import check_fit
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.match import matched
-from sim2real.runtime.wiring import EMPTY_AGE_S
+from sim2real.runtime.wiring import messages_read
 
 Tables = dict[str, Any]
 """Node -> ``seq`` and ``ts`` of its steps, leaves ``(E, K)``, and for each of its ``inputs`` the window that a step
@@ -199,21 +199,7 @@ def _with_default(default: Any, rows: Any) -> Any:
 def _window(nodes: Mapping[str, BaseNode], timeline: Timeline, name: str, input_name: str, seq: np.ndarray) -> Tables:
     """Return the messages in the window of every step ``seq (E, K)`` of a node, leaves ``(E, K, W)``."""
     edge, reader = timeline.edges[name, input_name], timeline.vertices[name]
-    width, sender = nodes[name].inputs[input_name].total_window, timeline.vertices[edge.sender]
-    window = np.maximum(newest_message(edge, reader)[..., None] - np.arange(width - 1, -1, -1), -1)
-    window = np.where(seq[..., None] >= 0, window, -1)
-    there = window >= 0
-
-    def pick(times: np.ndarray) -> np.ndarray:
-        flat = np.take_along_axis(times, window.reshape(len(window), -1).clip(0), axis=1)
-        return np.where(there, flat.reshape(window.shape), 0)
-
-    sent = pick(sender.end)
-    lead = np.where(there, (reader.start[..., None] - sent) / TICKS_PER_S, EMPTY_AGE_S)
-    seconds = lambda ticks: (ticks / TICKS_PER_S).astype(np.float32)  # noqa: E731
-    return {
-        "seq": window.astype(np.int32),
-        "sent": seconds(sent),
-        "received": seconds(pick(edge.received)),
-        "lead": lead.astype(np.float32),
-    }
+    width = nodes[name].inputs[input_name].total_window
+    newest = np.where(seq >= 0, newest_message(edge, reader), -1)
+    read = messages_read(width, newest, reader.start, edge, timeline.vertices[edge.sender])
+    return dict(zip(("seq", "sent", "received", "lead"), read, strict=True))

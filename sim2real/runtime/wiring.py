@@ -15,7 +15,7 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.timeline import Timeline
-from sim2real.graph.times import NEVER, Vertex, search_rows
+from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
 from sim2real.graph.windows import check_bursts, longest_burst
 from sim2real.runtime.pattern import find_pattern
 from sim2real.runtime.placement import Placement, Placer
@@ -145,6 +145,27 @@ def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timel
     return None if placement is None else _Tables(placer, placement).wiring()
 
 
+def messages_read(
+    width: int, newest: np.ndarray, ts: np.ndarray, edge: Edge, sender: Vertex
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the messages in the windows of steps: ``seq``, ``sent``, ``received`` and ``lead`` of ``InputTable``.
+
+    Args:
+        width: Length W of the window.
+        newest: Shape ``(E, C)``: the newest message that each step has consumed; -1: none, or no step.
+        ts: Shape ``(E, C)``: starts of the steps [ticks].
+        edge: The messages.
+        sender: The steps that sent them.
+    """
+    window = np.maximum(newest[..., None] - np.arange(width - 1, -1, -1), -1)
+    flat = window.reshape(len(window), -1).clip(0)
+    pick = lambda a: np.where(window >= 0, np.take_along_axis(a, flat, 1).reshape(window.shape), 0)  # noqa: E731
+    sent, received = pick(sender.end), pick(edge.received)
+    lead = np.where(window >= 0, (ts[..., None] - sent) / TICKS_PER_S, EMPTY_AGE_S)
+    seconds = lambda a: (a / TICKS_PER_S).astype(np.float32)  # noqa: E731
+    return window.astype(np.int32), seconds(sent), seconds(received), lead.astype(np.float32)
+
+
 class _Tables:
     """Makes the tables of one placement."""
 
@@ -244,17 +265,9 @@ class _Tables:
                 f"input {key[1]!r} of node {key[0]!r} would read a message that has not been computed",
                 hint="the timeline's edges contradict its vertices: re-derive it",
             )
-        window = np.maximum(newest[..., None] - np.arange(connection.total_window - 1, -1, -1), -1)
-        window = np.where(seq[..., None] >= 0, window, -1)
-        flat = window.reshape(len(seq), -1)
-        pick = lambda a: np.where(  # noqa: E731
-            window >= 0, np.take_along_axis(a, flat.clip(0), 1).reshape(window.shape), 0
-        )
-        sent, received = pick(sender.end), pick(edge.received)
-        lead = np.where(window >= 0, (ts[..., None] - sent) / TICKS_PER_S, EMPTY_AGE_S)
-        seconds = lambda a: (a / TICKS_PER_S).astype(np.float32)  # noqa: E731
         return InputTable(
-            age.astype(np.int32), window.astype(np.int32), seconds(sent), seconds(received), lead.astype(np.float32)
+            age.astype(np.int32),
+            *messages_read(connection.total_window, np.where(seq >= 0, newest, -1), ts, edge, sender),
         )
 
     def _rings(
