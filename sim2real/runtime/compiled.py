@@ -7,7 +7,7 @@ outputs of each node, the index of the episode and the row.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -254,68 +254,11 @@ class CompiledGraph:
         inside = not _traced(gs.step)
         return scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
 
-    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
-        """Run the world's ticks alone, by another function in place of its step.
-
-        For physics that runs outside of the program: ``drive`` says what the world hears and when, ``replay`` what the
-        other nodes make of its messages. All that the world hears must be given.
-
-        Args:
-            gs: What ``init`` returned.
-            step: Maps the world's step state to the next one, and what is to be returned.
-
-        Returns:
-            What ``step`` returned, leaves ``(ticks of the episode, ...)``.
-
-        Raises:
-            UsageError: When there is no world, or it hears a node that is not given.
-        """
-        self._check_apart("drive")
-        return self.program.drive(gs, step)
-
-    def replay(self, gs: GraphState, messages: Any, record: Sequence[str]) -> dict[str, Rollout]:
-        """Run an episode's steps of all nodes but the world, whose messages are known.
-
-        Args:
-            gs: What ``init`` returned.
-            messages: The world's, leaves ``(1 + ticks of the episode, ...)``; the first is its default output.
-            record: Nodes whose outputs are returned.
-
-        Returns:
-            The records by node.
-
-        Raises:
-            UsageError: As ``drive``, and when a node in ``record`` does not run.
-        """
-        self._check_apart("replay")
-        self._check_record(record)
-        program = copy.copy(self.program)
-        program.replayed = messages
-
-        def row(gs: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
-            outputs: dict[str, list[Rollout]] = {}
-            gs = program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside=True)
-            return gs.replace(step=gs.step + 1), outputs
-
-        return scan_rows(row, gs, record, self.rows, self.rows_per_pass)[1]
-
     def _check_record(self, record: Sequence[str]) -> None:
         for name in record:
             if name not in self.nodes or name in self.given:
                 running = [n for n in self.nodes if n not in self.given]
                 raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
-
-    def _check_apart(self, call: str) -> None:
-        world = self.wiring.world
-        if world is None:
-            raise UsageError(f"{call}() is for graphs with a world, this one has none")
-        senders = [c.output_node.name for c in self.nodes[world].inputs.values()]
-        live = [n for n in senders if n in self.nodes and n not in self.given]
-        if live:
-            raise UsageError(
-                f"{call}() needs to know all that the world {world!r} hears, and {live[0]!r} is not given",
-                hint="give its recorded outputs: CompiledGraph(..., given={...})",
-            )
 
     def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Number]:
         """Run a row up to the supervisor's step, and return what the supervisor sees.

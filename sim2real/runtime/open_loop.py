@@ -137,8 +137,18 @@ class OpenLoopGraph:
 
         Returns:
             The results, leaves ``(ticks, ...)``.
+
+        Raises:
+            UsageError: When there is no world, or it hears a node that is not given.
         """
-        world = self.world or ""
+        if self.world is None:
+            raise UsageError("drive() is for graphs with a world, this one has none")
+        world, heard = self.world, [c.output_node.name for c in self.nodes[self.world].inputs.values()]
+        if live := [n for n in heard if n not in given]:
+            raise UsageError(
+                f"drive() needs all messages that the world {world!r} hears, and {live[0]!r} is not given",
+                hint="give its recorded outputs",
+            )
         sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()}
         return self._scan(world, gs, tables[world], sent, step, ahead=True)
 

@@ -48,10 +48,6 @@ class RowProgram:
         ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
             the sender's ring has.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
-
-    Attributes:
-        replayed: The world's messages where its ticks were run elsewhere, leaves ``(1 + ticks, ...)``: the default
-            output, then those of its ticks; None where it runs here.
     """
 
     def __init__(
@@ -65,7 +61,6 @@ class RowProgram:
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self.bounds: DelayBounds = bounds_of(nodes)
-        self.replayed: Any = None
         self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
@@ -164,20 +159,6 @@ class RowProgram:
         new, output = self.call(name, step_state)
         return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
 
-    def drive(self, gs: GraphState, step: Callable[[StepState], tuple[StepState, T]]) -> T:
-        """Run the world's ticks of a whole episode by another function; see ``CompiledGraph.drive``."""
-        world: Any = self.wiring.world
-        flat = lambda t: t[:, gs.eps].reshape(-1, *t.shape[3:])  # noqa: E731 - (R, E, ticks, ...) -> (R * ticks, ...)
-        # What a tick hears does not depend on the ticks before it: looked up for all of them at once.
-        seen = jax.vmap(lambda now: self._step_state(gs, world, now, {}))(jax.tree_util.tree_map(flat, self._world))
-
-        def tick(state: Any, now: tuple[dict[str, InputState], Number, Number]) -> tuple[Any, T]:
-            inputs, seq, ts = now
-            new, output = step(StepState(gs.rng[world], state, gs.params[world], inputs, gs.eps, seq, ts))
-            return matched(world, "the state that a driven tick returns", new.state, "the one it got", state), output
-
-        return jax.lax.scan(tick, gs.state[world], (seen.inputs, seen.seq, seen.ts))[1]
-
     def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
         """Call a node's step; an exception gets a note with the node's name."""
         try:
@@ -242,8 +223,6 @@ class RowProgram:
             sender = connection.output_node.name
             if sender in self._given:
                 data = self._look_up(gs, sender, t["seq"])
-            elif self.replayed is not None and sender == self.wiring.world:
-                data = jax.tree_util.tree_map(lambda leaf, seq=t["seq"]: leaf[jnp.maximum(seq, -1) + 1], self.replayed)
             else:
                 kept = gs.buffer[sender]
                 data = _window(kept, age, width, *ages.get(input_name, (0, len(kept) - width)))
