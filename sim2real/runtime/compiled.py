@@ -1,7 +1,7 @@
 """A graph as one compiled program, in which timelines are data and the world always runs.
 
-Timing tables are constants of the program. The state that each copy carries consists of the nodes' states, the last few
-outputs of each node, the index of the episode and the row.
+Timing tables are constants of the program, or its arguments where the caller traces ``with_data``. The state that each
+copy carries consists of the nodes' states, the last few outputs of each node, the index of the episode and the row.
 """
 
 from __future__ import annotations

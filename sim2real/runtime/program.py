@@ -38,7 +38,7 @@ class Rollout(NamedTuple):
 
 
 class RowProgram:
-    """Traces rows; the tables are constants, looked up at the graph state's ``eps`` and ``step``.
+    """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
 
     Args:
         nodes: The nodes by name.

@@ -1,12 +1,15 @@
 """A search that is ended by a signal leaves its best so far."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run_folder import attempts
 from sim2real.errors import Sim2RealError
 from sim2real.stages import identify
@@ -73,3 +76,25 @@ def test_a_refinement_goes_on_from_the_searchs_best_and_counts_from_then_on():
     assert (best.loss, best.z.tolist()) == (0.6, [1.0])
     best.advance("refine", 0.1, 0.7, np.full(1, 2.0))
     assert (best.loss, best.done) == (0.6, {"search": 1.0, "refine": 0.2})
+
+
+@pytest.mark.full  # an identification and a half
+def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
+    own = [sys.executable, "-m", "sim2real.cli", "identify", "pendulum", "--log", str(LOG), "--runs", str(tmp_path)]
+    quick = ["--generations", "10", "--refine", "1"]
+    with subprocess.Popen([*own, *quick], stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+        for line in running.stderr:
+            if "errors, predictions and baselines" in line:
+                running.kill()
+                break
+    (path,) = tmp_path.rglob("partial.json")
+    assert not (path.parent / "parameters.json").exists()
+    left = Identification.load(path)
+    assert left.verdict.status == "interrupted"
+    assert f"--begin {path}" in left.verdict.next
+    again = [*own, "--begin", str(path), "--generations", "0"]
+    subprocess.run(again, check=True, capture_output=True, cwd=ROOT)
+    found = Identification.load(next(tmp_path.rglob("parameters.json")))
+    assert found.verdict.status == "accepted"
+    assert found.values["gain"] == pytest.approx(left.values["gain"], rel=1e-3)
+    assert not (next(tmp_path.rglob("parameters.json")).parent / "partial.json").exists()
