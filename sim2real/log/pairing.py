@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log import evidence
+from sim2real.log.following import following, on_grid
 from sim2real.log.names import Meaning
 from sim2real.log.signals import Signal, find_stamps
 
@@ -132,8 +132,8 @@ def _link(a: Signal, b: Signal, signals: Sequence[Signal], path: str, rate_hz: f
     t = find_stamps(signals, a, "measured", path, rate_hz).t_s
     good = a.finite & b.finite & np.isfinite(t)
     good[1:] &= np.diff(np.maximum.accumulate(np.where(np.isfinite(t), t, -np.inf))) > 0
-    held, joined, period = evidence.on_grid(t[good], b.values[good], t[good], a.values[good])
-    found = evidence.following(held, joined, period)
+    held, joined, period = on_grid(t[good], b.values[good], t[good], a.values[good])
+    found = following(held, joined, period)
     best = np.abs(found.r).max(axis=1)
     if not (best > 0).any():
         return 0.0, 0.0
@@ -180,8 +180,8 @@ def _halves(
     """Split columns into those that lead and those that follow, where each has a partner that is closest both ways."""
     t = find_stamps(signals, signal, "measured", path, rate_hz).t_s
     good = signal.finite
-    held, joined, period = evidence.on_grid(t[good], signal.values[good], t[good], signal.values[good])
-    found = evidence.following(held, joined, period)
+    held, joined, period = on_grid(t[good], signal.values[good], t[good], signal.values[good])
+    found = following(held, joined, period)
     distance = found.distance() + np.diag(np.full(signal.width, np.inf))
     partner = distance.argmin(axis=1)
     own = np.arange(signal.width)
