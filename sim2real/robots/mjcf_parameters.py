@@ -213,7 +213,7 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
     for term in terms:
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
         offset = 1 if term.what == "payload" else 0
-        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name)]
+        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name, re.DOTALL)]
         if not at:
             raise UsageError(
                 f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",

@@ -19,7 +19,18 @@ from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.mjcf import NO_LIMIT, JointDrive, driven, joints_of, limit_of, read_model, read_spec, set_drives
+from sim2real.robots.holding import Holding
+from sim2real.robots.mjcf import (
+    NO_LIMIT,
+    JointDrive,
+    driven,
+    held_in,
+    joints_of,
+    limit_of,
+    read_model,
+    read_spec,
+    set_drives,
+)
 from sim2real.robots.mjcf_parameters import (
     FALLBACK,
     LAWS,
@@ -60,6 +71,7 @@ class RobotConfig:
         kd_unit: What 1 stands for in the log's own damping.
         fix_base: Whether a floating base is held.
         contacts: Whether bodies touch.
+        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
         terms: What is identified.
     """
 
@@ -76,7 +88,16 @@ class RobotConfig:
     kd_unit: float = 1.0
     fix_base: bool = False
     contacts: bool = False
+    hold: tuple[str, ...] = ()
     terms: tuple[ParameterPattern, ...] = ()
+
+    def driven(self, rubbing: bool = True) -> Any:
+        """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
+        return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
+
+    def held(self) -> Holding:
+        """Return what becomes of the joints that were not recorded."""
+        return held_in(self.model, read_model(self.model), self.joints, self.fix_base, self.hold)
 
     def to_toml(self, model: str) -> str:
         """Return the text of a ``robot.toml`` that names the model's file."""
@@ -187,7 +208,7 @@ class MjcfRobot(LoggedRobot):
         own = read_model(config.model)
         self.lawful = any(term.what in LAWS for term in config.terms)
         rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
-        self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts, rubbing)
+        self.model = config.driven(rubbing)
         self.placed = tuple(expand(config.terms, config.joints, self.model, own))
         self._limits = [limit_of(own, joint) for joint in config.joints]
 
@@ -307,9 +328,9 @@ class IdentifiableMjcf(IdentifiableRecording):
         super().__init__(robot, max_delay_s)
         self.parameters = ParameterTable(p for p in self.parameters if p.name != "sensor_delay")
         self.ahead_s = robot.tick_s
-        world = robot.make_nodes()[2]
+        self._world = world = robot.make_nodes()[2]
         self._placed: Sequence[Placed] = robot.placed
-        self._joints, self._dofs, self._qpos = world.joints, world.qvel_at, world.qpos_at
+        self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
@@ -327,8 +348,11 @@ class IdentifiableMjcf(IdentifiableRecording):
         if world.terms is not None:
             angle = world.terms.angle(angle)
             speed = speed / world.terms.rate(angle, 1.0)
-        qpos, qvel = world.qpos.at[self._qpos].set(angle), world.qvel.at[self._dofs].set(speed)
-        return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero, world.terms)}
+        return {
+            **tree,
+            "world": self._world.started(world, angle, speed),
+            "sensor": EncoderParams(world.zero, world.terms),
+        }
 
 
 def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:
