@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -10,15 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from flax import struct
 
+from sim2real.artifacts.files import check
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.log.toml_text import toml_value
 from sim2real.robots.holding import Holding
 from sim2real.robots.mjcf import (
     NO_LIMIT,
@@ -105,11 +107,11 @@ class RobotConfig:
         plain = {f.name: f.default for f in fields(self)}
         lines = ["# A robot that was recorded: sim2real.robots.mjcf_robot.RobotConfig says what each key is."]
         own["model"] = model
-        lines += [f"{k} = {json.dumps(v)}" for k, v in own.items() if v != plain[k]]
+        lines += [f"{k} = {toml_value(v)}" for k, v in own.items() if v != plain[k]]
         for term in self.terms:
             usual = asdict(ParameterPattern(term.what))
             said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
-            lines += ["", "[[terms]]", *(f"{k} = {json.dumps(v)}" for k, v in said.items())]
+            lines += ["", "[[terms]]", *(f"{k} = {toml_value(v)}" for k, v in said.items())]
         return "\n".join(lines) + "\n"
 
     @staticmethod
@@ -119,15 +121,17 @@ class RobotConfig:
         Raises:
             UsageError: When a key is unknown, missing or of the wrong kind.
         """
+        known = [f.name for f in fields(RobotConfig)]
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
             terms = tuple(ParameterPattern(**row) for row in table.pop("terms", []))
-            rest: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-            found = RobotConfig(**rest, terms=terms)
-            return replace(found, model=path.parent / found.model)
-        except (tomllib.TOMLDecodeError, TypeError, OSError) as error:
-            known = ", ".join(f.name for f in fields(RobotConfig))
-            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {known}") from None
+            check(table.keys() <= set(known), f"unknown key {min(table.keys() - set(known), default='')!r}")
+            found = msgspec.convert(table, RobotConfig, dec_hook=lambda _, text: Path(text))
+            return replace(found, model=path.parent / found.model, terms=terms)
+        except UsageError:
+            raise
+        except (ValueError, TypeError, OSError) as error:
+            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(known)}") from None
 
 
 @struct.dataclass

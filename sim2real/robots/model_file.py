@@ -78,6 +78,7 @@ class _Budget:
         self._bytes = self._file_bytes = 0
         self._elements = 0
         self._seen: set[Path] = set()
+        self._names: set[str] = set()
 
     def check(self, path: Path) -> None:
         """Count a file.
@@ -129,8 +130,9 @@ class _Budget:
 
     def _element(self, element: ET.Element) -> None:
         tag, get = element.tag, element.attrib
+        self._names.add(get.get("name", ""))
         for name, value in get.items():
-            if name != "name" and any(_strange(word, name) for word in value.split()):
+            if value not in self._names and any(_strange(word, name) for word in value.split()):
                 raise UsageError(f"{self._path}: {name} = {value!r} of a <{tag}> is not finite", hint="correct it")
         if tag == "include":
             self.check(self._path.parent / get.get("file", ""))

@@ -46,14 +46,14 @@ def run(config: ImportConfig) -> None:
             with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 importer.write_log(log := stage.output("log", "session.mcap"), episode, mapping)
                 if text:
-                    (written := stage.output("mapping", "import.toml")).write_text(text)
+                    (written := stage.output("mapping", "import.toml")).write_text(text, encoding="utf-8")
                 for name, path in Timing.of(episode).save(stage.folder).items():
                     stage.output(name, path)
                 stage.summary(facts)
         else:
             importer.write_log(log, episode, mapping)
             if text:
-                (written := log.with_suffix(".import.toml")).write_text(text)
+                (written := log.with_suffix(".import.toml")).write_text(text, encoding="utf-8")
         print(console.pairs(facts))
         console.wrote(log)
         if written is not None:
