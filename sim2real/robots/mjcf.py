@@ -16,6 +16,9 @@ from sim2real.robots.holding import Holding, apply, plan
 
 NO_LIMIT = 1e6
 _LEAST_FRICTION = 1e-9
+_OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
+              "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
+"""Units of hinges -> units of slides."""
 
 
 def read_spec(path: Path, contacts: bool = False) -> Any:
@@ -32,6 +35,16 @@ def joints_of(model: Any) -> tuple[str, ...]:
     """Return the names of a model's hinges and slides, in its order."""
     kinds = {int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE)}
     return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
+
+
+def slides_of(model: Any, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return those of a model's joints that are slides: their units have m for rad, and N for N m."""
+    return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
+
+
+def unit_for(unit: str, slide: bool) -> str:
+    """Return the unit of a hinge's quantity, or what takes its place at a slide."""
+    return _OF_SLIDES.get(unit, unit) if slide else unit
 
 
 def driven(

@@ -32,6 +32,8 @@ from sim2real.robots.mjcf import (
     read_model,
     read_spec,
     set_drives,
+    slides_of,
+    unit_for,
 )
 from sim2real.robots.mjcf_parameters import (
     FALLBACK,
@@ -226,10 +228,14 @@ class MjcfRobot(LoggedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Field -> unit."""
+        """Field -> unit; entry of a field, such as ``position[0]``, where some joints are slides and others hinges."""
         known = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
         there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
-        return {field: unit for field, unit in known.items() if field in there}
+        known = {field: unit for field, unit in known.items() if field in there}
+        slides = [joint in slides_of(self.model, self.config.joints) for joint in self.config.joints]
+        if len(set(slides)) == 1:
+            return {field: unit_for(unit, slides[0]) for field, unit in known.items()}
+        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in known.items() for i, s in enumerate(slides)}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""

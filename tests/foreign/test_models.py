@@ -3,6 +3,7 @@
 import struct
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
+from sim2real.log.foreign import open_foreign
 from sim2real.robots import model_file
 from sim2real.robots.mjcf import driven, read_model
+from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.stages import described
+from sim2real.stages import described, importing
 
 FOUR_BAR = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="crank"><joint name="crank" axis="0 1 0" damping=".01"/>
@@ -223,3 +226,76 @@ def test_a_name_with_a_line_break_matches_a_pattern(tmp_path):
     (tmp_path / "robot.xml").write_text(model(joint="a&#10;[[terms]]"))
     config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=described.usual_terms(("goal",)))
     assert len(MjcfRobot(config).dynamics()) == 4
+
+
+SLIDE = '<joint name="x" type="slide" axis="1 0 0" frictionloss="10"/>'
+AXIS = f"""<mujoco><option gravity="0 0 0"/><worldbody><body>{SLIDE}<geom size=".1" mass="95"/>
+{{}}</body></worldbody></mujoco>"""
+RAIL = AXIS.format('<body><joint name="arm" axis="0 1 0"/><geom size=".1" pos=".2 0 0" mass="1"/></body>')
+UNITS = {
+    "gain": ("N m", "N"), "damping": ("N m s/rad", "N s/m"), "armature": ("kg m^2", "kg"), "frictionloss": ("N m", "N"),
+    "kp": ("N m/rad", "N/m"), "kd": ("N m s/rad", "N s/m"), "speed": ("rad/s", "m/s"), "torque": ("N m", "N"),
+    "zero": ("rad", "m"), "play": ("rad", "m"), "drag": ("N m s^2/rad^2", "N s^2/m^2"), "static": ("N m", "N"),
+    "stribeck_rad_s": ("rad/s", "m/s"), "load": ("1", "1"), "tilt_x": ("rad", "rad"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", UNITS)
+def test_parameters_of_slides_are_in_metres_and_newtons(tmp_path, what):
+    """Also beside a hinge, with which a slide shares no value that has another unit."""
+    (tmp_path / "rail.xml").write_text(RAIL)
+    for joints, index in ((("arm",), 0), (("x",), 1)):
+        config = RobotConfig(tmp_path / "rail.xml", joints, ("torque",), terms=(ParameterPattern(what),))
+        assert [p.unit for p in MjcfRobot(config).dynamics()] == [UNITS[what][index]]
+    both = MjcfRobot(replace(config, joints=("x", "arm"))).dynamics()
+    if len(set(UNITS[what])) == 1:
+        assert [(p.name, p.unit) for p in both] == [(what, UNITS[what][0])]
+    else:
+        assert [(p.name, p.unit) for p in both] == [(what, UNITS[what][0]), (f"{what}_slide", UNITS[what][1])]
+
+
+@pytest.mark.parametrize(
+    ("text", "joints", "units"),
+    [
+        (AXIS.format(""), ("x",), {"position": "m", "velocity": "m/s", "torque": "N"}),
+        (RAIL, ("arm",), {"position": "rad", "velocity": "rad/s", "torque": "N m"}),
+        (RAIL, ("x", "arm"), {"position[0]": "m", "position[1]": "rad", "velocity[0]": "m/s", "velocity[1]": "rad/s",
+                              "torque[0]": "N", "torque[1]": "N m"}),
+    ],
+)  # fmt: skip
+def test_fields_of_slides_are_in_metres_and_newtons(tmp_path, text, joints, units):
+    (tmp_path / "rail.xml").write_text(text)
+    robot = MjcfRobot(RobotConfig(tmp_path / "rail.xml", joints, ("torque",), velocity=True))
+    assert robot.units == units
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "joints", "scale", "units"),
+    [
+        ("q_m", AXIS.format(""), ("x",), 0.1, ("m", "N")),
+        ("q", AXIS.format(""), ("x",), 0.1, ("m", "N")),
+        ("q_rad", RAIL, ("arm",), 0.5, ("rad", "N m")),
+    ],
+)
+def test_logs_of_slides_are_in_metres_and_newtons(tmp_path, capsys, file, text, joints, scale, units):
+    t = np.arange(0.0, 20.0, 0.005)
+    q = scale * np.sin(2 * np.pi * 0.7 * t + np.sin(1.3 * t))[:, None]
+    np.savez(
+        tmp_path / "run.npz", **{"t_s": t, file: q, "force_cmd_n": 1000 * np.gradient(np.gradient(q, axis=0), axis=0)}
+    )
+    (tmp_path / "robot.xml").write_text(text)
+    asked = importing.asked_of_model(tmp_path / "robot.xml", "axis", joints)
+    mapping, written = importing.proposed(open_foreign(tmp_path / "run.npz"), asked)
+    assert (mapping.units["sensor"]["position"], mapping.units["actuator"]["torque"]) == units
+    assert (units[0] == "m") == ("is in radians" not in written)
+    assert (units[0] == "m") == ("x slides" in capsys.readouterr().err)
+
+
+def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
+    t = np.arange(0.0, 20.0, 0.005)
+    q = 120.0 * np.sin(2 * np.pi * 0.7 * t + np.sin(1.3 * t))[:, None]
+    np.savez(tmp_path / "run.npz", t_s=t, q=q, force_cmd=np.gradient(np.gradient(q, axis=0), axis=0))
+    (tmp_path / "robot.xml").write_text(AXIS.format(""))
+    asked = importing.asked_of_model(tmp_path / "robot.xml", "axis")
+    with pytest.raises(UsageError, match=r"(?s)taken for degrees, but x slides.*0.001 for mm"):
+        importing.proposed(open_foreign(tmp_path / "run.npz"), asked)
