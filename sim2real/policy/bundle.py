@@ -109,7 +109,7 @@ def save_bundle(
     (folder / CONTRACT).unlink(missing_ok=True)
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    (folder / CONTRACT).write_text(json.dumps(about, indent=2) + "\n")
+    (folder / CONTRACT).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return folder
 
 

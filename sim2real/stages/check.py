@@ -20,9 +20,11 @@ from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify import excitation, identifiability, uncertainty
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
+from sim2real.log.schema import unit_of
 from sim2real.robots.base import Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages import advice
@@ -192,9 +194,9 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
         joints.append(
             {
                 "name": c.name,
-                "unit": units.get(c.position, ""),
+                "unit": unit_of(position_of(c), units),
                 **{k: _as_json(v) for k, v in own.items()},
-                **asdict(excitation.motion(velocity, c.velocity_sigma)),
+                **asdict(excitation.motion_of(t_s, position)),
             }
         )
     commands = []
@@ -208,7 +210,7 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
                 commands.append(
                     {
                         "name": name,
-                        "unit": units.get(field, ""),
+                        "unit": unit_of(f"{field}[{i}]", units),
                         **_as_json(excitation.spread(values)),
                         **(asdict(band) if band else {"low_hz": None, "high_hz": None}),
                     }

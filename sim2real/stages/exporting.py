@@ -103,7 +103,7 @@ def write(
         content = source(
             terms, f"Actuators and randomisation of {found.pipeline!r}, as sim2real identified them.", about
         )
-    out.write_text(content)
+    out.write_text(content, encoding="utf-8")
 
 
 def find_parameters(config: ExportConfig) -> Path:

@@ -182,9 +182,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         for name, path in found.save(stage.folder).items():
             stage.output(name, path)
         for name, text in pipeline.texts().items():
-            stage.output(Path(name).stem + "_" + Path(name).suffix[1:], name).write_text(text)
+            stage.output(Path(name).stem + "_" + Path(name).suffix[1:], name).write_text(text, encoding="utf-8")
         if (mjcf := robot.identified_mjcf(found.values)) is not None:
-            stage.output("mjcf", "identified.xml").write_text(mjcf)
+            stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
         from sim2real.view.page import identify_page  # matplotlib and jinja2 take 0.5 s to import
 
         stage.output("page", identify_page(stage.folder).name)
