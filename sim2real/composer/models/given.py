@@ -147,6 +147,10 @@ class Records:
         """Return the classes of defaults directly below another one."""
         return [below for below, above in self._classes.items() if above == name]
 
+    def class_names(self) -> list[str]:
+        """Return all classes of defaults."""
+        return list(dict.fromkeys(["main", *self._classes]))
+
     def add_class(self, name: str, above: str) -> None:
         """Note a class of defaults."""
         self._classes[name] = above
@@ -187,8 +191,12 @@ class Records:
         return self._written(native, kind) or read(native, kind, defaults(native, kind))
 
     def _written(self, native: Native, kind: str) -> Given | None:
+        return None if kind == "inertial" else self.written(native)
+
+    def written(self, native: Native) -> Given | None:
+        """Return what the document has of an element, or of a part of a tendon's path; None without a document."""
         words = native.info.split()
-        if self._document is None or kind == "inertial" or len(words) != 2 or not words[1].isdigit():
+        if self._document is None or len(words) != 2 or not words[1].isdigit():
             return None
         return self._document.lines.get(int(words[1]))
 

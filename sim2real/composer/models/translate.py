@@ -343,6 +343,28 @@ def _parsed(
     return fixed, named
 
 
+def key_of(kind: str, tag: str, name: str, references: tuple[str, ...], plain: Mapping[str, str]) -> str | None:
+    """Return the native attribute, such as ``objname`` or ``textures[1]``, that MuJoCo's parser puts a reference in.
+
+    Args:
+        kind: Namespace of the element, such as ``sensor``.
+        tag: Its tag.
+        name: The attribute in MJCF that names another element.
+        references: All its attributes that do so.
+        plain: Attributes that decide what is named.
+    """
+    try:
+        _, named = _parsed(kind, tag, tuple(plain.items()), references)
+    except ValueError:
+        return None
+    for key, value in named.items():
+        if value == f"@{name}":
+            return key
+        if isinstance(value, list) and f"@{name}" in value:
+            return f"{key}[{value.index(f'@{name}')}]"
+    return None
+
+
 def _is_reference(value: Any) -> bool:
     """Return whether a parsed value is a placeholder, or a list with one."""
     if isinstance(value, list):
@@ -370,10 +392,15 @@ def same(a: Any, b: Any) -> bool:
         return True
 
 
+def kind_of(native: Native) -> str:
+    """Return the kind of an element of an ``MjSpec``."""
+    return type(native).__name__.removeprefix("Mjs").lower()
+
+
 def plural(kind: str) -> str:
     """Return the name of the list in an ``MjSpec`` that holds elements of a kind."""
     if kind == "body":
         return "bodies"
     if kind == "equality":
         return "equalities"
-    return f"{kind}es" if kind == "mesh" else f"{kind}s"
+    return f"{kind}es" if kind in ("mesh", "flex") else f"{kind}s"

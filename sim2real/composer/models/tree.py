@@ -14,6 +14,7 @@ from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
+    from sim2real.composer.models.paths import Part
     from sim2real.composer.types import MjSpec, Native
 
 _ADDED_LATER = 1_000_000_000
@@ -55,8 +56,10 @@ class Handle:
 
     @name.setter
     def name(self, value: str) -> None:
+        from sim2real.composer.models import references  # which needs what is defined here
+
         self.root.check_name(self.kind, value)
-        self._native.name = value or ""
+        references.rename(self, value or "")
         self.root.touch()
 
     @property
@@ -118,6 +121,7 @@ class Tree(Scope, Generic[H]):
     Attributes:
         references: Native element and attribute -> the element that the attribute names, whatever that is called.
         records: What was given of every element.
+        paths: Native tendon -> what it runs over, as far as that was read.
     """
 
     handle_type: ClassVar[type[Handle]] = Handle
@@ -127,6 +131,7 @@ class Tree(Scope, Generic[H]):
         super().__init__(model, spec)
         self.records = Records(document, is_blank=spec is None)
         self.references: dict[tuple[Native, str], H] = {}
+        self.paths: dict[Native, list[Part]] = {}
         self._handles: dict[Native | tuple[Native, str], H] = {}
         self._order: dict[Native, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
@@ -155,6 +160,13 @@ class Tree(Scope, Generic[H]):
         number = [*map(id, peers)].index(id(element))
         own = f"/unnamed_{element.kind}_{number}"
         return (prefix or ("/" if relative_to is None else "")) + own
+
+    def rename_attachment(self, old: str, new: str) -> None:
+        """Rename an attached model's frame; what names the model's elements names them still."""
+        from sim2real.composer.models import references  # which needs what is defined here
+
+        references.hold_below(self, f"{old}/")
+        super().rename_attachment(old, new)
 
     # -- handles
 
