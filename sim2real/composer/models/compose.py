@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sim2real.composer.models import files, keyframes, merge, translate
 from sim2real.composer.models import late as late_elements
 from sim2real.composer.models.paths import ELSEWHERE, path_of, wrap
-from sim2real.composer.models.targets import SECTION_KINDS
+from sim2real.composer.models.targets import SECTION_KINDS, point
 from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
@@ -138,7 +138,7 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
             native.name = name
         for (native, key), target in model.references.items():
             own = target.root is model and not target.is_removed
-            translate.point(native, key, target._native.name if own else ELSEWHERE)
+            point(native, key, target._native.name if own else ELSEWHERE)
         for native, _ in left_out:  # the names of what a copy drops stay taken in it
             native.name = ""
         out = spec.copy()

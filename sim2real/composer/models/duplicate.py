@@ -6,7 +6,8 @@ import itertools
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from sim2real.composer.models import compose, translate
-from sim2real.composer.models.paths import Part, path_of
+from sim2real.composer.models.given import PathPart
+from sim2real.composer.models.paths import path_of
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
@@ -42,9 +43,9 @@ def _twin(model: Tree[Any], target: Any, twins: dict[T, T], natives: dict[Native
     return twins[target.root].handle(target.kind, natives[target._native])
 
 
-def _part(model: Tree[Any], part: Part, twins: dict[T, T], natives: dict[Native, Native]) -> Part:
+def _part(model: Tree[Any], part: PathPart, twins: dict[T, T], natives: dict[Native, Native]) -> PathPart:
     values = {k: _twin(model, v, twins, natives) if hasattr(v, "root") else v for k, v in part.values.items()}
-    return Part(part.tag, values, dict(part.written))
+    return PathPart(part.tag, values, dict(part.written))
 
 
 def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:

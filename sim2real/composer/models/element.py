@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2real.composer.models import attaching, builder, files, given, schema, translate
 from sim2real.composer.models.element_list import ElementList
-from sim2real.composer.models.references import REFERENCES, refer, referenced
+from sim2real.composer.models.references import REFERENCES, refer, referenced, rename
 from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Handle, Tree
@@ -148,7 +148,9 @@ class Element(Handle):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "name":
-            type(self).name.__set__(self, value)
+            self.root.check_name(self.kind, value)
+            rename(self, value or "")
+            self.root.touch()
             return
         kind, said = self.kind, self.recorded()
         value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value

@@ -41,6 +41,26 @@ class Given:
             self.values[name] = value
 
 
+@dataclass
+class PathPart:
+    """A part of a tendon's path.
+
+    Attributes:
+        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
+        values: Attribute in MJCF -> element, its name where it is not there, or number.
+        written: Attribute -> the name that the ``MjSpec`` has.
+    """
+
+    tag: str
+    values: dict[str, Any]
+    written: dict[str, str]
+
+    def is_outdated(self, model: Any) -> bool:
+        """Return whether the ``MjSpec`` has other names than those by which the model's own elements are called now."""
+        named = [(self.values[key], text) for key, text in self.written.items()]
+        return any(e.root is not model or e.is_removed or e._native.name != text for e, text in named)
+
+
 class Document:
     """The text of a model, from which the tags and attributes of its elements are read when somebody asks.
 

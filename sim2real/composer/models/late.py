@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.models import paths, translate
 from sim2real.composer.models.paths import path_of
-from sim2real.composer.models.targets import SECTION_KINDS, targets
+from sim2real.composer.models.targets import SECTION_KINDS, point, targets
 from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
@@ -84,8 +84,9 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
                 hint="elements of attached models have the names of those in front: arm/hand/finger",
             )
     if found.is_removed:
+        name = found.root.removed.get(found, "")
         raise UsageError(
-            f"{element} of model {model.model!r} names a {kind} that was removed",
+            f"{element} of model {model.model!r} names the {kind} {name!r}, which was removed",
             hint=f"remove the {element.split()[0]} as well, or let it name another {kind}",
         )
     return final_name(found, top)
@@ -103,7 +104,7 @@ def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: froze
     Raises:
         UsageError: When an element names one that is not there.
     """
-    for kind in kinds:
+    for kind in (k for k in SECTION_KINDS if k in kinds):
         for model in models:
             for native in list(getattr(model._spec, translate.plural(kind))):
                 element = model.handle(kind, native)
@@ -111,14 +112,21 @@ def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: froze
                 what = f"{kind} {element.name or final_name(element, top)!r}"
                 for key, target_kind, text in list(targets(kind, native)):
                     target = model.references.get((native, key), text)
-                    translate.point(new, key, named(model, what, target_kind, target, top))
+                    point(new, key, named(model, what, target_kind, target, top))
                 if kind == "tendon":
                     for part in path_of(model, native):
                         paths.wrap(new, part, lambda k, t, m=model, w=what: named(m, w, k, t, top))
 
 
 def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
-    """Add a copy of an element to a spec; what it names is called as in the other spec. A tendon has no path yet."""
+    """Add a copy of an element to a spec; what it names is called as in its own spec, and a tendon has no path yet.
+
+    Args:
+        out: The spec.
+        kind: What the element is.
+        native: The element of its own spec.
+        name: The name of the copy.
+    """
     new = getattr(out, f"add_{kind}")()
     new.name, new.info = name, native.info
     for key in translate.attributes(native):
@@ -146,7 +154,7 @@ def point_aside(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], done
             if (target.root is not model or target.is_removed) and element.kind not in done:
                 what = f"{element.kind} {element.full_identifier!r}"
                 new = getattr(out, element.kind)(final_name(element, top))
-                translate.point(new, key, named(model, what, target.kind, target, top))
+                point(new, key, named(model, what, target.kind, target, top))
 
 
 COUNTED = (*TREE_KINDS, *SECTION_KINDS, *("mesh", "material", "texture", "hfield", "skin", "flex"), "numeric", "text")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.models import attaching, compose, duplicate, files, parse
+from sim2real.composer.models import attaching, compose, duplicate, files, parse, references
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.given import Document
 from sim2real.composer.models.schema import SECTION_OF
@@ -85,6 +85,11 @@ class Model(Tree[Element]):
     def enter_scope(self, scope_identifier: str) -> Model | None:
         """Return the model attached under a name such as ``arm/hand``, or None."""
         return self.find("attached_model", scope_identifier.rstrip("/"))
+
+    def rename_attachment(self, old: str, new: str) -> None:
+        """Rename an attached model's frame; what names the model's elements names them still."""
+        references.hold_below(self, f"{old}/")
+        super().rename_attachment(old, new)
 
     # -- attaching
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from sim2real.composer.models.given import PathPart
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
@@ -29,39 +29,19 @@ _TAGS = {
 }
 
 
-@dataclass
-class Part:
-    """A part of a tendon's path.
-
-    Attributes:
-        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
-        values: Attribute in MJCF -> element, its name where it is not there, or number.
-        written: Attribute -> the name that the ``MjSpec`` has.
-    """
-
-    tag: str
-    values: dict[str, Any]
-    written: dict[str, str]
-
-    def is_outdated(self, model: Tree[Any]) -> bool:
-        """Return whether the ``MjSpec`` has other names than those by which the model's own elements are called now."""
-        named = [(self.values[key], text) for key, text in self.written.items()]
-        return any(e.root is not model or e.is_removed or e._native.name != text for e, text in named)
-
-
-def path_of(model: Tree[Any], native: Native) -> list[Part]:
+def path_of(model: Tree[Any], native: Native) -> list[PathPart]:
     """Return the path of a tendon."""
     known = model.paths.setdefault(native, [])
     known += [_read(model, native, wrap) for wrap in list(native.path)[len(known) :]]
     return known
 
 
-def _read(model: Tree[Any], native: Native, wrap: Any) -> Part:
+def _read(model: Tree[Any], native: Native, wrap: Any) -> PathPart:
     """Return what an ``MjSpec`` or its document has of a part of a path."""
     tag = _TAGS[wrap.type]
     values: dict[str, Any] = {"coef": wrap.coef} if tag == "joint" else {}
     if tag == "pulley":
-        return Part(tag, {"divisor": wrap.divisor}, {})
+        return PathPart(tag, {"divisor": wrap.divisor}, {})
     said = model.records.written(wrap)
     for key, target in zip(NAMING[tag], (wrap.target, wrap.sidesite if tag == "geom" else None), strict=False):
         text = None if said is None else said.values.get(key)
@@ -71,11 +51,16 @@ def _read(model: Tree[Any], native: Native, wrap: Any) -> Part:
             values[key] = model.find(KIND[key], text) or text
         elif key == tag:
             raise UsageError(f"tendon {native.name!r} of model {model.model!r} runs over a {tag} that is not there")
-    return Part(tag, values, {k: v.name or "" for k, v in values.items() if hasattr(v, "root")})
+    return PathPart(tag, values, {k: v.name or "" for k, v in values.items() if hasattr(v, "root")})
 
 
-def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> Part:
-    """Return a part of a path from its attributes in MJCF: elements, or their names.
+def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> PathPart:
+    """Return a part of a path.
+
+    Args:
+        model: The model of the tendon.
+        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
+        attrs: The attributes in MJCF: elements, or their names.
 
     Raises:
         UsageError: When there is no such part, or an attribute is missing.
@@ -90,10 +75,10 @@ def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> Part:
     for key in NAMING[tag]:
         if isinstance(values.get(key), str):
             values[key] = model.find(KIND[key], values[key]) or values[key]
-    return Part(tag, values, {})
+    return PathPart(tag, values, {})
 
 
-def wrap(tendon: Native, part: Part, name: Callable[[str, Handle | str], str]) -> None:
+def wrap(tendon: Native, part: PathPart, name: Callable[[str, Handle | str], str]) -> None:
     """Let the path of a tendon of an ``MjSpec`` run on over a part.
 
     Args:

@@ -59,7 +59,7 @@ def refer(element: Handle, key: str, target: Handle | str | None) -> None:
         target = target.name or ""
     else:
         model.references.pop((element._native, key), None)
-    translate.point(element._native, key, target or "")
+    targets.point(element._native, key, target or "")
     model.touch()
 
 
@@ -100,10 +100,10 @@ def rename(element: Handle, name: str) -> None:
     element._native.name = name
     for (native, key), target in model.references.items():
         if target is element:
-            translate.point(native, key, name)
+            targets.point(native, key, name)
     for native, key, kind, text in list(targets.of_classes(model)) if old else ():
         if (kind, text) == (element.kind, old):
-            translate.point(native, key, name)
+            targets.point(native, key, name)
 
 
 def hold_below(model: Tree[Handle], prefix: str) -> None:
@@ -140,11 +140,13 @@ def let_go(model: Tree[Handle], gone: Iterable[Handle]) -> None:
         for (native, key), target in list(one.references.items()):
             if target in gone and target.kind in targets.COSMETIC:
                 del one.references[native, key]
-                translate.point(native, key, "")
+                targets.point(native, key, "")
                 one.records.of(native, translate.kind_of(native)).note(target.kind, None)
+        held = [*one.references.values(), *(v for path in one.paths.values() for p in path for v in p.values.values())]
+        model.removed |= {element: element.name or "" for element in gone if any(element is v for v in held)}
     for native, key, kind, text in list(targets.of_classes(model)):
         if any((kind, text) == (element.kind, element.name) for element in gone):
-            translate.point(native, key, "")
+            targets.point(native, key, "")
 
 
 def _hold(elements: Iterable[Handle]) -> None:

@@ -102,3 +102,20 @@ def of_classes(model: Tree[Any]) -> Iterator[tuple[Native, str, str, str]]:
         for kind in _IN_DEFAULTS:
             native = getattr(model._spec.find_default(name), kind)
             yield from ((native, *t) for t in targets(kind, native))
+
+
+def point(native: Native, key: str, name: str) -> None:
+    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
+
+    Args:
+        native: The element of the ``MjSpec``.
+        key: The attribute, in the spelling of ``MjSpec``.
+        name: The other element's name; '' for none.
+    """
+    key, _, number = key.partition("[")
+    if not number:
+        setattr(native, key, name)
+        return
+    names = list(getattr(native, key))
+    names[int(number[:-1])] = name
+    setattr(native, key, names)

@@ -39,6 +39,7 @@ _RENAMED = {
         "actuatorfrclimited": "actfrclimited",
         "actuatorgravcomp": "actgravcomp",
     },
+    "site": {"mesh": "meshname"},
     "camera": {"target": "targetbody"},
     "light": {"target": "targetbody"},
     "tendon": {
@@ -118,23 +119,6 @@ def read(native: Native, kind: str, key: str) -> Any:
     if kind == "body" and key == "mocap":
         return "true" if value else "false"
     return value
-
-
-def point(native: Native, key: str, name: str) -> None:
-    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
-
-    Args:
-        native: The element of the ``MjSpec``.
-        key: The attribute, in the spelling of ``MjSpec``.
-        name: The other element's name; '' for none.
-    """
-    key, _, number = key.partition("[")
-    if not number:
-        setattr(native, key, name)
-        return
-    names = list(getattr(native, key))
-    names[int(number[:-1])] = name
-    setattr(native, key, names)
 
 
 def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models import translate
-from sim2real.composer.models.given import Document, Given, Records
+from sim2real.composer.models.given import Document, Given, PathPart, Records
 from sim2real.composer.models.schema import KIND_OF_TAG, SECTION_OF
 from sim2real.composer.models.scope import Scope
 from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.paths import Part
     from sim2real.composer.types import MjSpec, Native
 
 _ADDED_LATER = 1_000_000_000
@@ -56,10 +55,8 @@ class Handle:
 
     @name.setter
     def name(self, value: str) -> None:
-        from sim2real.composer.models import references  # which needs what is defined here
-
         self.root.check_name(self.kind, value)
-        references.rename(self, value or "")
+        self._native.name = value or ""
         self.root.touch()
 
     @property
@@ -121,6 +118,7 @@ class Tree(Scope, Generic[H]):
     Attributes:
         references: Native element and attribute -> the element that the attribute names, whatever that is called.
         records: What was given of every element.
+        removed: Deleted element that others name -> its name.
         paths: Native tendon -> what it runs over, as far as that was read.
     """
 
@@ -131,7 +129,8 @@ class Tree(Scope, Generic[H]):
         super().__init__(model, spec)
         self.records = Records(document, is_blank=spec is None)
         self.references: dict[tuple[Native, str], H] = {}
-        self.paths: dict[Native, list[Part]] = {}
+        self.removed: dict[Handle, str] = {}
+        self.paths: dict[Native, list[PathPart]] = {}
         self._handles: dict[Native | tuple[Native, str], H] = {}
         self._order: dict[Native, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
@@ -160,13 +159,6 @@ class Tree(Scope, Generic[H]):
         number = [*map(id, peers)].index(id(element))
         own = f"/unnamed_{element.kind}_{number}"
         return (prefix or ("/" if relative_to is None else "")) + own
-
-    def rename_attachment(self, old: str, new: str) -> None:
-        """Rename an attached model's frame; what names the model's elements names them still."""
-        from sim2real.composer.models import references  # which needs what is defined here
-
-        references.hold_below(self, f"{old}/")
-        super().rename_attachment(old, new)
 
     # -- handles
 
