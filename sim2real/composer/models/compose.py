@@ -78,7 +78,7 @@ def _whole(model: Tree[Handle], models: list[Tree[Handle]]) -> MjSpec:
 
 def _wanted(models: list[Tree[Handle]]) -> dict[str, int]:
     """Return how many elements of each kind the world of some models has."""
-    counts = [late_elements.count(m._spec) for m in models]
+    counts = [late_elements.count_own(m) for m in models]
     wanted = {kind: sum(c[kind] for c in counts) for kind in counts[0]}
     # Where a model has a free joint of its own, its body takes the place of the frame.
     wanted["body"] -= sum(free_body(a.model) is not None for m in models for a in m.attachments.values())

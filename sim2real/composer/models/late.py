@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sim2real.composer.models import paths, translate
 from sim2real.composer.models.paths import path_of
 from sim2real.composer.models.targets import SECTION_KINDS, point, targets
@@ -128,11 +130,16 @@ def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
         name: The name of the copy.
     """
     new = getattr(out, f"add_{kind}")()
-    new.name, new.info = name, native.info
     for key in translate.attributes(native):
         value = getattr(native, key)
-        if not callable(value) and value is not None and key != "path":
+        if key == "path" or callable(value) or value is None:
+            continue
+        if isinstance(value, np.ndarray):
+            if value.tobytes() != getattr(new, key).tobytes():
+                setattr(new, key, value)
+        elif type(value).__name__.endswith("Vec") or value != getattr(new, key):
             setattr(new, key, value)
+    new.name, new.info = name, native.info
     if getattr(native, "plugin", None) is not None and native.plugin.active:
         for key in ("name", "plugin_name", "active"):
             setattr(new.plugin, key, getattr(native.plugin, key))
@@ -166,3 +173,10 @@ def count(spec: MjSpec) -> dict[str, int]:
     found = {kind: len(getattr(spec, translate.plural(kind))) for kind in COUNTED}
     found["body"] -= 1
     return found
+
+
+def count_own(model: Tree[Handle]) -> dict[str, int]:
+    """Return how many elements of each kind a model has, without those of attached models."""
+    if model.counted is None or model.counted[0] is None or model.counted[0] != model.revision():
+        model.counted = model.revision(), count(model._spec)
+    return model.counted[1]

@@ -101,7 +101,7 @@ def rename(element: Handle, name: str) -> None:
     for (native, key), target in model.references.items():
         if target is element:
             targets.point(native, key, name)
-    for native, key, kind, text in list(targets.of_classes(model)) if old else ():
+    for native, key, kind, text in list(targets.of_classes(model, (element.kind,))) if old else ():
         if (kind, text) == (element.kind, old):
             targets.point(native, key, name)
 
@@ -116,7 +116,7 @@ def hold_below(model: Tree[Handle], prefix: str) -> None:
     for one in _seeing(model):
         lead = model.prefix(one) + prefix
         _read_paths(one)
-        for native, key, kind, text in list(targets.by_text(one)):
+        for native, key, kind, text in list(targets.by_text(one, targets.ALL)):
             found = one.find(kind, text) if text.startswith(lead) and kind else None
             if found is not None:
                 one.references[native, key] = found
@@ -144,7 +144,7 @@ def let_go(model: Tree[Handle], gone: Iterable[Handle]) -> None:
                 one.records.of(native, translate.kind_of(native)).note(target.kind, None)
         held = [*one.references.values(), *(v for path in one.paths.values() for p in path for v in p.values.values())]
         model.removed |= {element: element.name or "" for element in gone if any(element is v for v in held)}
-    for native, key, kind, text in list(targets.of_classes(model)):
+    for native, key, kind, text in list(targets.of_classes(model, {element.kind for element in gone})):
         if any((kind, text) == (element.kind, element.name) for element in gone):
             targets.point(native, key, "")
 
@@ -155,8 +155,9 @@ def _hold(elements: Iterable[Handle]) -> None:
     for one in _seeing(elements[0].root) if elements else ():
         if any(element.kind in ("joint", "site", "geom") for element in elements):
             _read_paths(one)
+        kinds = {element.kind for element in elements}
         named = {(e.kind, e.root.identify(e, relative_to=one)): e for e in elements}
-        for native, key, kind, text in list(targets.by_text(one)):
+        for native, key, kind, text in list(targets.by_text(one, kinds)):
             if (kind, text) in named:
                 one.references[native, key] = named[kind, text]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.models import layout, translate
@@ -51,8 +51,11 @@ FIXED: dict[str, dict[str, str]] = {
 The path of a tendon names elements too: see ``paths``."""
 SECTION_KINDS = ("pair", "exclude", "equality", "tendon", "actuator", "sensor", "tuple")
 """Elements that stand in no body and name elements: MuJoCo drops them from a copy in which what they name is not."""
+ALL = frozenset(layout.KINDS)
+"""Kinds of elements that are named."""
 COSMETIC = ("material", "texture")
 """What an element can do without, when it is removed."""
+_IN_CLASSES = {"material", "mesh", "hfield", "texture"}
 _IN_DEFAULTS = ("geom", "site", "light", "mesh", "material", "tendon")
 
 
@@ -85,20 +88,26 @@ def _kind_of(kind: str, native: Native, key: str, number: int) -> str:
     return _OBJECTS.get(native.reftype if key == "refname" else native.objtype, "")
 
 
-def by_text(model: Tree[Any]) -> Iterator[tuple[Native, str, str, str]]:
+def by_text(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
     """Yield what the elements of a model name by text alone: the element, attribute, kind and name of the other.
 
     What a program named by element is left out, and so are the paths of tendons.
+
+    Args:
+        model: The model.
+        kinds: Kinds of the elements that are looked for; more may be found.
     """
     spec = model._spec
-    for kind in FIXED:
+    for kind, attributes in FIXED.items():
+        if "" not in attributes.values() and set(attributes.values()).isdisjoint(kinds):
+            continue
         for native in getattr(spec, translate.plural(kind)):
             yield from ((native, *t) for t in targets(kind, native) if (native, t[0]) not in model.references)
 
 
-def of_classes(model: Tree[Any]) -> Iterator[tuple[Native, str, str, str]]:
+def of_classes(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
     """Yield what the classes of defaults of a model name, as ``by_text`` does."""
-    for name in model.records.class_names():
+    for name in model.records.class_names() if not _IN_CLASSES.isdisjoint(kinds) else ():
         for kind in _IN_DEFAULTS:
             native = getattr(model._spec.find_default(name), kind)
             yield from ((native, *t) for t in targets(kind, native))

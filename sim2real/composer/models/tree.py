@@ -119,6 +119,7 @@ class Tree(Scope, Generic[H]):
         references: Native element and attribute -> the element that the attribute names, whatever that is called.
         records: What was given of every element.
         removed: Deleted element that others name -> its name.
+        counted: How many elements of each kind there were, and at which revision.
         paths: Native tendon -> what it runs over, as far as that was read.
     """
 
@@ -130,6 +131,7 @@ class Tree(Scope, Generic[H]):
         self.records = Records(document, is_blank=spec is None)
         self.references: dict[tuple[Native, str], H] = {}
         self.removed: dict[Handle, str] = {}
+        self.counted: tuple[int | None, dict[str, int]] | None = None
         self.paths: dict[Native, list[PathPart]] = {}
         self._handles: dict[Native | tuple[Native, str], H] = {}
         self._order: dict[Native, int] = {}
