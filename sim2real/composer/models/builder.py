@@ -65,9 +65,20 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
         remove(model, element)
         raise
     if kind == "joint" and body.is_frame:  # joints of a frame are called after it
-        native.name = body._native.name + (f"{name}/" if name else "")
+        _name_frame_joint(model, body, element, name)
     model.touch()
     return element
+
+
+def _name_frame_joint(model: Tree[H], frame: H, joint: H, name: str | None) -> None:
+    full = frame._native.name + (f"{name}/" if name else "")
+    if model._spec.joint(full) is not None:
+        remove(model, joint)
+        raise UsageError(
+            f"the attachment frame {frame.full_identifier!r} has a joint {full!r} already",
+            hint='give each of its joints a name: frame.add("joint", name="x", ...)',
+        )
+    joint._native.name = full
 
 
 def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -> H:
@@ -80,6 +91,8 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
     """
     model.check_name(kind, attrs.get("name"))
+    if kind in ("numeric", "text", "tuple") and not attrs.get("name"):
+        raise UsageError(f"a <{tag}> needs a name", hint=f'custom.add("{tag}", name=...)')
     defaults = _defaults(model, attrs)
     adder = getattr(model._spec, f"add_{kind}")
     native = adder() if defaults is None else adder(defaults)
@@ -250,6 +263,30 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
     path.append(part)
     model.touch()
     return tendon
+
+
+def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Any]) -> H:
+    """Add an element to those that a tuple names.
+
+    Args:
+        model: The model.
+        element: The tuple.
+        tag: ``element``.
+        attrs: ``objname``, an element or a name, with ``objtype``; ``prm``, a number.
+    """
+    native, target = element._native, attrs.get("objname")
+    word = attrs.get("objtype") or (target.kind if isinstance(target, Handle) else None)
+    kind = getattr(translate.mj.mjtObj, f"mjOBJ_{str(word).upper()}", None)
+    if tag != "element" or not target or kind is None or attrs.keys() - {"objtype", "objname", "prm"}:
+        raise UsageError(
+            f"a tuple holds <element objtype objname prm>, got <{tag}> with {attrs}",
+            hint='add("element", objtype="body", objname=body)',
+        )
+    native.objtype = [*native.objtype, int(kind)]
+    native.objprm = [*native.objprm, float(attrs.get("prm") or 0.0)]
+    native.objname = [*native.objname, ""]
+    references.refer(element, f"objname[{len(native.objname) - 1}]", target)
+    return element
 
 
 def remove(model: Tree[Handle], element: Handle) -> None:

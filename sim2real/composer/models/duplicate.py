@@ -51,6 +51,7 @@ def _part(model: Tree[Any], part: PathPart, twins: dict[T, T], natives: dict[Nat
 def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
     spec = compose.full_copy(model)
     made = twins[model] = type(model).owning(spec)
+    made.shows_text = model.shows_text
     made.inherits_angle = model.inherits_angle
     natives[model._spec.worldbody] = spec.worldbody
     for kind in compose.NAMED_KINDS:

@@ -71,6 +71,8 @@ def referenced(element: Handle, name: str) -> Handle | str | None:
     if target is not None:
         return None if target.is_removed else target
     for found, kind, text in targets.targets(element.kind, element._native):
+        if found == key and model.shows_text:
+            return text
         if found == key:
             return (model.find(kind, text) if kind else None) or text
     text = said.values.get(name)

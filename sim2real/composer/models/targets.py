@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from sim2real.composer.types import Native
 
 _OBJECTS = {
-    **{kind.object_type: name for name, kind in layout.KINDS.items()},
-    **{getattr(mj.mjtObj, f"mjOBJ_{k.upper()}"): k for k in ("pair", "exclude", "skin", "flex", "tuple")},
+    **{number: kind for kind, number in layout.OBJECT_TYPES.items()},
     mj.mjtObj.mjOBJ_XBODY: "body",
 }
 _TRANSMISSIONS = {

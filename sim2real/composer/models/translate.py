@@ -144,7 +144,7 @@ def _is_plain(native: Native, kind: str, key: str) -> tuple[bool, bool]:
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return True, True
     name = native_name(kind, key)
-    if name in _SKIPPED or not hasattr(native, name):
+    if name in _SKIPPED or not hasattr(native, name) or (kind, key) == ("numeric", "data"):  # whose length is its size
         return False, False
     value = getattr(native, name)
     is_keyword = type(value).__module__.endswith("_enums") and not isinstance(value, mj.mjtLimited)
@@ -204,6 +204,8 @@ def assign(native: Native, kind: str, key: str, value: Any) -> None:
     name, size, dtype, choices = plan
     if size:
         numbers = np.array(value, dtype) if value.__class__ is not str else np.array(_numbers(value), dtype)
+        if numbers.size > size:
+            raise UsageError(f"{key} of a <{kind}> takes no more than {size} numbers, got {numbers.size}")
         if numbers.size < size:  # a part is given: the rest stays
             whole = getattr(native, name).copy()
             whole[: numbers.size] = numbers
@@ -296,6 +298,8 @@ def from_xml(
     Raises:
         ValueError: When the parser refuses the element.
     """
+    if kind == "tuple":  # which has no attributes; what it names is added later
+        return {}, {}
     plain = tuple([(k, v if v.__class__ is str else _text(v)) for k, v in attrs.items() if k not in references])
     fixed, named = _parsed(kind, tag, plain, tuple(references))
     return fixed, {
@@ -308,7 +312,8 @@ def from_xml(
 def _parsed(
     kind: str, tag: str, plain: tuple[tuple[str, str], ...], references: tuple[str, ...]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*plain, *((k, f"@{k}") for k in references)))
+    needed = (("name", "_"),) if kind in ("numeric", "text") else ()
+    words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*needed, *plain, *((k, f"@{k}") for k in references)))
     spec = mj.MjSpec()
     if kind in TREE_KINDS:
         text, owner = f"<worldbody><body><{tag} {words}/></body></worldbody>", spec.worldbody
