@@ -53,7 +53,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
     for number, stage in enumerate(STAGES, 1):
         done = None if redo or run_dir is None else standing(run_dir).get(stage)
         if done is not None and not done.stale:
-            console.note(f"{stage} ({number}/{len(STAGES)}): {done.newest.folder.name} is finished, skipped")
+            console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")
             continue
         redo = True  # what comes after a stage that ran again is out of date
         why = f": {done.stale}" if done is not None else ""
