@@ -27,6 +27,7 @@ from sim2real.stages.probed import write_probe
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
+from sim2real.stages.targets import warn_of_stale
 
 
 def deploy(
@@ -197,7 +198,7 @@ def _find_bundle(
 ) -> tuple[Path, Path | None]:
     if config.bundle is not None:
         return Path(config.bundle), run_dir
-    trained = newest(root, pipeline.name, "train", run_dir)
+    trained = warn_of_stale(newest(root, pipeline.name, "train", run_dir))
     require_untouched(trained)
     return trained.output("bundle"), run_dir or trained.run_dir
 

@@ -22,7 +22,7 @@ from sim2real.stages.console import note, wrote
 from sim2real.stages.described import pipeline_beside
 from sim2real.stages.left_out import having
 from sim2real.stages.pipeline import available
-from sim2real.stages.targets import find_run
+from sim2real.stages.targets import find_run, warn_of_stale
 
 _FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json"}
 _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
@@ -124,9 +124,9 @@ def find_parameters(config: ExportConfig) -> Path:
     if (path / PARAMETERS).is_file():
         return path / PARAMETERS
     if source in available():
-        return newest(config.runs, source, "identify").output("parameters")
+        return warn_of_stale(newest(config.runs, source, "identify")).output("parameters")
     run_dir = find_run(config.runs, source)
-    return newest(config.runs, pipeline_of(run_dir), "identify", run_dir).output("parameters")
+    return warn_of_stale(newest(config.runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")
 
 
 def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:

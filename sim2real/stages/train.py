@@ -40,7 +40,7 @@ from sim2real.train.networks import Policy
 from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
-from sim2real.train.processes import in_words, join, leads, wait_for_all
+from sim2real.train.processes import in_words, join, leads, require_neighbours, wait_for_all
 from sim2real.train.sweep import Sweep, named
 
 
@@ -88,7 +88,8 @@ def train(
         result = patiently(
             lambda: learn(
                 made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep, teacher=master
-            )
+            ),
+            require_neighbours,
         )
     weak = None
     if config.sensitivity and leads():
