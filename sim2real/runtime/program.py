@@ -287,7 +287,8 @@ def scan_rows(
         return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
 
     gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
-    merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
+    # (rows, per row, ...) -> (C, ...); counted, as -1 cannot be inferred for a leaf of size 0
+    merge = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])  # noqa: E731
     return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
 
