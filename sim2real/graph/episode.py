@@ -115,7 +115,7 @@ class Messages:
         return len(self.seq_out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Episode:
     """A recorded run of a graph.
 
@@ -134,6 +134,9 @@ class Episode:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
     units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Episode({self.duration_s:.3f} s, steps: {', '.join(f'{n} {len(s)}' for n, s in self.steps.items())})"
 
     @property
     def duration_s(self) -> float:
