@@ -29,7 +29,7 @@ from sim2real.robots.worlds import in_world
 from sim2real.stages import advice
 from sim2real.stages.arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.config import CheckConfig, IdentifyConfig
-from sim2real.stages.console import note, pairs, shown, table
+from sim2real.stages.console import note, pairs, progress, shown, table
 from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
 from sim2real.stages.pipeline import Pipeline, pipeline_of
@@ -96,7 +96,8 @@ def check(
         logs = recordings_of(recording, pipeline)
         config = replace(config, log=tuple(str(log.path) for log in logs), plan=False)
         source = JudgedLogs([shown(log.path) for log in logs], [log.episode for log in logs], False)
-    found = judge(model, source, fitting, parameters, dict(robot.units))
+    with progress(None, "check: simulate"):
+        found = judge(model, source, fitting, parameters, dict(robot.units))
     own = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
     identify = advice.command(pipeline, replace(pipeline.identify, **own), config.runs)
     advised = advice.recommend({"pipeline": pipeline.name, **found}, identify, f"sim2real record {pipeline.name}")

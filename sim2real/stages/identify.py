@@ -92,16 +92,20 @@ def identify(
     started = time.monotonic()
     every, found, choice = _with_terms(model, episodes, windows, config, table, names, best)
     best.fitted(found.z, found.loss)
-    with progress(None, "identify: errors, predictions and baselines"):
+    with progress(None, "identify: left-out parts") as bar:
         judged = config.folds and found.converged  # errors of other fits promise nothing of this one
         without = patiently(lambda: left_out.examined(every, config, names)) if judged else ()
+        bar.set_description_str("identify: intervals")
         findings = patiently(lambda: identified.Findings.of(found, without))
         found = findings.fit
         terms = found.problem.table.terms if every.problem.table.terms else None
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
+        bar.set_description_str("identify: posterior")
         posterior = patiently(lambda: ensemble.posterior(found, findings.at, findings.spread, every, choice))
         document = identified.document(pipeline.name, findings, posterior, truth, time.monotonic() - started)
+        bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, found))
+        bar.set_description_str("identify: each recording, distribution of delays")
         each = patiently(lambda: _each(found)) if config.each and len(fitted) > 1 else ()
         own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
         document = replace(document, left_out=without, terms=terms, links=own)

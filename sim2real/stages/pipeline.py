@@ -77,6 +77,11 @@ class Pipeline:
         """How a command names the robot."""
         return (self.name,)
 
+    @property
+    def has_commands(self) -> bool:
+        """Whether a command finds it by its words."""
+        return True
+
     def mapping_of(self, path: Path) -> ImportMapping | None:
         """Return the mapping with which a file of another recorder is read; None: it is a log, or there is none."""
         from sim2real.log.mapping import load_mapping
@@ -121,6 +126,11 @@ class _OfRobot(Pipeline):
     """A robot that no pipeline has loaded, such as one made in a notebook, with the stages' own defaults."""
 
     made: Any = None
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether a command finds it by its words: it does not."""
+        return False
 
     def load(self, module: str | None = None) -> Any:
         return super().load(module) if module else self.made

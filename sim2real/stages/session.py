@@ -167,8 +167,7 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
 
 def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str) -> None:
     graph.start(state)
-    with progress(None, label) as bar:
-        bar.total = round(duration_s, 1)
+    with progress(round(duration_s, 1), label) as bar:
         begin = time.monotonic()
         while (left := duration_s - (time.monotonic() - begin)) > 0:
             graph.run_for(min(_POLL_S, left))

@@ -97,7 +97,8 @@ def train(
     teacher = None if teacher is None else bundle_of(teacher, "teacher")
     log = None if log is None else recording_of(log, pipeline, "log")
     checkpoint, resume = (None if path is None else Path(path) for path in (checkpoint, resume))
-    made = prepare(pipeline, config, identification, timing)
+    with progress(None, "train: draw episodes", leads()):
+        made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
     own = contract_of(made.robot, made.env.task, made.values, made.episodes)
     master = None if teacher is None else teacher_of(teacher, own)
@@ -110,7 +111,8 @@ def train(
         )
     weak = None
     if config.sensitivity and leads():
-        weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
+        with progress(None, "train: what breaks the policy"):
+            weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
     policy, weights = result.best, result.best.to_weights()
     contract, graph = as_taught(own, policy), export_graph(policy)
     seen = {} if policy.spec.privileged else {"training": result.observations[:MOST]}
