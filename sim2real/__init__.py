@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sim2real.graph import Timeline as Timeline
     from sim2real.graph import TrainableDist as TrainableDist
     from sim2real.graph.episode import MemoryRecorder as MemoryRecorder
+    from sim2real.graph.rebuilding import rebuild as rebuild
     from sim2real.graph.schedule import draw as draw
     from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
     from sim2real.runtime.clock import Clock as Clock
@@ -96,6 +97,7 @@ __all__ = [
     "export",
     "identify",
     "load_pipeline",
+    "rebuild",
     "record",
     "report",
     "run",
@@ -129,6 +131,7 @@ _HOMES = {
         "TrainableDist",
     ),
     "sim2real.graph.episode": ("MemoryRecorder",),
+    "sim2real.graph.rebuilding": ("rebuild",),
     "sim2real.graph.schedule": ("draw",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
