@@ -42,6 +42,13 @@ def malformed(path: Path, again: str) -> Iterator[None]:
         raise Sim2RealError(f"{path} is malformed: {reason}", hint=again) from error
 
 
+def made(folder: Path | str) -> Path:
+    """Return a folder's path; it is made if it is missing."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def check(good: bool, reason: str) -> None:
     """Raise ValueError unless ``good``; inside ``malformed`` it becomes an error that names the file."""
     if not good:

@@ -168,8 +168,7 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
 def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder) -> None:
     """Run the graph; print a warning where the log's writer falls behind, and again when it is twice as far behind."""
     graph.start(state)
-    with progress(None, label) as bar:
-        bar.total = round(duration_s, 1)
+    with progress(round(duration_s, 1), label) as bar:
         begin, warn_s = time.monotonic(), 0.0
         while (left := duration_s - (time.monotonic() - begin)) > 0:
             graph.run_for(min(_POLL_S, left))
