@@ -25,6 +25,10 @@ _MOST_SIZE: Final = 10_000_000
 """Of any attribute of `size`, and its `memory` in bytes a thousand times that."""
 _LIMITS: Final = ("lower", "upper", "effort", "velocity")
 """Attributes of a URDF's limits, which may be infinite."""
+_PACKAGES: Final = (
+    "put the folder of the package above the model, or name the folder that it is in with ROS_PACKAGE_PATH; a link with "
+    "an inertia needs no meshes without contacts"
+)
 _UNITS: Final = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
 
 
@@ -59,8 +63,9 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     except (ValueError, RuntimeError, OSError) as error:
         raise UsageError(
             f"MuJoCo cannot read {path}: {'; '.join([one_line(error), *notes])}",
-            hint="correct the file; meshes that it names must lie where it says, those of package:// in a folder of "
-            "ROS_PACKAGE_PATH or above the file; or take them out: a link with an inertia needs none without contacts",
+            hint=_PACKAGES
+            if notes
+            else "correct the file; files that it names must lie where it says, or be taken out",
         ) from None
     return spec, left_out
 
