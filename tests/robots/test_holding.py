@@ -89,6 +89,11 @@ MOTOR = '<actuator><motor joint="knee"/></actuator>'
 LIMITED = 'range="-2.7 -0.8"'
 
 
+BESIDE = f"""<mujoco><compiler angle="radian"/><worldbody><body><joint name="hip"/><geom size=".1"/></body>
+<body><joint name="knee" {LIMITED}/><geom size=".1"/></body></worldbody></mujoco>"""
+"""A knee of another leg, which changes nothing of the hip."""
+
+
 @pytest.mark.parametrize(
     ("text", "hold", "line"),
     [
@@ -97,7 +102,8 @@ LIMITED = 'range="-2.7 -0.8"'
         (arm(LIMITED, TWO.format("home")), (), "knee at -1 rad, keyframe 'home'"),
         (arm(LIMITED, TWO.format("lie")), ("lie",), "knee at -1 rad, keyframe 'lie'"),
         (arm(LIMITED, BENT), ("knee=-2.0",), "knee at -2 rad, named"),
-        (arm('range="-2.7 -1.5005"', BENT), (), "knee at -1.5 rad, keyframe 'stand'"),  # rounded: moved into the range
+        (arm('range="-2.7 -1.5005"', BENT), (), "knee at -1.5 rad, keyframe 'stand', moved into its range"),
+        (BESIDE, (), "knee at -0.8 rad, the model's zero, moved into its range"),
         (arm('type="slide"'), ("knee=0.1",), "knee at 0.1 m, named"),
         (arm("", '<actuator><motor joint="hip"/></actuator>'), (), "no actuator of the model drives it"),
         (arm("", MOTOR), (), "knee at 0 rad, the model's zero"),
@@ -116,10 +122,10 @@ def test_where_a_joint_that_was_not_recorded_is_held(tmp_path, text, hold, line)
         (
             arm(LIMITED),
             (),
-            r"(?s)knee .* at 0 rad \(the model's zero\), outside its range of -2.7 to -0.8.*--hold knee=",
+            r"(?s)knee at 0 rad \(the model's zero\), outside -2.7 to -0.8.*--hold knee=",
         ),
-        (arm('range="-2.7 -2.0"', BENT), (), "keyframe 'stand'.*outside its range"),
-        (arm(LIMITED, BENT), ("knee=0.1",), "named.*outside its range"),
+        (arm('range="-2.7 -2.0"', BENT), (), "keyframe 'stand'.*outside -2.7"),
+        (arm(LIMITED, BENT), ("knee=0.1",), "named.*outside -2.7"),
         (arm(LIMITED, TWO.format("lie")), (), "2 keyframes with different values.*stand, lie"),
         (arm(), ("toe=0.1",), "no joint 'toe' to hold. Joints: hip, knee"),
         (arm(), ("squat",), "no joint 'squat' to hold.*keyframes: none"),
