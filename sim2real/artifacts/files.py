@@ -125,9 +125,18 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a compressed npz file."""
-    named: dict[str, Any] = dict(arrays)
-    np.savez_compressed(path, **named)
+    """Write arrays to a compressed npz file, which takes any name but those with a null character.
+
+    Raises:
+        Sim2RealError: When a name has a null character, at which a zip file cuts it off.
+    """
+    if cut := [name for name in arrays if "\0" in name]:
+        raise Sim2RealError(f"{path} cannot be written: the name {cut[0]!r} has a null character")
+    # As numpy.savez_compressed does, whose arguments leave no room for an array called file.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
 
 
 def _array(kind: type, value: Any) -> Any:

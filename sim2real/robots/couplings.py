@@ -76,7 +76,7 @@ def joints_of_tendon(model: Any, tendon: int) -> frozenset[int]:
 def below(model: Any, joint: int) -> set[int]:
     """Return the numbers of the joints of a joint's body and of the bodies that hang on it."""
     top = int(model.jnt_bodyid[joint])
-    return {i for i in range(model.njnt) if top in _upwards(model, int(model.jnt_bodyid[i]))}
+    return {i for i in range(model.njnt) if top in upwards(model, int(model.jnt_bodyid[i]))}
 
 
 def _of_equality(model: Any, equality: int) -> frozenset[int]:
@@ -103,12 +103,12 @@ def _between(model: Any, bodies: Sequence[int]) -> set[int]:
     """Return the joints that move some of the bodies, but not all of them."""
     if not bodies:
         return set()
-    chains = [_upwards(model, body) for body in bodies]
+    chains = [upwards(model, body) for body in bodies]
     moved = set().union(*chains) - set(chains[0]).intersection(*chains)
     return {i for i in range(model.njnt) if int(model.jnt_bodyid[i]) in moved}
 
 
-def _upwards(model: Any, body: int) -> set[int]:
+def upwards(model: Any, body: int) -> set[int]:
     """Return a body and those that it hangs on, the world left out."""
     found: set[int] = set()
     while body > 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
-from sim2real.robots.couplings import Coupling, below, couplings_of, groups
+from sim2real.robots.couplings import Coupling, below, couplings_of, groups, upwards
 
 _HOME = "home"
 """The keyframe that is taken where a model has several."""
@@ -85,6 +86,8 @@ def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: boo
     key, named = _named(model, hold, numbers, moved, path)
     _refuse_tendons(model, couplings, numbers, {*moved, *named}, path)
     held = []
+    free = {int(model.jnt_bodyid[i]) for i in numbers | moved.keys()}
+    carrying = set().union(*(upwards(model, body) for body in free))
     for i in range(model.njnt):
         if i in numbers or i in moved:
             continue
@@ -93,7 +96,10 @@ def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: boo
                 f"the base of {path} floats: joint {model.joint(i).name or 'without a name'!r} was not recorded",
                 hint="--fix-base holds it where the model has it, as on a stand",
             )
-        held.append(_held(model, i, named.get(i), key, path))
+        body = int(model.jnt_bodyid[i])
+        matters = body in carrying or bool(upwards(model, body) & free)
+        held.append(_held(model, i, named.get(i), key, matters))
+    _refuse_outside(model, held, path)
     at = {h.joint for h in held}
     dropped = tuple(c for c in couplings if not c.acts or not c.joints or c.joints <= at)
     return Holding(tuple(held), moved, dropped, key)
@@ -206,7 +212,24 @@ def _refuse_tendons(
             )
 
 
-def _held(model: Any, number: int, named: float | None, key: int, path: Any) -> Held:
+def _refuse_outside(model: Any, held: Sequence[Held], path: Any) -> None:
+    """Refuse joints that would be held outside their ranges: they change the inertia of the others."""
+    outside = []
+    for h in held:
+        low, high = model.jnt_range[h.joint]
+        if h.unit and model.jnt_limited[h.joint] and not low <= h.value[0] <= high:
+            outside.append((h, f"{h.name} at {h.value[0]:.4g} {h.unit} ({h.source}), outside {low:.4g} to {high:.4g}"))
+    if outside:
+        flags = " ".join(f"--hold {shlex.quote(h.name)}=VALUE" for h, _ in outside)
+        raise UsageError(
+            f"{path}: joints that were not recorded would be held outside of their ranges: "
+            f"{'; '.join(line for _, line in outside)}",
+            hint=f"{flags} names where each was, in rad or m; a keyframe 'home' of the model does, too",
+        )
+
+
+def _held(model: Any, number: int, named: float | None, key: int, matters: bool) -> Held:
+    """Return where a joint is held; one that no free joint carries, or is carried by, is moved into its range."""
     kind, name = int(model.jnt_type[number]), model.joint(number).name
     at, low_high = _address(model, number), model.jnt_range[number]
     shown = name or f"a joint of body {model.body(int(model.jnt_bodyid[number])).name!r}"
@@ -221,15 +244,9 @@ def _held(model: Any, number: int, named: float | None, key: int, path: Any) -> 
     if kind == _BALL:
         return Held(number, shown, tuple(map(float, value)), "", source, passive)
     unit = "m" if kind == _SLIDE else "rad"
-    if model.jnt_limited[number]:
-        nearest = np.clip(value, *low_high)
-        if abs(nearest - value)[0] > _ROUNDED:
-            low, high = low_high
-            raise UsageError(
-                f"{path}: joint {shown} was not recorded, and would be held at {value[0]:.4g} {unit} ({source}), "
-                f"outside its range of {low:.4g} to {high:.4g} {unit}",
-                hint=f"--hold {name or 'JOINT'}=VALUE names where it was, in {unit}",
-            )
+    nearest = np.clip(value, *low_high) if model.jnt_limited[number] else value
+    if abs(nearest - value)[0] <= _ROUNDED or not (matters or named is not None):
+        source += "" if nearest[0] == value[0] else ", moved into its range"
         value = nearest
     return Held(number, shown, (float(value[0]),), unit, source, passive)
 

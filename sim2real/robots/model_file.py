@@ -25,6 +25,10 @@ _MOST_SIZE: Final = 10_000_000
 """Of any attribute of `size`, and its `memory` in bytes a thousand times that."""
 _LIMITS: Final = ("lower", "upper", "effort", "velocity")
 """Attributes of a URDF's limits, which may be infinite."""
+_PACKAGES: Final = (
+    "put the folder of the package above the model, or name the folder that it is in with ROS_PACKAGE_PATH; without "
+    "contacts, a link with an inertia needs no meshes"
+)
 _UNITS: Final = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
 
 
@@ -45,9 +49,11 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     _Budget(path).check(path)
     left_out: list[str] = []
     notes: list[str] = []
+    packaged = False
     try:
         spec = mj.MjSpec.from_file(str(path))
         notes = meshes.find_packages(spec, path)
+        packaged = bool(notes)
         try:
             spec.copy().compile()
         except (ValueError, RuntimeError, OSError):
@@ -59,8 +65,9 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     except (ValueError, RuntimeError, OSError) as error:
         raise UsageError(
             f"MuJoCo cannot read {path}: {'; '.join([one_line(error), *notes])}",
-            hint="correct the file; meshes that it names must lie where it says, those of package:// in a folder of "
-            "ROS_PACKAGE_PATH or above the file; or take them out: a link with an inertia needs none without contacts",
+            hint=_PACKAGES
+            if packaged
+            else "correct the file; files that it names must lie where it says, or be taken out",
         ) from None
     return spec, left_out
 

@@ -19,7 +19,7 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.design import Design
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.files import read_json, write_json
+from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Identification, Matrix
 from sim2real.artifacts.iterations import Iterations
 from sim2real.artifacts.latency import Latency
@@ -125,6 +125,19 @@ def test_documents_of_stages(tmp_path, kind):
         document = drawn(kind, rng)
         write_json(tmp_path / "x.json", document)
         assert plainly(read_json(tmp_path / "x.json", kind)) == plainly(document)
+
+
+@pytest.mark.parametrize("name", ["file", "a/b", "a.npy", "..", "/abs", "\u2028", *(o for o in ODD if "\0" not in o)])
+def test_arrays_of_any_name(tmp_path, name):
+    write_arrays(tmp_path / "x.npz", {name: np.array(NUMBERS), "other": np.zeros((0, 2))})
+    found = read_arrays(tmp_path / "x.npz")
+    np.testing.assert_array_equal(found[name], NUMBERS)
+    assert found["other"].shape == (0, 2)
+
+
+def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):
+    with pytest.raises(Sim2RealError, match="null character"):
+        write_arrays(tmp_path / "x.npz", {"a\0b": np.zeros(1)})
 
 
 @pytest.mark.parametrize("seed", range(5))
