@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -84,7 +84,7 @@ def minimise(
     loss: Callable[[dict[str, Any]], Any],
     parameters: Mapping[str, Any],
     bounds: Mapping[str, Any],
-    config: FitConfig | None = None,
+    config: FitConfig | Mapping[str, Any] | None = None,
     compiled: bool = True,
 ) -> Minimum:
     """Return the parameters within bounds at which a loss of one's own is least.
@@ -94,7 +94,8 @@ def minimise(
         parameters: Name -> where to begin, a number or an array.
         bounds: Name -> (lowest, highest), numbers or arrays. Positive bounds of a decade or more are searched on a
             logarithmic scale.
-        config: Strategy, population, generations, restarts, spread and seed of the search.
+        config: Strategy, population, generations, restarts, spread and seed of the search; a dict has what is different
+            from the default.
         compiled: False: the loss is plain Python, and called for one candidate after the other.
 
     Raises:
@@ -105,7 +106,7 @@ def minimise(
         raise UsageError(f"{', '.join(lacking)}: parameters and bounds must have the same names")
     if not parameters:
         raise UsageError("there is no parameter to search for")
-    config, scale = replace(config or FitConfig(generations=150), batch=0), _Scale(parameters, bounds)
+    config, scale = replace(_configured(config), batch=0), _Scale(parameters, bounds)
 
     def one(z: Any) -> Any:
         value = jnp.asarray(loss(scale.parameters(z)))
@@ -134,6 +135,15 @@ def minimise(
         found.history,
         found.evaluations + 1,
     )
+
+
+def _configured(config: FitConfig | Mapping[str, Any] | None) -> FitConfig:
+    usual = FitConfig(generations=150)
+    if config is None or isinstance(config, FitConfig):
+        return config or usual
+    if unknown := [name for name in config if name not in {f.name for f in fields(usual)}]:
+        raise UsageError(f"config has no {', '.join(unknown)}. Available: {', '.join(f.name for f in fields(usual))}")
+    return replace(usual, **config)
 
 
 def _checked(name: str, value: np.ndarray, bounds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

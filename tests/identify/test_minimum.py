@@ -58,6 +58,13 @@ def test_what_does_not_fit_is_named(parameters, bounds, said):
         minimise(lambda p: 0.0, parameters, bounds)
 
 
+def test_a_dict_of_settings():
+    found = minimise(lambda p: p["a"] ** 2, {"a": 0.5}, {"a": (-1.0, 1.0)}, {"population": 4, "generations": 3})
+    assert found.history.shape == (3,)
+    with pytest.raises(UsageError, match="config has no steps"):
+        minimise(lambda p: 0.0, {"a": 0.5}, {"a": (-1.0, 1.0)}, {"steps": 3})
+
+
 def test_a_loss_that_is_no_number_is_named():
     with pytest.raises(UsageError, match="must be one number, got an array of shape"):
         minimise(lambda p: p["a"], {"a": np.zeros(2)}, {"a": (-1.0, 1.0)}, FEW)
