@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from sim2real.stages.train import train as train
     from sim2real.stages.validate import validate as validate
     from sim2real.train.networks import Policy as Policy
+    from sim2real.view.graphs import plot_graph as plot_graph
+    from sim2real.view.graphs import plot_timeline as plot_timeline
 
     __version__: str
 
@@ -97,6 +99,8 @@ __all__ = [
     "export",
     "identify",
     "load_pipeline",
+    "plot_graph",
+    "plot_timeline",
     "rebuild",
     "record",
     "report",
@@ -146,6 +150,7 @@ _HOMES = {
     "sim2real.stages.train": ("train",),
     "sim2real.stages.validate": ("validate",),
     "sim2real.train.networks": ("Policy",),
+    "sim2real.view.graphs": ("plot_graph", "plot_timeline"),
 }
 _ROOMS = ("identify", "train")
 """Rooms that are called like the function that does their work, which is what this package has under the name."""
@@ -193,8 +198,9 @@ def __getattr__(name: str) -> Any:
     else:
         raise AttributeError(f"module 'sim2real' has no attribute {name!r}")
     if name in _ROOMS:
-        modules = vars(importlib.import_module(f"sim2real.{name}"))
-        value.__dict__.update({n: m for n, m in modules.items() if isinstance(m, ModuleType)})
+        own = importlib.import_module(f"sim2real.{name}")
+        value.__dict__.update({n: m for n, m in vars(own).items() if isinstance(m, ModuleType)})
+        value.__dict__.update({n: getattr(own, n) for n in getattr(own, "__all__", ())})
     globals()[name] = value
     return value
 

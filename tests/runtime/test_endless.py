@@ -90,8 +90,6 @@ def test_the_caller_ends_an_episode_of_unknown_length():
     graph.stop()
     assert int(ss.seq) == 250
     assert float(ss.inputs["world"].data.x[-1]) == 2 * 250 + 1
-    with pytest.raises(UsageError, match="a duration_s or a timeline, not both"):
-        AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1.0, timeline=Timeline({}, {}))
 
 
 @pytest.mark.parametrize("trainable", [False, True])
