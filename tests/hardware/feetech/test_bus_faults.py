@@ -1,11 +1,13 @@
-"""Two servos with one id: both answer, one after the other or at once, and both would obey."""
+"""Faults of buses in this process: two servos of one id, which both answer and both obey; alarms of DYNAMIXELs."""
 
 import pytest
 
-from sim2real.errors import HardwareLost
+from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
 from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.plant import OperatingMode
 
 pytestmark = pytest.mark.realtime
 
@@ -56,3 +58,24 @@ def test_dynamixels_too(serve, monkeypatch):
         assert bus.handshake({2: None}) == {2: 1060}
         with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1: both answer, and both would obey"):
             bus.handshake({1: None})
+
+
+ALARMS = {"input voltage": 0, "overheating": 2, "motor encoder": 3, "electrical shock": 4, "overload": 5}
+
+
+@pytest.mark.parametrize("bit", ALARMS.values(), ids=ALARMS)
+def test_an_alarm_in_motion_is_named_and_torque_ends_off(serve, monkeypatch, bit):
+    """As when the supply breaks down under load."""
+    monkeypatch.setattr("sts_bench.StsBus", EmulatedBus)
+    robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
+    with ServoBus(BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)) as bus:
+        bus.handshake({1: None, 2: None})
+        bus.setup(OperatingMode.PWM)
+        bus.torque(True)
+        bus.write_goal_pwm({1: 0.5, 2: 0.5})
+        bus.read_state()
+        robot.bus.servos[2].put(reg.HARDWARE_ERROR_STATUS, 1 << bit)
+        (name,) = (name for name, number in ALARMS.items() if number == bit)
+        with pytest.raises(SafetyStop, match=f"servo 2 has stopped itself: {name}"):
+            bus.read_state()
+    assert [robot.bus.servos[i].get(reg.TORQUE_ENABLE) for i in (1, 2)] == [0, 0]
