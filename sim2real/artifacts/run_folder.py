@@ -255,11 +255,11 @@ def new_run(root: Path, pipeline: str) -> Path:
 
 
 def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
-    """Return all attempts at a stage in a run folder, the latest first."""
-    folders = [run_dir / stage, *(f for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdigit())]
+    """Return all attempts at a stage in a run folder, the latest first: by number, for a clock may be set back."""
+    numbers = [int(f.suffix[1:]) for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdecimal()]
+    folders = [*(run_dir / f"{stage}.{n}" for n in sorted(numbers, reverse=True)), run_dir / stage]
     found = [(folder, read_manifest(folder)) for folder in folders]
-    there = [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
-    return sorted(there, key=lambda a: (str(a.manifest.get("started", "")), a.folder.name), reverse=True)
+    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
 
 
 def finished(run_dir: Path, stage: str) -> StageFolder | None:

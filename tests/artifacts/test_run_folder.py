@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import dataclass
+from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
@@ -49,6 +50,16 @@ def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
     assert set(done) >= {"started", "git", "command", "versions"}
     assert stage.result.output("bundle") == stage.folder / "bundle"
     assert [p.name for p in stage.folder.iterdir() if p.name.startswith(".")] == []
+
+
+class Clock:
+    """A wall clock that stands still at an hour."""
+
+    def __init__(self, hour):
+        self._hour = hour
+
+    def now(self, zone):
+        return datetime(2026, 1, 1, self._hour, tzinfo=zone)
 
 
 DIES = """
@@ -339,3 +350,34 @@ def test_a_repository_from_elsewhere_runs_no_programs(tmp_path, key):
     assert not (tmp_path / "ran").exists()
     assert state is not None
     assert state["dirty"]
+
+
+def test_a_clock_that_is_set_back_does_not_hide_the_newest_attempt(tmp_path, monkeypatch):
+    first = record(tmp_path, text="1")
+    for hour in (9, 7):  # the second one starts before the first one, says the clock
+        monkeypatch.setattr(run_folder, "datetime", Clock(hour))
+        latest = record(tmp_path, first.run_dir, text=f"at {hour}")
+    for number in range(4, 12):
+        latest = record(tmp_path, first.run_dir, text=f"at 7, {number}")
+    assert [a.folder.name for a in run_folder.attempts(first.run_dir, "record")][:3] == [
+        "record.11", "record.10", "record.9",
+    ]  # fmt: skip
+    found = run_folder.finished(first.run_dir, "record")
+    assert found is not None
+    assert found.folder == latest.folder
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.EPERM])
+def test_a_folder_that_is_read_only_is_named_before_anything_moves(tmp_path, monkeypatch, number):
+    """A process of root writes in spite of permissions, so the error is that of a file system."""
+    first = record(tmp_path)
+
+    def refuse(path, *_, **__):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    for run_dir in (None, first.run_dir):
+        with pytest.raises(
+            Sim2RealError, match=rf"cannot write the run folder .*{os.strerror(number)}[\s\S]*--runs DIR"
+        ):
+            record(tmp_path, run_dir)
