@@ -19,14 +19,14 @@ def to_xml(spec: MjSpec) -> str:
     Raises:
         ValueError: MuJoCo's own message, when the model does not compile for another reason.
     """
+    light = [b for b in spec.bodies[1:] if not b.explicitinertial and not b.geoms]  # a failed spec does not list them
     try:
         spec.compile()
         return spec.to_xml()
     except ValueError as error:
         if "mass and inertia" not in str(error):
             raise
-    for body in spec.bodies[1:]:
-        if not body.explicitinertial and not body.geoms:
-            body.explicitinertial, body.mass, body.inertia = True, _MASS, [_MASS] * 3
+    for body in light:
+        body.explicitinertial, body.mass, body.inertia = True, _MASS, [_MASS] * 3
     spec.compile()
     return re.sub(r"(<body\b[^>]*)>\s*</body>", r"\1/>", _GIVEN.sub("", spec.to_xml()))

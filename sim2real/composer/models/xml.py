@@ -37,7 +37,7 @@ _ORDER = ("inertial", "joint", "geom", "site", "camera", "light", "body")
 def _node(element: Element, top: Tree[Any], self_only: bool) -> ElementTree.Element:
     said = element.recorded().values
     node = ElementTree.Element(element.tag)
-    if element.name and not element.is_worldbody:
+    if element.name and not element.is_worldbody and element.kind != "inertial":
         node.set("name", element.root.identify(element, relative_to=top))
     for key in said:
         value = said[key] if key.startswith("file") else getattr(element, key)
