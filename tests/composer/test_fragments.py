@@ -182,6 +182,11 @@ def test_a_model_without_masses_is_written():
     assert "inertial" not in text
     assert "mass" not in text
     assert mjcf.from_xml_string(text.replace("/", "_").replace("<_", "</").replace("_>", "/>")).find("joint", "part_j")
+    hinge.add("inertial", pos=[0, 0, 0], mass=2.0)
+    text = top.to_xml_string()
+    assert 'mass="2"' in text
+    assert "inertia=" not in text
+    hinge.inertial.remove()
     hinge.add("geom", size=[0.1])
     assert mujoco.MjModel.from_xml_string(top.to_xml_string()).njnt == 1
 

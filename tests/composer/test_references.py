@@ -3,6 +3,7 @@
 import copy
 
 import pytest
+from mujoco import mjx
 from test_oracle import differing_arrays, names
 
 from sim2real.composer import mjcf
@@ -83,6 +84,11 @@ def test_changed_worlds_are_those_of_dm_control(oracle, change):
         CHANGES[change](*models)
         found.append(compiled(lib, models[0]))
     assert_equal(*found)
+
+
+def test_tendons_across_models_are_there_on_mjx():
+    model = mjx.put_model(world(mjcf)[0].compile())
+    assert (model.ntendon, model.nu, model.nsensor, model.neq) == (6, 5, 7, 5)
 
 
 def test_a_copy_names_its_own_elements():

@@ -296,6 +296,7 @@ def remove(model: Tree[Handle], element: Handle) -> None:
     """
     native = element._native
     if element.kind == "inertial":
+        translate.reset(native, translate.blank("body"), ("mass", "ipos", "iquat", "inertia", "fullinertia"))
         native.explicitinertial = False
         model.touch()
         return
