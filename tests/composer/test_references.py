@@ -138,6 +138,42 @@ def test_text_follows_a_model_that_is_renamed_after_its_elements():
     assert top.compile().actuator("m").trnid[0] == top.compile().joint("x/kk").id
 
 
+@pytest.mark.parametrize("order", [("reftype", "refname"), ("refname", "reftype")])
+def test_references_are_set_one_after_the_other(oracle, order):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        top, left, right = world(lib)
+        motor = top.actuator.add("motor", name="m", joint=left.find("joint", "j"))
+        motor.joint = right.find("joint", "k")
+        same = top.equality.add("joint", name="e", joint1=left.find("joint", "j"))
+        same.joint2 = right.find("joint", "j")
+        place = top.sensor.add("framepos", name="p", objtype="site", objname=left.find("site", "s"))
+        for name in order if lib is mjcf else ("reftype", "refname"):
+            setattr(place, name, {"reftype": "body", "refname": right.find("body", "c")}[name])
+        found.append(compiled(lib, top))
+    assert_equal(*found)
+
+
+SERVOS = ROBOT.replace('<motor name="m" joint="k"/>', '<position name="m" joint="k" kp="3"/>')
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_an_element_that_is_laid_down_anew_names_what_it_named(oracle, copied):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        robot = lib.from_xml_string(SERVOS)
+        j, k = robot.find("joint", "j"), robot.find("joint", "k")
+        j.name, k.name, j.name = "x", "j", "k"
+        robot = copy.deepcopy(robot) if copied else robot
+        robot.find("actuator", "m").kp = 5
+        robot.find("sensor", "place").reftype = "xbody"
+        robot.find("sensor", "place").refname = robot.find("body", "c")
+        top = lib.RootElement(model="w")
+        top.attach(robot)
+        found.append(compiled(lib, top))
+    assert_equal(*found)
+
+
 def test_text_that_names_nothing_is_refused():
     top = mjcf.from_xml_string('<mujoco><actuator><motor name="m" joint="r/k"/></actuator></mujoco>')
     with pytest.raises(
