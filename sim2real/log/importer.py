@@ -43,13 +43,18 @@ class _Signals:
 
 
 def import_file(
-    path: str | Path, mapping: ImportMapping | str | Path, samples: slice | None = None, format: str | None = None
+    path: str | Path,
+    mapping: ImportMapping | str | Path,
+    samples: slice | None = None,
+    format: str | None = None,
+    episode: int | None = None,
 ) -> Episode:
     """Read a file of another recorder as an episode.
 
     Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are kept, rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
-    sample. Without recorded stamps, they are generated from the node's rate. The episode's metadata has ``stamps``
+    sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
+    ``frame_index / fps`` count as generated. The episode's metadata has ``stamps``
     (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``graph``, ``mapping`` and
     ``versions``.
 
@@ -58,13 +63,14 @@ def import_file(
         mapping: The mapping from signals to fields, or the mapping file.
         samples: The samples to take, for every node; None: all.
         format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; None: chosen by the file's suffix.
+        episode: Number of the episode of a LeRobot data set; None: the only one.
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
             differ in length, a sample is not finite, or stamps do not increase.
     """
     found = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
-    return import_opened(open_foreign(Path(path), format), found, samples)
+    return import_opened(open_foreign(Path(path), format, episode), found, samples)
 
 
 def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | None = None) -> Episode:
@@ -86,18 +92,18 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
             for field, how in node.fields.items()
         }
         ticks[name] = _ticks(file, name, node, found, kept)
-        stamps[name] = GENERATED if found.stamps is None else RECORDED
+        stamps[name] = GENERATED if found.stamps is None or node.stamps in file.nominal else RECORDED
         dropped[name] = last - first - len(kept)
-    zero = _time_zero([ticks[name] for name, kind in stamps.items() if kind == RECORDED], first)
-    for name, kind in stamps.items():
-        ticks[name] -= zero if kind == RECORDED else 0
+    from_file = [name for name, found in signals.items() if found.stamps is not None]
+    zero = _time_zero([ticks[name] for name in from_file], first)
+    for name in from_file:
+        ticks[name] -= zero
     source = {
         "file": file.path.name,
         "format": file.format,
-        "sha256": hashlib.sha256(file.path.read_bytes()).hexdigest(),
-        **(
-            {"beside": {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in file.beside}} if file.beside else {}
-        ),
+        "sha256": _sha256(file.path),
+        **({"beside": {p.name: _sha256(p) for p in file.beside}} if file.beside else {}),
+        **({"notes": list(file.notes)} if file.notes else {}),
         "first_sample": first,
         "time_zero_us": zero,
         "dropped": dropped,
@@ -116,6 +122,11 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
         },
         units=mapping.units,
     )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> None:

@@ -12,6 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.log import evidence
 from sim2real.log.evidence import DEGREES, SURE, Following
 from sim2real.log.foreign import ForeignFile
+from sim2real.log.lerobot import are_degrees
 from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping
 from sim2real.log.names import same_joint
 from sim2real.log.pairing import find_pair
@@ -73,7 +74,10 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         )
     found = evidence.following(held, joined, period_s)
     fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
-    to_rad, why = radian(measured, q, asked, path)
+    proven = are_degrees(file.facts, _names_of(file, measured), q, path)
+    to_rad, why = (
+        (DEGREES, "its steps are those of encoders of 4096 a turn") if proven else radian(measured, q, asked, path)
+    )
     said.append(f"{measured.name!r} is in {'degrees' if to_rad != 1 else 'radians'}: {why}")
     fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width)
     kind = pair.kind or ("position" if command.meaning.unit in ("rad", "deg") or _follows(found) else "duty")
@@ -99,7 +103,16 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         nodes[name], policy = _node(name, fields[name], at, signal, offset)
         said += policy
     mapping = ImportMapping(asked.pipeline, nodes)
-    return Proposal(mapping, labels, tuple(said + more + others))
+    return Proposal(mapping, labels, tuple(said + more + others + list(file.notes)))
+
+
+def _names_of(file: ForeignFile, signal: Signal) -> list[str]:
+    """Return the names of a signal's columns as the file has them."""
+    own = file.columns.get(signal.sources[0].partition("[")[0], ())
+    places = [s.rpartition("[:,")[2].rstrip("]") for s in signal.sources]
+    return [
+        own[int(p)] if p.isdigit() and int(p) < len(own) else s for p, s in zip(places, signal.sources, strict=True)
+    ]
 
 
 def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
@@ -278,13 +291,15 @@ def _node(
     if stamps.repeated:
         repeated = "first"
         said.append(f'{name}: {stamps.repeated} stamps repeat: repeated = "first" keeps the first sample of each')
-    if stamps.backward:
-        raise UsageError(
-            f"{stamps.backward} stamps of {stamps.source!r} are earlier than the one before: a clock that was set, or "
-            "files that were joined in the wrong order",
-            hint="sort or cut the file: --samples A:B",
-        )
     steps = np.diff(stamps.t_s[good])
+    if stamps.backward:
+        k = int(np.argmax(steps < 0))
+        raise UsageError(
+            f"{stamps.backward} stamps of {stamps.source!r} are earlier than the one before, first that of sample "
+            f"{np.flatnonzero(good)[k + 1]}, by {-steps[k]:.4g} s: a clock that was set, or files that were joined in "
+            "the wrong order",
+            hint="cut the file there, and import the parts one by one",
+        )
     long = steps > _GAP * np.median(steps)
     if long.any():
         said.append(

@@ -33,6 +33,8 @@ _CHUNK_NAME_AT = 37
 _METADATA_NAME_AT = _PREFIX.size
 # LZ4 compresses at most 255 to 1. A chunk that claims more is not genuine, and decompressing it could fill the memory.
 _TIGHTEST = 256
+# Zstandard packs equal bytes without such a limit, as those of a black image; a chunk that claims more is not genuine.
+_TIGHTEST_ZSTD_BYTES = 1 << 28
 # Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
 _SMALL_BYTES = 64 * 1024
 # Reading stops once this multiple of the file's size was read: records overlap, and might do so without end.
@@ -236,7 +238,8 @@ def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
 def _decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's content; a wrong size or checksum is an error, found without decompressing more than claimed."""
     size = chunk.uncompressed_size
-    if size > _TIGHTEST * len(chunk.data) + _SMALL_BYTES:
+    most = _TIGHTEST * len(chunk.data) + _SMALL_BYTES
+    if size > (max(most, _TIGHTEST_ZSTD_BYTES) if chunk.compression == "zstd" else most):
         raise ValueError(f"it claims to hold {size} bytes: more than can be packed into {len(chunk.data)}")
     if chunk.compression == "lz4":
         import lz4.frame

@@ -135,6 +135,14 @@ def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rat
         if chosen:
             return _stamps(chosen[0], path)
         rate_hz, said = _told_rate(signals), "the file says so"
+        coarse = [s for s in signals if s.values.shape == (length, 1) and s.meaning.quantity == "stamp" and _ticks(s)]
+        if rate_hz is None and coarse:
+            repeated = float((np.diff(coarse[0].values[:, 0]) == 0).mean())
+            raise UsageError(
+                f"the stamps {coarse[0].name!r} of {path} repeat the one before in {repeated:.0%} of {length} rows: "
+                "their clock is coarser than the samples",
+                hint="say the rate of its samples with --rate-hz",
+            )
     else:
         said = "--rate-hz"
     if rate_hz is None:
@@ -155,6 +163,12 @@ def _increases(signal: Signal) -> bool:
     values = signal.values[signal.finite, 0]
     steps = np.diff(values)
     return values.size > 2 and bool(steps.size and (steps > 0).mean() > 0.9)
+
+
+def _ticks(signal: Signal) -> bool:
+    """Return whether a signal counts up, but stands still in between."""
+    steps = np.diff(signal.values[signal.finite, 0])
+    return bool(steps.size and (steps > 0).any() and (steps >= 0).all())
 
 
 def _counts(signal: Signal) -> bool:

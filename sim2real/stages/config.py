@@ -199,7 +199,7 @@ class ImportConfig:
     """Turn files of other recorders into logs, one for each file."""
 
     files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
-    """Files of other recorders: npz, JSON, CSV, MCAP or a ROS 2 bag, or episodes of a LeRobot data set."""
+    """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
     """TOML file that says which signal is which field; default: the pipeline's import.toml, or one is proposed."""
     mjcf: Path | None = None
@@ -216,6 +216,8 @@ class ImportConfig:
     """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
     format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None
     """Format of the files; default: by their suffixes."""
+    episode: int | None = None
+    """Episode of a LeRobot data set; default: the only one."""
     samples: Annotated[str | None, arg(metavar="A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None
@@ -246,9 +248,7 @@ class ImportConfig:
     @property
     def selection(self) -> slice | None:
         """The range of samples; None: all."""
-        if self.samples is None:
-            return None
-        return slice(*(int(end) if end else None for end in self.samples.split(":")))
+        return slice(*(int(end) if end else None for end in self.samples.split(":"))) if self.samples else None
 
 
 @dataclass(frozen=True)

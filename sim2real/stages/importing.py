@@ -31,13 +31,16 @@ def run(config: ImportConfig) -> None:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
             proposed and something is ambiguous.
     """
-    files = [open_foreign(path, config.format) for path in config.sources]
+    files = [open_foreign(path, config.format, config.episode) for path in config.sources]
     files = [joined(files)] if config.together and len(files) > 1 else files
     mapping = told_mapping(config)
     text = "" if mapping else None
     for file in files:
         if mapping is None:
             mapping, text = proposed(file, asked(config))
+        else:
+            for line in file.notes:
+                console.note(line)
         episode = importer.import_opened(file, mapping, config.selection)
         refuse_contradictions(file.path, episode, config.as_told)
         facts, log, written = importer.facts(episode), config.out, None
@@ -114,7 +117,13 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
     Raises:
         UsageError: When something is ambiguous.
     """
-    found = propose(file, told)
+    try:
+        found = propose(file, told)
+    except UsageError:
+        # What was left out may be the reason.
+        for line in file.notes:
+            console.note(line)
+        raise
     console.note(f"proposed from {file.path.name}, as nobody said what is what:")
     for line in found.evidence:
         console.note(f"  {line}")
