@@ -168,7 +168,7 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
             whole = record.end - record.start >= _MESSAGE.size
             number, _, log_ns, _ = _MESSAGE.unpack_from(source, record.start) if whole else (-1, 0, 0, 0)
             if number not in channels:
-                damage.skipped.append(f"a message at {record.start}, of no known channel,")
+                damage.skip(f"a message at {record.start}, of no known channel,")
                 return None
             return channels[number], log_ns, source, record.start + _MESSAGE.size, record.end
         if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, damage)) is not None:
@@ -205,7 +205,7 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
                         if (found := take(content, Record(*part))) is not None:
                             yield found
                 except ValueError as error:
-                    damage.skipped.append(str(error))
+                    damage.skip(str(error))
         if not begun:
             raise UsageError(
                 f"{path} is no MCAP file, or is damaged from its beginning", hint="`mcap doctor` says where"

@@ -41,6 +41,7 @@ class Proposal:
     evidence: tuple[str, ...]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
 def propose(file: ForeignFile, asked: Asked) -> Proposal:
     """Return the mapping that names and data speak for.
 

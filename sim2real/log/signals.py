@@ -135,14 +135,10 @@ def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rat
         if chosen:
             return _stamps(chosen[0], path)
         rate_hz, said = _told_rate(signals), "the file says so"
-        coarse = [s for s in signals if s.values.shape == (length, 1) and s.meaning.quantity == "stamp" and _ticks(s)]
-        if rate_hz is None and coarse:
-            repeated = float((np.diff(coarse[0].values[:, 0]) == 0).mean())
-            raise UsageError(
-                f"the stamps {coarse[0].name!r} of {path} repeat the one before in {repeated:.0%} of {length} rows: "
-                "their clock is coarser than the samples",
-                hint="say the rate of its samples with --rate-hz",
-            )
+        clocks = [s for s in signals if s.values.shape == (length, 1) and s.meaning.quantity == "stamp"]
+        clocks = [s for s in clocks if s.finite.sum() > 2 and np.ptp(s.values[s.finite]) > 0]
+        if rate_hz is None and clocks:
+            raise UsageError(_unusable(clocks[0], path), hint="say the rate of its samples with --rate-hz")
     else:
         said = "--rate-hz"
     if rate_hz is None:
@@ -165,10 +161,17 @@ def _increases(signal: Signal) -> bool:
     return values.size > 2 and bool(steps.size and (steps > 0).mean() > 0.9)
 
 
-def _ticks(signal: Signal) -> bool:
-    """Return whether a signal counts up, but stands still in between."""
+def _unusable(signal: Signal, path: str) -> str:
+    """Return why stamps are no clock of the samples."""
     steps = np.diff(signal.values[signal.finite, 0])
-    return bool(steps.size and (steps > 0).any() and (steps >= 0).all())
+    repeated, back = float((steps == 0).mean()), float((steps < 0).mean())
+    if back:
+        why = f"are earlier than the one before in {back:.0%} of {len(steps) + 1} rows: they are in no order of time"
+    else:
+        why = (
+            f"repeat the one before in {repeated:.0%} of {len(steps) + 1} rows: their clock is coarser than the samples"
+        )
+    return f"the stamps {signal.name!r} of {path} {why}"
 
 
 def _counts(signal: Signal) -> bool:

@@ -68,6 +68,11 @@ def test_a_clock_that_is_set_back_with_no_other_is_refused_with_the_place(tmp_pa
         imported(bags.write(tmp_path / "x.mcap", rows))
 
 
+def test_a_bag_that_is_backward_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"are earlier than the one before in 100% of 600 rows: .* no order of time"):
+        imported(bags.write(tmp_path / "x.mcap", bags.rows()[::-1]))
+
+
 def test_a_simulated_clock_that_is_coarse_is_not_mixed_with_the_recorders(tmp_path):
     rows = bags.rows(lambda k, ns: T0_NS + (ns - T0_NS) // 2 // 10**7 * 10**7)
     with pytest.raises(UsageError, match=r"header.stamp' .* repeat the one before in 7\d%.*coarser than the samples"):
