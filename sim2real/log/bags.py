@@ -26,6 +26,7 @@ _LARGE_BYTES = 64 * 1024
 """A message of joints is smaller [bytes]: this is room for a thousand of them."""
 _UNPACKED = 256
 """The chunks of a bag hold at most this multiple of its size, beside the memory of the budget."""
+_RELEASED_BYTES = 1 << 24
 _JOINTLESS = {
     "tf2_msgs", "diagnostic_msgs", "visualization_msgs", "rcl_interfaces", "rosgraph_msgs", "nav_msgs", "map_msgs",
     "lifecycle_msgs", "stereo_msgs", "shape_msgs", "vision_msgs", "rosbag2_interfaces", "statistics_msgs",
@@ -183,11 +184,15 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
                 found.leave_out(f"other messages of this topic are {known.kind}")
         return None
 
-    unpacked, begun = 0, False
+    unpacked, released, begun = 0, 0, False
     with opened(path) as data:
         most = _UNPACKED * len(data) + MOST_BYTES
         for record in records(data, damage):
             begun = True
+            if record.start - released > _RELEASED_BYTES:
+                # What was read leaves the memory: a bag with images may be larger than that.
+                data.madvise(mmap.MADV_DONTNEED, released, _RELEASED_BYTES)
+                released += _RELEASED_BYTES
             if record.opcode == Opcode.METADATA:
                 entry = parsed(Metadata, data, record, damage)
                 if entry is not None and entry.name == SESSION:

@@ -92,7 +92,7 @@ class ForeignFile:
         except KeyError:
             close = difflib.get_close_matches(name, self.keys, n=1)
             raise UsageError(
-                f"{self.path} has no {name!r}. Available: {', '.join(self.keys) or 'nothing'}",
+                f"{self.path} has no {name!r}. Available: {', '.join(self.keys[:100]) or 'nothing'}",
                 hint=f"did you mean {close[0]}?" if close else "correct the source in the mapping",
             ) from None
         except UsageError:

@@ -13,6 +13,7 @@ from sim2real.log.names import Meaning
 from sim2real.log.signals import Signal, find_stamps
 
 _SURE = 0.8
+_MOST_UNNAMED, _MOST_LISTED = 50, 20
 _KINDS = ("position", "velocity", "torque", "duty", "voltage")
 
 
@@ -143,6 +144,12 @@ def _link(a: Signal, b: Signal, signals: Sequence[Signal], path: str, rate_hz: f
 
 def _by_data(candidates: Sequence[Signal], path: str, rate_hz: float | None, signals: Sequence[Signal]) -> Pair:
     """Return the pair where names say nothing: what follows was measured, what leads was commanded."""
+    if len(candidates) > _MOST_UNNAMED:
+        raise UsageError(
+            f"names in {path} do not say what was measured and what was commanded, and {len(candidates)} signals are "
+            f"too many to compare each with each (at most {_MOST_UNNAMED}): {_names(candidates)}",
+            hint="name the columns so that it shows, as in q_rad and goal_rad, or write a mapping",
+        )
     found = []
     for i, a in enumerate(candidates):
         for b in candidates[:i]:
@@ -157,7 +164,7 @@ def _by_data(candidates: Sequence[Signal], path: str, rate_hz: float | None, sig
     widest = max((a.width for a, *_ in found), default=0)
     found = [f for f in found if f[0].width == widest]
     if len(found) != 1:
-        listed = "; ".join(f"{a.name} and {b.name}" for a, b, *_ in found) or _names(signals)
+        listed = "; ".join(f"{a.name} and {b.name}" for a, b, *_ in found[:_MOST_LISTED]) or _names(signals)
         raise UsageError(
             f"names in {path} do not say what was measured and what was commanded, "
             f"and {'several pairs follow each other' if found else 'nothing follows anything'}. Candidates: {listed}",
@@ -200,4 +207,5 @@ def _halves(
 
 
 def _names(signals: Sequence[Signal]) -> str:
-    return ", ".join(repr(s.name) for s in signals) or "nothing"
+    more = f" and {len(signals) - _MOST_LISTED} more" if len(signals) > _MOST_LISTED else ""
+    return ", ".join(repr(s.name) for s in signals[:_MOST_LISTED]) + more or "nothing"

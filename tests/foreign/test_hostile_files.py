@@ -110,6 +110,14 @@ def test_arrays_that_are_too_large_or_no_numbers_stop_no_others(tmp_path):
         file.signal("odd")
 
 
+def test_many_columns_without_a_name_are_refused_before_each_is_compared_with_each(tmp_path):
+    table = np.cumsum(np.random.default_rng(0).normal(size=(60, 400)), axis=0)
+    np.savetxt(tmp_path / "x.csv", table, delimiter=",", header=",".join(f"x{i}" for i in range(400)), comments="")
+    with pytest.raises(UsageError, match=r"401 signals are too many to compare.* more\n") as caught:
+        propose(open_foreign(tmp_path / "x.csv"), Asked("rig", rate_hz=50.0))
+    assert len(str(caught.value)) < 1500
+
+
 def test_a_mapping_that_is_nested_too_deep(tmp_path):
     (tmp_path / "m.toml").write_text("a = " + "[" * 20_000)
     with pytest.raises(UsageError, match="no TOML"):
