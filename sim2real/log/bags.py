@@ -110,14 +110,18 @@ def read_bag(paths: Sequence[Path]) -> RawSignals:
 
 def is_ours(path: Path) -> bool:
     """Return whether an MCAP file is a log of sim2real, as far as it can be read."""
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-
     try:
-        with path.open("rb") as stream:
-            return any(m.name == SESSION for m in make_reader(stream).iter_metadata())
-    except (McapError, OSError, struct.error):
-        return True  # a log that was cut: its own reader says more
+        with opened(path) as data:
+            for record in records(data, damage := Damage()):
+                if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                    return False
+                if record.opcode == Opcode.METADATA:
+                    entry = parsed(Metadata, data, record, damage)
+                    if entry is not None and entry.name == SESSION:
+                        return True
+    except (Sim2RealError, OSError):
+        pass
+    return True  # a log that was cut before its data: its own reader says more
 
 
 def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _Topic], list[str]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d)?)(?:[.,](\d+))?\s*(Z|UTC|[+-]\d\d:?\d\d)?)?")
 _TIME = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?")
+_OTHER = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}\b.*")
 _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
@@ -17,6 +18,11 @@ def are_dates(texts: Sequence[str]) -> bool:
     """Return whether the first of some texts is a date or a time of day."""
     first = texts[0].strip() if len(texts) else ""
     return bool(_DATE.fullmatch(first) or _TIME.fullmatch(first))
+
+
+def is_other(text: str) -> bool:
+    """Return whether a text looks like a date in another form, whose day and month may be either."""
+    return bool(_OTHER.fullmatch(text))
 
 
 def parsed(texts: Sequence[str], unit: str = "") -> np.ndarray:

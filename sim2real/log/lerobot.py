@@ -63,7 +63,8 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         raise
     except (pyarrow.ArrowException, *_DAMAGED) as error:
         raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
-    rates = {name: info[name] for name in ("fps",) if isinstance(info.get(name), int | float)}
+    if not info and "observation.state" in schema.names:
+        info = {"robot_type": ""}  # a file of a data set, without what the set says of its robot
 
     def load(name: str) -> Any:
         if name not in schema.names:
@@ -75,12 +76,16 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         parts = [part for part in parts if len(part)] or parts[:1]
         return parts[0] if len(parts) == 1 else np.concatenate([np.asarray(part) for part in parts])
 
+    fps = info.get("fps")
+    fps = float(fps) if isinstance(fps, int | float) and fps > 0 else _fps(load, schema.names)
+    info = {**info, "fps": fps} if fps else info
     nominal: list[str] = []
-    if "timestamp" in keys and rates and _is_nominal(load, schema.names, float(rates["fps"])):
+    if "timestamp" in keys and fps and _is_nominal(load, schema.names, fps):
         nominal = ["timestamp"]
         keys.remove("timestamp")
-        notes.append(f"'timestamp' is frame_index / fps: nominal times at {rates['fps']:g} Hz, not measured ones")
-    return RawSignals([*keys, *rates], load, _feature_names(info), tuple(notes), frozenset(nominal), info)
+        notes.append(f"'timestamp' is frame_index / fps: nominal times at {fps:g} Hz, not measured ones")
+    keys += ["fps"] * bool(fps)
+    return RawSignals(keys, load, _feature_names(info), tuple(notes), frozenset(nominal), info)
 
 
 def files_of(path: Path, episode: int | None = None) -> list[Path]:
@@ -194,7 +199,7 @@ def are_degrees(facts: Mapping[str, Any], names: Sequence[str], q: np.ndarray, p
     Raises:
         UsageError: When neither the data nor ``info.json`` says which unit it is.
     """
-    robot = str(facts.get("robot_type") or "the robot")
+    robot = str(facts.get("robot_type") or "an unknown robot")
     motors = robot.startswith(_MOTORS) or any(name.endswith(".pos") for name in names)
     if not facts or not (motors or np.abs(q).max() > _NO_RADIANS):
         return False
@@ -208,7 +213,7 @@ def are_degrees(facts: Mapping[str, Any], names: Sequence[str], q: np.ndarray, p
         most = ", ".join(f"{names[i]} {np.abs(q[:, i]).max():.4g}" for i in arm[:3])
         raise UsageError(
             f"the positions of {robot} in {path} are degrees, or hundredths of each joint's calibrated range "
-            f"(-100..100), which LeRobot writes by default: {most} at most, and meta/info.json does not say which",
+            f"(-100..100), which LeRobot writes by default: {most} at most, and no meta/info.json says which",
             hint="write a mapping with their scale: the guide 'Import' has that of degrees and that of hundredths",
         )
     if odd := [i for i in jaws if q[:, i].min() >= -0.5 and q[:, i].max() <= _MOST_HUNDREDTHS and q[:, i].any()]:
@@ -230,6 +235,17 @@ def _is_degrees(column: np.ndarray) -> bool | None:
     if np.abs(counts - np.round(counts)).max() > 0.02:
         return None
     return bool(counts[-1] >= 200 and levels.size >= 20)
+
+
+def _fps(load: Any, names: Sequence[str]) -> float | None:
+    """Return the rate by which frames are numbered in time [Hz]; None where they are not."""
+    if not {"timestamp", "frame_index"} <= set(names):
+        return None
+    stamps, frames = (np.asarray(load(name), np.float64) for name in ("timestamp", "frame_index"))
+    if len(stamps) < 3 or not np.ptp(stamps) > 0 or not np.ptp(frames) > 0:
+        return None
+    fps = round(float(np.ptp(frames) / np.ptp(stamps)), 2)
+    return fps if _is_nominal(load, names, fps) else None
 
 
 def _is_nominal(load: Any, names: Sequence[str], fps: float) -> bool:

@@ -14,7 +14,7 @@ from sim2real.log.evidence import DEGREES, SURE, Following
 from sim2real.log.foreign import ForeignFile
 from sim2real.log.lerobot import are_degrees
 from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping
-from sim2real.log.names import same_joint
+from sim2real.log.names import meaning, same_joint
 from sim2real.log.pairing import find_pair
 from sim2real.log.quantities import Asked, clean, extras, field_of, radian, taken, velocity_of
 from sim2real.log.signals import Signal, Stamps, collect, find_stamps
@@ -56,8 +56,12 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     pair = find_pair(signals, str(file.path), asked.rate_hz)
     path, said = str(file.path), list(pair.said)
     measured, command = pair.measured, pair.command
-    stamps = [find_stamps(signals, s, side, path, asked.rate_hz)
-              for s, side in ((measured, "measured"), (command, "command"))]  # fmt: skip
+    try:
+        stamps = [find_stamps(signals, s, side, path, asked.rate_hz)
+                  for s, side in ((measured, "measured"), (command, "command"))]  # fmt: skip
+    except UsageError:
+        _require_readable_stamps(file)
+        raise
     said += _on_stamps(measured, stamps[0]) + (
         _on_stamps(command, stamps[1]) if stamps[1].source != stamps[0].source else []
     )
@@ -105,6 +109,13 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         said += policy
     mapping = ImportMapping(asked.pipeline, nodes)
     return Proposal(mapping, labels, tuple(said + more + others + list(file.notes)))
+
+
+def _require_readable_stamps(file: ForeignFile) -> None:
+    """Raise the error of a signal that is named like a time stamp, but cannot be read."""
+    for key in file.keys:
+        if meaning(key).quantity == "stamp":
+            file.signal(key)
 
 
 def _names_of(file: ForeignFile, signal: Signal) -> list[str]:

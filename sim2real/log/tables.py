@@ -1,4 +1,4 @@
-"""Reads tables in text: CSV with commas, semicolons, tabs or blanks between the cells."""
+"""Reads tables in text: CSV with commas, semicolons, tabs, bars or blanks between the cells."""
 
 from __future__ import annotations
 
@@ -247,13 +247,15 @@ class _Table:
             f"line {line} of {self._path}, column {name!r} holds {text[:60]!r}, no number",
             hint="decimal commas need semicolons or tabs between the cells"
             if comma
+            else "write dates as 2024-05-01T12:00:00.25"
+            if dates.is_other(own)
             else "name another source in the mapping",
         )
 
 
 def _delimiter(first: str, second: str) -> str:
     """Return what stands between the cells of a table, by its first two lines."""
-    best = max(",;\t", key=first.count)
+    best = max(",;\t|", key=first.count)
     if best in first:
         return best
     return " " if len(first.split()) == len(second.split()) > 1 else ","

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from made_bags import CONTROLLER, GOAL, IMAGE, NUMBERS, STAMPS_NS, STATE, T0_NS, Q
 
+from sim2real import cli
+from sim2real.artifacts.run_folder import newest
 from sim2real.errors import UsageError
+from sim2real.log import read_log
 from sim2real.log.foreign import open_foreign
 from sim2real.log.importer import import_opened
 from sim2real.log.proposal import propose
@@ -159,6 +162,22 @@ def test_a_bag_that_is_split_is_one_recording(tmp_path, with_metadata):
     (folder / "bag_5.mcap").unlink()
     with pytest.raises(UsageError, match="bag_5.mcap, which metadata" if with_metadata else "not numbered one after"):
         open_foreign(folder)
+
+
+def test_the_command_prints_what_was_left_out(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bag").mkdir()
+    extra = ("/extra", "demo/msg/Note", b"", T0_NS)
+    bags.write(tmp_path / "bag" / "bag_0.mcap", [extra, *bags.rows(stop=300)])
+    bags.write(tmp_path / "bag" / "bag_1.mcap", bags.rows(begin=300))
+    assert cli.main(["import", "bag"]) == 0
+    err = capsys.readouterr().err
+    assert err.count("left out: /extra (demo/msg/Note): it has a wstring") == 1
+    stage = newest(tmp_path / "runs", "robot", "record")
+    assert stage.manifest["inputs"]["source_1"]["path"].endswith("bag/bag_1.mcap")
+    assert cli.main(["import", "bag", "--mapping", str(stage.output("mapping")), "--out", "again.mcap"]) == 0
+    assert "left out: /extra" in capsys.readouterr().err
+    np.testing.assert_allclose(read_log("again.mcap").outputs["sensor"]["position"], Q)
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,18 @@ def test_hundredths_of_a_range_are_not_taken_for_degrees(tmp_path, robot, scale,
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], np.radians(arm(values[1])), atol=1e-5)
 
 
+def test_a_file_away_from_its_data_set(tmp_path):
+    pq.write_table(episode_table(0, *map(hundredths, degrees(0, 60))), tmp_path / "x.parquet")
+    with pytest.raises(UsageError, match=r"an unknown robot .* degrees, or hundredths"):
+        proposed(tmp_path / "x.parquet")
+    goal, q = (np.radians(x) for x in degrees())
+    pq.write_table(episode_table(0, goal, q), tmp_path / "y.parquet")
+    episode, found = proposed(tmp_path / "y.parquet")
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], q, atol=1e-6)
+    assert episode.metadata["stamps"] == {"actuator": "generated", "sensor": "generated"}
+    assert found.mapping.nodes["sensor"].rate_hz == FPS
+
+
 def test_the_mapping_that_the_guide_has_for_hundredths(tmp_path):
     goal, q = degrees()
     table = episode_table(0, hundredths(goal), hundredths(q))

@@ -44,6 +44,7 @@ def all_signals(tmp_path, text):
         "t;q;goal\n" + ROWS.replace(",", ";").replace(".", ","),
         "t\tq\tgoal\n" + ROWS.replace(",", "\t").replace(".", ","),
         "sep=;\nt;q;goal\n" + ROWS.replace(",", ";").replace(".", ","),
+        "t|q|goal\n" + ROWS.replace(",", "|"),
         "t q goal\n" + ROWS.replace(",", " "),
         "  t   q   goal\n  0.0  1.5   2\n  0.1  2.5   3 \n",
         "t,q,goal\n" + ROWS.replace("\n", ",\n"),
@@ -73,7 +74,7 @@ def test_forms_of_one_table(tmp_path, text):
         ("t,t\n0,1\n", "more than one column 't'"),
         ("time,q\n2024-05-01 12:00:00,1\nlater,2\n", r"line 3 .*'later' is no date"),
         ("time,q\n2024-05-01 12:00:00,1\n17.5,2\n", r"line 3 .*'17.5' is no date"),
-        ("time,q\n01.05.2024 12:00:00,1\n", r"line 2 .*'01.05.2024 12:00:00', no number"),
+        ("time,q\n01.05.2024 12:00:00,1\n", r"line 2 .*'01.05.2024 12:00:00', no number.*write dates as"),
         (",".join(f"c{i}" for i in range(10_001)) + "\n", "has 10001 signals; at most 10000"),
         ("t,q\n0,[1 2]\n1,[1 b]\n", r"line 3 .*no list of numbers"),
         ("t,q\n0,[" + " ".join("1" * 1001) + "]\n", r"line 2 .*1001 numbers"),
@@ -150,6 +151,13 @@ def test_a_table_with_dates_is_imported_at_its_time(tmp_path):
     episode = import_opened(file, propose(file, Asked("rig")).mapping)
     np.testing.assert_array_equal(episode.steps["sensor"].start, 5000 * np.arange(COUNT))
     assert episode.metadata["source"]["time_zero_us"] == BEGIN_S * 10**6
+
+
+@pytest.mark.parametrize("form", ["{:02.0f}.05.2024 12:00:{:09.6f}", "05/{:02.0f}/2024 12:00:{:09.6f}"])
+def test_dates_in_another_form_are_refused_by_their_line(tmp_path, form):
+    file = opened(tmp_path, following([form.format(1, t) for t in TIME.tolist()]))
+    with pytest.raises(UsageError, match=r"(?s)line 2 of .*column 't' holds .*2024.*write dates as 2024-05-01T12:00"):
+        propose(file, Asked("rig"))
 
 
 @pytest.mark.parametrize("tick_s", [0.01, 0.1, 1.0])
