@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import mmap
+import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.log.bag_columns import Columns
-from sim2real.log.budget import MOST_BYTES, require_memory, require_signals
+from sim2real.log.budget import MOST_BYTES, MOST_TEXT_BYTES, require_memory, require_signals
 from sim2real.log.document import SESSION
 from sim2real.log.raw import RawSignals
 from sim2real.log.records import BROKEN, Damage, Record, chunk_content, chunk_records, opened, parsed, records
@@ -122,6 +123,46 @@ def is_ours(path: Path) -> bool:
     except (Sim2RealError, OSError):
         pass
     return True  # a log that was cut before its data: its own reader says more
+
+
+def bag_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a ROS 2 bag's folder, in the order in which they continue each other.
+
+    Raises:
+        UsageError: When there are none, one is missing, or they are not of one bag.
+    """
+    there = {p.name: p for p in folder.glob("*.mcap")}
+    about = folder / "metadata.yaml"
+    if not there:
+        packed, other = sorted(folder.glob("*.mcap.zst*")), sorted(folder.glob("*.db3"))
+        if not (packed or other or about.is_file()):
+            hint = "name the files in it, or the folder of a ROS 2 bag or of a LeRobot data set (with meta/info.json)"
+            raise UsageError(f"{folder} is a folder, not a file", hint=hint)
+        hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
+        hint = f"unpack it first: zstd -d {packed[0].name}" if packed else hint
+        raise UsageError(f"{folder} holds 0 MCAP files, and {len(other)} of SQLite", hint=hint)
+    listed: list[str] = []
+    if about.is_file():
+        text = about.read_text(encoding="utf-8", errors="replace")[:MOST_TEXT_BYTES]
+        named = re.findall(r"^\s*-\s+[\"']?([^\s\"']+\.mcap)[\"']?\s*$", text, re.MULTILINE)
+        listed = list(dict.fromkeys(Path(name).name for name in named))
+    if lost := [name for name in listed if name not in there]:
+        raise UsageError(
+            f"{lost[0]}, which metadata.yaml names, is not in {folder}",
+            hint="copy it there, or name the files that are",
+        )
+    if listed:
+        return [there[name] for name in listed]
+    parts = {name: re.fullmatch(r"(.*?)_?(\d+)\.mcap", name) for name in there}
+    order = sorted(there, key=lambda name: int(found[2]) if (found := parts[name]) else -1)
+    numbers = [int(found[2]) for name in order if (found := parts[name])]
+    one_bag = len({found[1] for found in parts.values() if found}) == 1 and len(numbers) == len(there)
+    if len(there) > 1 and not (one_bag and numbers == list(range(numbers[0], numbers[0] + len(numbers)))):
+        raise UsageError(
+            f"{folder} has no metadata.yaml, and its files are not numbered one after another: {', '.join(order[:6])}",
+            hint="name one of them: each becomes a log",
+        )
+    return [there[name] for name in order]
 
 
 def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _Topic], list[str]]:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from sim2real.errors import UsageError
 
+WHOLE = "check that the file is complete, and of the format that its name or --format says"
+"""The hint for damaged content."""
 MOST_BYTES = 1 << 30
 """A file's numbers take at most this much memory [bytes]: 37 minutes of 60 columns at 1 kHz."""
 MOST_TEXT_BYTES = 1 << 28

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,19 +14,18 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log import dates, lerobot
-from sim2real.log.bags import read_bag
+from sim2real.log.arrays import DAMAGED, read_npz
+from sim2real.log.bags import bag_files, read_bag
 from sim2real.log.budget import (
     MOST_COLUMNS,
     MOST_LEVELS,
     MOST_TEXT_BYTES,
-    require_memory,
+    WHOLE,
     require_signals,
     require_size,
-    why_left_out,
 )
 from sim2real.log.names import meaning
 from sim2real.log.raw import RawSignals
-from sim2real.log.tables import WHOLE as _WHOLE
 from sim2real.log.tables import encoding_of, read_csv
 
 if TYPE_CHECKING:
@@ -38,8 +34,6 @@ if TYPE_CHECKING:
 SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot", ".mcap": "mcap"}
 """File suffix -> format, used unless a format is given."""
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
-# What the libraries raise for damaged content.
-_DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -97,8 +91,8 @@ class ForeignFile:
             ) from None
         except UsageError:
             raise
-        except _DAMAGED as error:
-            raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=_WHOLE) from None
+        except DAMAGED as error:
+            raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=WHOLE) from None
         values = _numbers(raw, f"{name!r} in {self.path}", meaning(name).unit)
         if chosen is None:
             if values.ndim == 2 and values.shape[1] > MOST_COLUMNS:
@@ -150,7 +144,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
             why = "it is a pipe or a device" if path.exists() else "there is no such file"
             raise UsageError(f"cannot read {path}: {why}", hint="check its name")
         if not all(part.stat().st_size for part in files):
-            raise UsageError(f"{next(p for p in files if not p.stat().st_size)} is empty", hint=_WHOLE)
+            raise UsageError(f"{next(p for p in files if not p.stat().st_size)} is empty", hint=WHOLE)
         if format == "lerobot":
             found = lerobot.read_lerobot(path, episode)
         else:
@@ -170,69 +164,6 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
     )
 
 
-def _read_npz(path: Path) -> RawSignals:
-    # numpy would try to read anything but a ZIP archive as a pickle.
-    if not zipfile.is_zipfile(path):
-        raise UsageError(f"{path} is no npz file, or is cut off", hint=_WHOLE)
-    shapes: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
-    notes, total = [], 0.0
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            require_signals(len(names), path)
-            for name in names:
-                key = name.removesuffix(".npy")
-                try:
-                    shapes[key] = _shape(archive, name)
-                except (*_DAMAGED, UnicodeError) as error:
-                    notes.append(f"left out: {key!r}: its header is damaged ({str(error)[:80]})")
-    except _DAMAGED as error:
-        if isinstance(error, UsageError):
-            raise
-        raise UsageError(f"{path} is no npz file, or is damaged: {error}", hint=_WHOLE) from None
-    keys = []
-    for key, (shape, dtype) in shapes.items():
-        if why := why_left_out(shape, dtype.kind, dtype.itemsize):
-            notes.append(f"left out: {key!r}: {why}")
-        else:
-            keys.append(key)
-            total += 8.0 * math.prod(shape)
-    if not keys:
-        raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no arrays'}", hint=_WHOLE)
-    require_memory(total, str(path))
-
-    def load(name: str) -> Any:
-        if name not in (key.removesuffix(".npy") for key in names):
-            raise KeyError(name)
-        shape, dtype = shapes.get(name, ((), np.dtype(float)))
-        if dtype.hasobject:
-            raise UsageError(
-                f"{name!r} in {path} holds Python objects, which could run any code when loaded",
-                hint="save it again as an array of numbers",
-            )
-        require_memory(float(math.prod(shape)) * dtype.itemsize, f"{name!r} in {path}")
-        # Opened again for each signal, so that one that is damaged does not prevent reading the others.
-        with np.load(path, allow_pickle=False) as data:
-            return data[name]
-
-    return RawSignals(keys, load, notes=tuple(notes))
-
-
-def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type of an array in an archive, by its header alone.
-
-    Raises:
-        ValueError: When it has no such header.
-    """
-    with archive.open(name) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    if any(n < 0 for n in shape):
-        raise ValueError("a size below 0")
-    return shape, dtype
-
-
 def _read_json(path: Path) -> RawSignals:
     require_size(path, MOST_TEXT_BYTES)
     encoding = encoding_of(path, "JSON")
@@ -244,9 +175,9 @@ def _read_json(path: Path) -> RawSignals:
             raise
         deep = f"it is nested deeper than {MOST_LEVELS} levels"
         why = deep if isinstance(error, RecursionError) else error
-        raise UsageError(f"{path} is no JSON, or is cut off: {why}", hint=_WHOLE) from None
+        raise UsageError(f"{path} is no JSON, or is cut off: {why}", hint=WHOLE) from None
     if not isinstance(document, dict | list):
-        raise UsageError(f"{path} holds a single value, no signals", hint=_WHOLE)
+        raise UsageError(f"{path} holds a single value, no signals", hint=WHOLE)
     require_signals(len(keys), path)
 
     def load(name: str) -> Any:
@@ -255,46 +186,6 @@ def _read_json(path: Path) -> RawSignals:
         return _walk(document, [p for p in re.split(r"\.|(?=\[\])", name) if p], path)
 
     return RawSignals(keys, load, notes=(f"{path.name} is no UTF-8: it is read as latin-1",) * (encoding == "latin-1"))
-
-
-def bag_files(folder: Path) -> list[Path]:
-    """Return the MCAP files of a ROS 2 bag's folder, in the order in which they continue each other.
-
-    Raises:
-        UsageError: When there are none, one is missing, or they are not of one bag.
-    """
-    there = {p.name: p for p in folder.glob("*.mcap")}
-    about = folder / "metadata.yaml"
-    if not there:
-        packed, other = sorted(folder.glob("*.mcap.zst*")), sorted(folder.glob("*.db3"))
-        if not (packed or other or about.is_file()):
-            hint = "name the files in it, or the folder of a ROS 2 bag or of a LeRobot data set (with meta/info.json)"
-            raise UsageError(f"{folder} is a folder, not a file", hint=hint)
-        hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
-        hint = f"unpack it first: zstd -d {packed[0].name}" if packed else hint
-        raise UsageError(f"{folder} holds 0 MCAP files, and {len(other)} of SQLite", hint=hint)
-    listed: list[str] = []
-    if about.is_file():
-        text = about.read_text(encoding="utf-8", errors="replace")[:MOST_TEXT_BYTES]
-        named = re.findall(r"^\s*-\s+[\"']?([^\s\"']+\.mcap)[\"']?\s*$", text, re.MULTILINE)
-        listed = list(dict.fromkeys(Path(name).name for name in named))
-    if lost := [name for name in listed if name not in there]:
-        raise UsageError(
-            f"{lost[0]}, which metadata.yaml names, is not in {folder}",
-            hint="copy it there, or name the files that are",
-        )
-    if listed:
-        return [there[name] for name in listed]
-    parts = {name: re.fullmatch(r"(.*?)_?(\d+)\.mcap", name) for name in there}
-    order = sorted(there, key=lambda name: int(found[2]) if (found := parts[name]) else -1)
-    numbers = [int(found[2]) for name in order if (found := parts[name])]
-    one_bag = len({found[1] for found in parts.values() if found}) == 1 and len(numbers) == len(there)
-    if len(there) > 1 and not (one_bag and numbers == list(range(numbers[0], numbers[0] + len(numbers)))):
-        raise UsageError(
-            f"{folder} has no metadata.yaml, and its files are not numbered one after another: {', '.join(order[:6])}",
-            hint="name one of them: each becomes a log",
-        )
-    return [there[name] for name in order]
 
 
 def joined(files: Sequence[ForeignFile]) -> ForeignFile:
@@ -325,7 +216,7 @@ def joined(files: Sequence[ForeignFile]) -> ForeignFile:
     return ForeignFile(files[0].path, files[0].format, keys, load, columns, beside, notes, nominal, files[0].facts)
 
 
-_READERS: dict[str, Callable[[Path], RawSignals]] = {"npz": _read_npz, "json": _read_json, "csv": read_csv}
+_READERS: dict[str, Callable[[Path], RawSignals]] = {"npz": read_npz, "json": _read_json, "csv": read_csv}
 _FORMATS = (*_READERS, "lerobot", "mcap")
 
 
@@ -373,7 +264,7 @@ def _walk(value: object, parts: Sequence[str], path: Path) -> Any:
                 if not i:
                     raise
                 raise UsageError(
-                    f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=_WHOLE
+                    f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=WHOLE
                 ) from None
         return found
     if isinstance(value, dict) and head in value:

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.budget import MOST_TEXT_BYTES, require_memory, require_signals, require_size, why_left_out
+from sim2real.log.budget import MOST_TEXT_BYTES, WHOLE, require_memory, require_signals, require_size, why_left_out
 from sim2real.log.raw import RawSignals
 
 INFO = Path("meta") / "info.json"
 _EPISODE = "episode_index"
 _COUNTERS = ("frame_index", _EPISODE, "index", "task_index")
 _DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError)
-_WHOLE = "check that the file is complete, and of the format that its name or --format says"
 _MOTORS = ("so100", "so101", "so_", "bi_so", "koch", "bi_koch", "lekiwi", "moss", "omx", "hope_jr")
 """The robots whose motors LeRobot normalises; their names begin so."""
 _JAWS = ("gripper", "jaw")
@@ -58,11 +57,11 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
             notes += [f"left out: {name!r}: {why}"] * bool(why)
         require_signals(len(schema.names), path)
         if not keys:
-            raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no columns'}", hint=_WHOLE)
+            raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no columns'}", hint=WHOLE)
     except UsageError:
         raise
     except (pyarrow.ArrowException, *_DAMAGED) as error:
-        raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
+        raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=WHOLE) from None
     if not info and "observation.state" in schema.names:
         info = {"robot_type": ""}  # a file of a data set, without what the set says of its robot
 
@@ -72,7 +71,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         try:
             parts = [_loaded(*part, name) for part in zip(files, rows, strict=True)]
         except pyarrow.ArrowException as error:
-            raise UsageError(f"{name!r} in {path} is damaged: {error}", hint=_WHOLE) from None
+            raise UsageError(f"{name!r} in {path} is damaged: {error}", hint=WHOLE) from None
         parts = [part for part in parts if len(part)] or parts[:1]
         return parts[0] if len(parts) == 1 else np.concatenate([np.asarray(part) for part in parts])
 
@@ -272,9 +271,9 @@ def _info(path: Path) -> Mapping[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, UsageError):
             raise
-        raise UsageError(f"{path} is no JSON: {error}", hint=_WHOLE) from None
+        raise UsageError(f"{path} is no JSON: {error}", hint=WHOLE) from None
     if not isinstance(found, dict):
-        raise UsageError(f"{path} holds no object", hint=_WHOLE)
+        raise UsageError(f"{path} holds no object", hint=WHOLE)
     return found
 
 

@@ -15,11 +15,10 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log import dates
-from sim2real.log.budget import MOST_BYTES, MOST_COLUMNS, require_signals, require_size
+from sim2real.log.budget import MOST_BYTES, MOST_COLUMNS, WHOLE, require_signals, require_size
 from sim2real.log.names import meaning
 from sim2real.log.raw import RawSignals
 
-WHOLE = "check that the file is complete, and of the format that its name or --format says"
 _COMMENTS = ("#", "%", "//")
 _BLOCK = 4096
 _STAMP_UNITS = ("s", "ms", "us", "ns")
