@@ -13,6 +13,8 @@ from sim2real.errors import UsageError
 LOG_TIME, STAMP = "log_time", "header.stamp"
 _COARSE = 0.1
 """A clock whose stamps repeat in a larger share of the messages is too coarse for them."""
+_JUMP_NS = 1e8
+"""A clock that is ahead by more from one message to the next was set."""
 _ALIKE = 0.01
 """Two clocks of one rate differ by less than this share."""
 
@@ -170,12 +172,33 @@ def _clock(stamp: np.ndarray, log: np.ndarray) -> tuple[str, str]:
     if (steps < 0).any() and not (own < 0).any():
         k = int(np.argmax(steps < 0))
         return STAMP, f"message {k + 1} has a stamp {-1e-9 * steps[k]:.4g} s before that of the one before: {recorder}"
+    if (k := _set_forward(steps, own, stamp - log)) is not None:
+        late = f"message {k + 1} has a stamp {1e-9 * steps[k]:.4g} s after that of the one before, but came "
+        return STAMP, f"{late}{1e-9 * own[k]:.4g} s after it: {recorder}"
     repeated = float((steps == 0).mean())
     if repeated > _COARSE and not (steps < 0).any() and not (own < 0).any():
         if abs(np.ptp(stamp) / max(np.ptp(log), 1) - 1) < _ALIKE:
             return STAMP, f"{repeated:.0%} of the stamps in the headers repeat the one before: {recorder}"
         return LOG_TIME, ""  # a simulated clock: that of the recorder runs at another rate
     return "", ""
+
+
+def _set_forward(steps: np.ndarray, own: np.ndarray, offset: np.ndarray) -> int | None:
+    """Return at which message the sender's clock was set forward, while the recorder's ran on; None: nowhere.
+
+    Args:
+        steps: From stamp to stamp of the sender, ``(N - 1,)`` [ns].
+        own: The recorder's.
+        offset: The sender's stamps less the recorder's, ``(N,)`` [ns].
+    """
+    if (own < 0).any() or not (own > 0).any():
+        return None  # the recorder's clock was set, or stood still
+    for k in np.flatnonzero(steps - own > max(_JUMP_NS, 10 * float(np.median(own[own > 0])))):
+        # A message that was late alone, or a burst after a pause of the network, leaves the offset as it was.
+        before, after = np.median(offset[max(k - 20, 0) : k + 1]), np.median(offset[k + 1 : k + 21])
+        if after - before > 0.8 * (steps[k] - own[k]):
+            return int(k)
+    return None
 
 
 def _flat(value: Any, trail: str = "") -> dict[str, Any]:

@@ -25,6 +25,10 @@ def set_back(k, ns):
     return ns - SET_BACK * (k >= 300)
 
 
+def set_forward(k, ns):
+    return ns + SET_BACK * (k >= 300)
+
+
 def never(k, ns):
     return 0
 
@@ -50,6 +54,11 @@ def is_right(episode, q=Q, goal=GOAL, start_ns=STAMPS_NS):
         pytest.param(None, None, "", id="both clocks in order"),
         pytest.param(None, set_back, "", id="the recorder's clock is set back"),
         pytest.param(set_back, None, "0.3975 s before", id="the robot's clock is set back"),
+        pytest.param(
+            set_forward, None, "0.4075 s after that of the one before, but came", id="the robot's is set forward"
+        ),
+        pytest.param(None, set_forward, "", id="the recorder's clock is set forward"),
+        pytest.param(None, lambda k, ns: ns + 10**9 * (k % 200 == 7), "", id="messages that came late"),
         pytest.param(never, None, "stamps in the headers are 0", id="no stamps in the headers"),
         pytest.param(lambda k, ns: ns * (k > 0), None, "1 of 600 stamps in the headers are 0", id="the first is 0"),
         pytest.param(lambda k, ns: T0_NS, None, "are the same", id="one stamp in all headers"),
