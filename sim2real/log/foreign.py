@@ -17,6 +17,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.bags import read_bag
+from sim2real.log.cells import MISSING, OTHER, NoNumbers, from_words, is_number, number_in
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -26,16 +27,7 @@ SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
 # What the libraries raise for damaged content.
 _DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
-_OTHER = "name another source in the mapping"
 _WHOLE = "check that the file is complete, and of the format that its name or --format says"
-
-
-_MISSING = {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "nil", "none", "missing", "<na>"}
-"""Words that stand for a missing number."""
-
-
-class NoNumbers(UsageError):  # noqa: N818 - it says what a signal is
-    """A signal is text, or something else without a single number."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +196,7 @@ def _read_csv(path: Path) -> ForeignFile:
     rows = [(n, row if "".join(row[len(header) :]).strip() else row[: len(header)]) for n, row in rows]
     if twice := {name for name in header if name and header.count(name) > 1}:
         raise UsageError(f"{path} has more than one column {sorted(twice)[0]!r}", hint="rename one of them")
-    if all(_is_number(name) for name in header):
+    if all(is_number(name) for name in header):
         raise UsageError(f"the first line of {path} holds numbers, not names", hint="put the columns' names there")
     for number, row in rows:
         if len(row) != len(header):
@@ -220,10 +212,10 @@ def _read_csv(path: Path) -> ForeignFile:
             return np.array([int(row[index]) for _, row in rows], np.int64)
         except (ValueError, OverflowError):
             cells = [row[index].strip() for _, row in rows]
-        if not any(_is_number(cell) or cell.lower() in _MISSING for cell in cells):
-            raise NoNumbers(f"column {name!r} of {path} holds no numbers: {cells[0]!r}", hint=_OTHER)
+        if not any(is_number(cell) or cell.lower() in MISSING for cell in cells):
+            raise NoNumbers(f"column {name!r} of {path} holds no numbers: {cells[0]!r}", hint=OTHER)
         return np.array(
-            [_cell(c, f"line {n} of {path}, column {name!r}") for (n, _), c in zip(rows, cells, strict=True)]
+            [number_in(c, f"line {n} of {path}, column {name!r}") for (n, _), c in zip(rows, cells, strict=True)]
         )
 
     return ForeignFile(path, "csv", [name for name in header if name], load)
@@ -321,21 +313,12 @@ def _numbers(raw: npt.ArrayLike, what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
     if values.dtype.kind in "US":
-        values = _from_words(values, what)
+        values = from_words(values, what)
     if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
         return values.astype(np.int64)
     if values.dtype.kind not in "fiub":
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=_OTHER)
+        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
     return values if values.dtype == np.float32 else values.astype(np.float64)
-
-
-def _from_words(values: np.ndarray, what: str) -> np.ndarray:
-    """Return numbers that were saved as words; NaN for a word that stands for a missing one."""
-    words = [str(word).strip() for word in values.astype(str).reshape(-1)]
-    if not any(map(_is_number, words)):
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=_OTHER)
-    numbers = [_cell(word, f"sample {i} of {what}") for i, word in enumerate(words)]
-    return np.array(numbers).reshape(values.shape)
 
 
 def _index(text: str) -> int | slice:
@@ -375,26 +358,9 @@ def _paths(value: object, trail: str = "") -> list[str]:
     return [trail] if trail else []
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _list(text: str, where: str) -> Any:
     """Return the list in a CSV cell, as ``[0.1, 0.2]`` or ``[0.1 0.2]``."""
     try:
         return json.loads(text) if "," in text else [float(x) for x in text.strip("[] ").split()]
     except ValueError:
         raise UsageError(f"{where} holds {text!r}, no list of numbers", hint=_WHOLE) from None
-
-
-def _cell(text: str, where: str) -> float:
-    """Return the number in a CSV cell; NaN if it is empty, or a word for a missing number."""
-    if text.lower() in _MISSING:
-        return float("nan")
-    if not _is_number(text):
-        raise UsageError(f"{where} holds {text!r}, no number", hint=f"correct the cell, or empty it; {_OTHER}")
-    return float(text)

@@ -15,8 +15,8 @@ from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
 from sim2real.log import plausible
 from sim2real.log.foreign import ForeignFile, open_foreign
+from sim2real.log.kept import align_turns, kept_samples, plausible_samples
 from sim2real.log.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
-from sim2real.log.names import meaning
 from sim2real.log.session_file import SessionFile
 
 RECORDED, GENERATED = "recorded", "generated"
@@ -82,8 +82,8 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
     ticks, outputs, stamps, dropped = {}, {}, {}, {}
     for name, node in mapping.nodes.items():
         found, last = signals[name], signals[name].count if stop is None else stop
-        kept = _kept(node, found, first, last)
-        kept = _plausible(file, name, node, found, kept)
+        kept = kept_samples(node, found.fields, found.stamps, first, last)
+        kept = plausible_samples(f"node {name} in {file.path}", node, found.fields, _seconds(node, found, kept), kept)
         outputs[name] = {
             field: _samples(file, f"{name}.{field}", found.fields[field], how, kept)
             for field, how in node.fields.items()
@@ -91,7 +91,7 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
         ticks[name] = _ticks(file, name, node, found, kept)
         stamps[name] = GENERATED if found.stamps is None else RECORDED
         dropped[name] = last - first - len(kept)
-    _align_turns(mapping, outputs, ticks)
+    align_turns(mapping, outputs, ticks)
     zero = _time_zero([ticks[name] for name, kind in stamps.items() if kind == RECORDED], first)
     for name, kind in stamps.items():
         ticks[name] -= zero if kind == RECORDED else 0
@@ -250,81 +250,11 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
     return first, stop
 
 
-def _kept(node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep."""
-    kept = np.arange(first, stop)
-    series = [v for v in (*signals.fields.values(), signals.stamps) if v is not None and v.ndim]
-    if node.missing == "drop":
-        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
-        kept = kept[good]
-    if node.repeated == "first" and signals.stamps is not None and len(kept):
-        stamps = signals.stamps[kept]
-        kept = kept[np.concatenate([[True], stamps[1:] != stamps[:-1]])]
-    return kept
-
-
-def _plausible(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
-    """Return the numbers of those samples whose positions a joint can have had.
-
-    Raises:
-        UsageError: When positions leap away and back, and the mapping does not say to drop such samples; jump at the
-            end of a turn that is not to be counted; or change by more than a joint can move.
-    """
-    t_s = kept / signals.rate_hz if signals.rate_hz else None
-    if t_s is None and signals.stamps is not None:
-        t_s = signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
-    if t_s is None or len(kept) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-        return kept  # the errors of stamps say more
-    for field, how in node.fields.items():
-        if how.unit != "rad" or meaning(field).side == "command" or meaning(field).quantity != "position":
-            continue
-        values = signals.fields[field]
-        angle = np.atleast_2d(values[kept].reshape(len(kept), -1) * np.asarray(how.scale)) if values.ndim else None
-        if angle is None or not np.isfinite(angle).all():
-            continue
-        where = f"{name}.{field} in {file.path}"
-        if not how.turn and (over := plausible.turns(angle, plausible.TURN_RAD)).any():
-            raise UsageError(
-                f"column {int(over.argmax())} of {where} jumps by 2 pi at the end of a turn",
-                hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
-            )
-        leapt = plausible.glitches(t_s, angle)
-        if leapt.any() and node.implausible == "refuse":
-            k, i = (int(x[0]) for x in np.nonzero(leapt))
-            raise UsageError(
-                f"column {i} of {where} reads {angle[k, i]:.4g} rad in sample {kept[k]}: it leaps away and back, as no "
-                f"joint can, in {int(leapt.any(axis=1).sum())} samples",
-                hint='implausible = "drop" in the mapping leaves such samples out',
-            )
-        kept, angle, t_s = (x[~leapt.any(axis=1)] for x in (kept, angle, t_s))
-        if (jump := plausible.leap(t_s, angle)) is not None:
-            raise UsageError(
-                f"column {jump[1]} of {where} changes by {jump[2]:.4g} rad before sample {kept[jump[0]]}, within "
-                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: no joint can, so its zero or its unit has changed",
-                hint="cut the file there with --samples A:B, or leave this joint out",
-            )
-    return kept
-
-
-def _align_turns(
-    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, Any]
-) -> None:
-    """Bring positions and commands whose turns were counted, each from its own beginning, to the same turn."""
-    angles = [
-        (name, field, how)
-        for name, node in mapping.nodes.items()
-        for field, how in node.fields.items()
-        if how.unit == "rad"
-    ]
-    for name, field, how in angles:
-        for other, goal, its in angles:
-            a, b = outputs[name][field], outputs[other][goal]
-            if meaning(field).side == "command" or meaning(goal).side != "command" or not (how.turn or its.turn):
-                continue
-            if meaning(field).quantity != "position" or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
-                continue
-            flat, t = [x.reshape(len(x), -1) for x in (b, a)], [np.asarray(ticks[n], float) for n in (other, name)]
-            outputs[other][goal] = plausible.same_turn(flat[0], t[0], flat[1], t[1]).reshape(b.shape)
+def _seconds(node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+    """Return the stamps of samples, recorded or generated [s]."""
+    if signals.stamps is None:
+        return kept / (signals.rate_hz or 1.0)
+    return signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
 
 
 def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, kept: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pa
         "measured position", path,
     )  # fmt: skip
     named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
-    series = [s for s in series if np.ptp(s.values[s.finite], axis=0).any()] or series
+    series = [s for s in series if _varies(s)] or series
     # A command that never changes is still the command, where there is no other: to say so is what `check` is for.
     commands = [s for s in named if any(s is other for other in series)] or named
     # A feed-forward beside a goal is no command of its own; a goal is what positions follow.
@@ -105,6 +105,11 @@ def _one(fitting: Sequence[Signal], what: str, path: str) -> Signal | None:
         f"which signal of {path} is the {what}? Candidates: {', '.join(repr(s.name) for s in fitting)}",
         hint="write a mapping, or leave the others out of the file",
     )
+
+
+def _varies(signal: Signal) -> bool:
+    columns = [column[np.isfinite(column)] for column in signal.values.T]
+    return any(column.size and np.ptp(column) > 0 for column in columns)
 
 
 def _moves(signal: Signal) -> bool:

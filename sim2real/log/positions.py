@@ -12,8 +12,8 @@ from sim2real.log.evidence import DEGREES
 from sim2real.log.quantities import Asked, clean
 from sim2real.log.signals import Signal
 
-_FAST_RAD_S = 30.0
-"""What moves faster, as radians, is asked about: it may be in degrees."""
+_FAST_RAD_S, _SMALL_RAD = 30.0, 2.0
+"""What moves faster, as radians, and farther is asked about: it may be in degrees."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def checked_positions(measured: Signal, t_s: np.ndarray, asked: Asked, path: str
         at = rows[kept][jump[0]]
         raise UsageError(
             f"{measured.sources[jump[1]]!r} in {path} changes by {jump[2]:.4g} rad before sample {at}, at "
-            f"{t_s[at]:.6g} s: no joint can, between two samples. Its zero has changed, samples are missing, or it is no angle",
+            f"{t_s[at]:.6g} s, as no joint can: its zero has changed, samples are missing, or it is no angle",
             hint="cut the file there with --samples A:B, or leave this joint out",
         )
     said = [f"{measured.name!r} is in {'degrees' if to_rad != 1 else 'radians'}: {why}"]
@@ -139,7 +139,7 @@ def radian(
             return 1.0, f"as degrees {1 - share[DEGREES]:.0%} of it would lie outside of the joints' ranges"
     most = float(np.abs(q).max())
     speed = float(np.quantile(np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None], 0.99))
-    if most <= 2.2 * np.pi and speed <= _FAST_RAD_S:
+    if most <= 2.2 * np.pi and (speed <= _FAST_RAD_S or most <= _SMALL_RAD):
         return 1.0, f"it stays within {most:.3g}"
     if 30.0 < most <= 400.0 and speed > 2.0 * _FAST_RAD_S:
         return DEGREES, f"as radians it would move at {speed:.3g} rad/s"

@@ -101,7 +101,7 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         more = [f"{command.name!r} commands {kind}: it goes by its name, no position follows it (|r| at most "
                 f"{np.abs(found.r).max():.2f})"]  # fmt: skip
     said += more + shift
-    velocity, more = velocity_of(signals, measured, clocks[0], to_rad, places)
+    velocity, more, lacking = velocity_of(signals, measured, clocks[0], to_rad, places)
     fields["sensor"] |= velocity
     fields["actuator"] |= extra
     nodes = {}
@@ -109,7 +109,9 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         ("actuator", stamps[1], command, offset_s, np.zeros(len(command.values), bool)),
         ("sensor", stamps[0], measured, 0.0, checked.leapt),
     ):
-        nodes[name], policy = _node(name, fields[name], at, signal, offset, leapt)
+        lacks = ~(signal.finite | leapt)
+        lacks |= lacking if name == "sensor" else False
+        nodes[name], policy = _node(name, fields[name], at, lacks, offset, leapt)
         said += policy
     mapping = ImportMapping(asked.pipeline, nodes)
     return Proposal(mapping, labels, tuple(said + more + others + unread))
@@ -272,12 +274,12 @@ def _clocks(
 
 
 def _node(
-    name: str, fields: dict[str, FieldMapping], stamps: Stamps, signal: Signal, offset_s: float, leapt: np.ndarray
+    name: str, fields: dict[str, FieldMapping], stamps: Stamps, lacks: np.ndarray, offset_s: float, leapt: np.ndarray
 ) -> tuple[NodeMapping, list[str]]:
     """Return a node's mapping, with policies only where the data needs them, and what to say of those."""
     said = []
     missing, repeated = "refuse", "refuse"
-    good = (signal.finite | leapt) & np.isfinite(stamps.t_s)
+    good = ~lacks & np.isfinite(stamps.t_s)
     if not good.all():
         missing = "drop"
         said.append(

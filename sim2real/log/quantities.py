@@ -88,8 +88,8 @@ def field_of(signal: Signal, unit: str, scales: Sequence[float], turn: float = 0
 
 def velocity_of(
     signals: Sequence[Signal], measured: Signal, t_s: np.ndarray, to_rad: float, places: np.ndarray
-) -> tuple[dict[str, FieldMapping], list[str]]:
-    """Return the measured velocity, where it is that of the positions.
+) -> tuple[dict[str, FieldMapping], list[str], np.ndarray]:
+    """Return the measured velocity, where it is that of the positions, what to say, and which samples lack numbers.
 
     Args:
         signals: All of the file.
@@ -103,12 +103,17 @@ def velocity_of(
         if s.meaning.quantity == "velocity" and s.meaning.side != "command"
         and len(s.values) == len(measured.values) and s.width >= measured.width and s.values.ndim == 2
     ]  # fmt: skip
+    whole = np.zeros(len(measured.values), bool)
     if len(fitting) != 1:
-        return {}, [f"several velocities, none is taken: {', '.join(s.name for s in fitting)}"] * (len(fitting) > 1)
+        return (
+            {},
+            [f"several velocities, none is taken: {', '.join(s.name for s in fitting)}"] * (len(fitting) > 1),
+            whole,
+        )
     velocity = matched(fitting[0], measured, places)
     rows = np.flatnonzero(clean(t_s, measured) & velocity.finite)
     if len(rows) < 0.5 * clean(t_s, measured).sum() or len(rows) < 3:
-        return {}, [f"left out: {velocity.name!r} lacks numbers"]
+        return {}, [f"left out: {velocity.name!r} lacks numbers"], whole
     period = float(np.median(np.diff(t_s[rows])))
     rate = np.gradient(measured.values[rows], t_s[rows], axis=0) / to_rad
     found = following(rate, velocity.values[rows], period, 0.1)
@@ -122,14 +127,18 @@ def velocity_of(
     odd = still | (np.abs(r) > 0.05) & ((np.abs(r) < SURE) | (off < 0.6) | (off > 1.7))
     if ratio is None or odd.any():
         listed = ", ".join(f"{velocity.sources[i]} r {r[i]:.2f}, slope {slope[i]:.3g}" for i in np.flatnonzero(odd)[:3])
-        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({listed or 'no unit fits'}): left out"]
+        return (
+            {},
+            [f"{velocity.name!r} is not the rate of {measured.name!r} ({listed or 'no unit fits'}): left out"],
+            whole,
+        )
     scales = [float((-1 if x < -SURE else 1) / ratio) for x in r]
     said = [
         f"{velocity.name!r} is the rate of {measured.name!r}: r {np.abs(r).max():.2f}, slope {np.median(slope):.3g}"
     ]
     turned = [s for s, x in zip(velocity.sources, r, strict=True) if x < -SURE]
     said += [f"opposite signs, velocities are turned: {', '.join(turned)}"] * bool(turned)
-    return {"velocity": field_of(velocity, "rad/s", scales)}, said
+    return {"velocity": field_of(velocity, "rad/s", scales)}, said, ~velocity.finite
 
 
 def extras(

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.foreign import ForeignFile, NoNumbers
+from sim2real.log.cells import NoNumbers
+from sim2real.log.foreign import ForeignFile
 from sim2real.log.mapping import STAMP_UNITS
 from sim2real.log.names import Meaning, meaning
 
@@ -121,11 +122,6 @@ def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
         else:
             found += rows
     return found, [*said, *([f"left out, as they hold no numbers: {', '.join(text)}"] if text else [])]
-
-
-def with_numbers(signal: Signal) -> np.ndarray:
-    """Return the places of the columns that have a number in any row."""
-    return np.flatnonzero(np.isfinite(signal.values).any(axis=0))
 
 
 def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rate_hz: float | None) -> Stamps:
