@@ -76,7 +76,7 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     checked = checked_positions(measured, stamps[0].t_s, asked, path)
     measured, to_rad, said = checked.signal, checked.to_rad, said + checked.said
     command, turn = turned_commands(command, checked)
-    clocks, offset_s, shift = _clocks(stamps, measured, command, path)
+    clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
     rows = clean(clocks[0], measured), clean(clocks[1], command)
     t, q, c = (clocks[0][rows[0]], clocks[1][rows[1]]), measured.values[rows[0]], command.values[rows[1]]
     held, joined, period_s = _compared(t, c, q, _acting(signals, rows[1]), [measured, command], path)
@@ -223,7 +223,7 @@ def _joint_order(measured: Signal, asked: Asked, path: str) -> tuple[np.ndarray,
 
 
 def _clocks(
-    stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
+    signals: Sequence[Signal], stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
 ) -> tuple[list[np.ndarray], float, list[str]]:
     """Return both streams' times, the offset of the commands' clock, and what to say of it.
 
@@ -258,6 +258,8 @@ def _clocks(
             0.0,
             [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"] * (not one),
         )
+    if not apart and _leads_on_recorder(signals, (measured, command), rows):
+        return [t, c], 0.0, []  # no clock explains it
     if (np.isfinite(found.against_s) | np.isfinite(found.repeats_s) | found.either)[sure].all():
         raise UsageError(
             f"the clocks of {measured.name!r} and {command.name!r} in {path} do not agree, and commands that repeat "
@@ -271,6 +273,21 @@ def _clocks(
         "their names are exchanged: stamp_offset aligns them; what is left of the true delay cannot be told by clocks"
     )
     return [t, c + offset], offset, [said]
+
+
+def _leads_on_recorder(
+    signals: Sequence[Signal], pair: tuple[Signal, Signal], rows: tuple[np.ndarray, np.ndarray]
+) -> bool:
+    """Return whether positions move before their commands by the recorder's clock, too, which is one for both."""
+    names = [s.sources[0].partition(".")[0] + ".log_time" for s in pair]
+    found = [s.values[:, 0] * 1e-9 for name in names for s in signals if s.name == name]
+    if [len(x) for x in found] != [len(r) for r in rows]:
+        return False
+    q, c = (s.values[r] for s, r in zip(pair, rows, strict=True))
+    held, joined, period_s = on_grid(found[1][rows[1]], c, found[0][rows[0]], q)
+    own = following(held, joined, period_s)
+    sure = np.abs(own.r) > SURE
+    return bool(sure.any() and np.median(own.lag_s[sure]) < -1.5 * period_s)
 
 
 def _node(

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_robots import imported, motion
+from mcap_ros2.writer import Writer
 
 from sim2real.errors import UsageError
 from sim2real.log import evidence
@@ -45,6 +46,46 @@ def test_commands_that_are_the_measurements_are_refused(tmp_path, recorded, copy
 def test_a_mapping_of_such_commands_is_contradicted(recorded):
     t, _, q = recorded
     assert "its commands are its measurements" in evidence.contradictions((t, t), q, q)[0]
+
+
+SCHEMA = """std_msgs/Header header
+string[] name
+float64[] position
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+def bag(path, t, goal, q, ahead_s=0.0):
+    """Write a bag of both topics; ``ahead_s``: of the clock that stamps commands."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        kind = writer.register_msgdef("sensor_msgs/msg/JointState", SCHEMA)
+        for k in range(len(t)):
+            for topic, values, ahead in (("/cmd", goal, ahead_s), ("/joint_states", q, 0.0)):
+                ns = round((1000.0 + t[k]) * 1e9)
+                sec, nanosec = divmod(round((1000.0 + t[k] + ahead) * 1e9), 10**9)
+                header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}
+                row = {"header": header, "name": ["a", "b"], "position": values[k].tolist()}
+                writer.write_message(topic, kind, row, log_time=ns, publish_time=ns)
+        writer.finish()
+    return path
+
+
+def test_topics_that_are_exchanged_are_refused_but_a_clock_that_is_ahead_is_not(tmp_path, recorded):
+    """The recorder's clock is one for both topics: if positions lead by it, too, no clock explains that."""
+    t, goal, q = recorded
+    with pytest.raises(UsageError, match="move before they are told to: a by"):
+        imported(bag(tmp_path / "exchanged.mcap", t, q, goal))
+    _, found = imported(bag(tmp_path / "ahead.mcap", t, goal, q, 0.2))
+    assert found.mapping.nodes["actuator"].stamp_offset == pytest.approx(0.09 - 0.2, abs=0.02)
+    assert imported(bag(tmp_path / "right.mcap", t, goal, q))[1].mapping.nodes["actuator"].stamp_offset == 0.0
 
 
 @pytest.mark.parametrize(
