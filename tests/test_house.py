@@ -14,7 +14,7 @@ ROOMS = [
     "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "artifacts", "identify", "train", "robots",
     "view", "stages", "interop", "cli",
 ]  # fmt: skip
-EVERYWHERE = {"arrays", "errors", "room"}
+EVERYWHERE = {"arrays", "errors", "leaps", "room"}
 STAGES = {"record", "identify", "train", "deploy", "check"}
 MAX_LINES = 400
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -6,11 +6,8 @@ import numpy as np
 
 from sim2real.errors import SafetyStop
 from sim2real.hardware.gate import GateConfig
+from sim2real.leaps import STAMP_S, reach_rad
 
-_STAMP_S = 0.01
-"""Uncertainty of the time between two samples [s]: a servo may answer with an older sample."""
-_PLAY_RAD = 0.05
-"""Tolerance of a position change [rad]: 33 counts."""
 _KEPT = 0.5
 """The share of its speed that a joint surely keeps from one reading to the next."""
 _HARD = 10.0
@@ -85,7 +82,7 @@ class Plausibility:
         self._t_s, self._unsure_s = t_s, unsure_s
         moved = position_rad != self._position
         if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
-            speed = np.abs(position_rad - self._position) / (elapsed_s + _STAMP_S + unsure_s)
+            speed = np.abs(position_rad - self._position) / (elapsed_s + STAMP_S + unsure_s)
             self._speed[moved] = np.maximum(speed, _KEPT * self._before)[moved]
             self._before = speed
         self._position = position_rad.copy()
@@ -122,7 +119,7 @@ class Plausibility:
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
         limit = self._fastest
-        most = limit * (elapsed_s + _STAMP_S) + _PLAY_RAD
+        most = reach_rad(limit, elapsed_s)
         leap = np.abs(position_rad - self._position)
         if (leap > most).any():
             worst = int(np.argmax(leap - most))

@@ -20,6 +20,8 @@ MOST_COLUMNS = 1000
 """A signal of joints has at most this many columns; one with more is an image."""
 MOST_LEVELS = 64
 """A document is nested at most this deep."""
+_WORD_BYTES = 64
+"""What a word takes in memory until its number is known [bytes]."""
 
 
 def require_size(path: Path, most: int = MOST_BYTES) -> None:
@@ -73,12 +75,12 @@ def why_left_out(shape: Sequence[int], kind: str, itemsize: int) -> str:
         kind: Of its elements, as numpy's ``dtype.kind``.
         itemsize: Size of an element [bytes].
     """
-    if kind not in "fiubMm":
+    if kind not in "fiubMmUS":  # words may be dates, or numbers that were saved as words
         return "no numbers"
     if len(shape) > 2:
         return f"{len(shape)} dimensions, as of images"
     if len(shape) == 2 and shape[1] > MOST_COLUMNS:
         return f"{shape[1]} columns, as of images"
-    if math.prod(shape) * max(itemsize, 8) > MOST_BYTES:
+    if math.prod(shape) * max(itemsize, _WORD_BYTES if kind in "US" else 8) > MOST_BYTES:
         return f"larger than {MOST_BYTES / 2**20:.0f} MiB"
     return ""

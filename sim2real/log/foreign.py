@@ -24,6 +24,7 @@ from sim2real.log.budget import (
     require_signals,
     require_size,
 )
+from sim2real.log.cells import OTHER, NoNumbers, from_words
 from sim2real.log.names import meaning
 from sim2real.log.raw import RawSignals
 from sim2real.log.tables import encoding_of, read_csv
@@ -237,10 +238,12 @@ def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
             values = np.asarray(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
+    if values.dtype.kind in "US":
+        values = from_words(values, what)
     if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
         return values.astype(np.int64)
     if values.dtype.kind not in "fiub":
-        raise UsageError(f"{what} holds no numbers, but {values.dtype}", hint="name another source in the mapping")
+        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
     return values if values.dtype == np.float32 else values.astype(np.float64)
 
 

@@ -13,7 +13,9 @@ import numpy as np
 
 from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
+from sim2real.log import plausible
 from sim2real.log.foreign import ForeignFile, open_foreign
+from sim2real.log.kept import align_turns, kept_samples, plausible_samples
 from sim2real.log.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
 from sim2real.log.session_file import SessionFile
 
@@ -86,7 +88,8 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
     ticks, outputs, stamps, dropped = {}, {}, {}, {}
     for name, node in mapping.nodes.items():
         found, last = signals[name], signals[name].count if stop is None else stop
-        kept = _kept(node, found, first, last)
+        kept = kept_samples(node, found.fields, found.stamps, first, last)
+        kept = plausible_samples(f"node {name} in {file.path}", node, found.fields, _seconds(node, found, kept), kept)
         outputs[name] = {
             field: _samples(file, f"{name}.{field}", found.fields[field], how, kept)
             for field, how in node.fields.items()
@@ -94,6 +97,7 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
         ticks[name] = _ticks(file, name, node, found, kept)
         stamps[name] = GENERATED if found.stamps is None or node.stamps in file.nominal else RECORDED
         dropped[name] = last - first - len(kept)
+    align_turns(mapping, outputs, ticks)
     from_file = [name for name, found in signals.items() if found.stamps is not None]
     zero = _time_zero([ticks[name] for name in from_file], first)
     for name in from_file:
@@ -223,15 +227,17 @@ def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
 def _field(file: ForeignFile, where: str, how: FieldMapping) -> np.ndarray:
     """Read a field's signal, unscaled; several sources are stacked along the last axis."""
     parts = [file.signal(source, how.column) for source in how.source]
-    if len(parts) == 1:
-        return parts[0]
     try:
-        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+        values = parts[0] if len(parts) == 1 else np.stack(np.broadcast_arrays(*parts), axis=-1)
     except ValueError:
         shapes = ", ".join(f"{source} {part.shape}" for source, part in zip(how.source, parts, strict=True))
         raise UsageError(
             f"the sources of field {where} differ in shape: {shapes}", hint="stack signals of one length"
         ) from None
+    if not how.turn or not values.ndim:
+        return values
+    # Of all samples, not of those that are taken: a part of a file is then in the same turn as the whole.
+    return plausible.counted(values.reshape(len(values), -1), how.turn).reshape(values.shape)
 
 
 def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) -> tuple[int, int | None]:
@@ -255,17 +261,11 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
     return first, stop
 
 
-def _kept(node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep."""
-    kept = np.arange(first, stop)
-    series = [v for v in (*signals.fields.values(), signals.stamps) if v is not None and v.ndim]
-    if node.missing == "drop":
-        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
-        kept = kept[good]
-    if node.repeated == "first" and signals.stamps is not None and len(kept):
-        stamps = signals.stamps[kept]
-        kept = kept[np.concatenate([[True], stamps[1:] != stamps[:-1]])]
-    return kept
+def _seconds(node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+    """Return the stamps of samples, recorded or generated [s]."""
+    if signals.stamps is None:
+        return kept / (signals.rate_hz or 1.0)
+    return signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
 
 
 def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, kept: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
 _COMMANDING = "actuator"
+_POLICIES = {"missing": ("refuse", "drop"), "repeated": ("refuse", "first"), "implausible": ("refuse", "drop")}
+"""Key of a node that says what happens to samples -> values; the first is the default."""
 _HINT = "the guide 'Import' has a mapping file with every key"
 
 
@@ -33,6 +35,7 @@ class FieldMapping:
         offset: See ``scale`` [the field's unit].
         shape: Shape of one sample; None: as in the file.
         column: Column of a two-dimensional signal; None: all columns.
+        turn: A turn in the signal's unit, where angles jump at its end: turns are counted; 0: angles are as they are.
     """
 
     source: tuple[str, ...]
@@ -41,6 +44,7 @@ class FieldMapping:
     offset: float = 0.0
     shape: tuple[int, ...] | None = None
     column: int | None = None
+    turn: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ class NodeMapping:
         missing: What happens to samples that lack a number: ``refuse``, or ``drop`` to leave them out.
         repeated: What happens to samples with the stamp of the one before: ``refuse``, or ``first`` to keep the first.
         stamp_offset: Added to the recorded stamps, where a stream has a clock of its own [s].
+        implausible: What happens to samples whose positions leap away and back: ``refuse``, or ``drop``.
     """
 
     fields: Mapping[str, FieldMapping]
@@ -67,6 +72,7 @@ class NodeMapping:
     missing: str = "refuse"
     repeated: str = "refuse"
     stamp_offset: float = 0.0
+    implausible: str = "refuse"
 
 
 @dataclass(frozen=True)
@@ -151,7 +157,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
 
 def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     where = f"{document}: nodes.{name}"
-    keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", "missing", "repeated", "stamp_offset")
+    keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", *_POLICIES, "stamp_offset")
     _known(table, keys, where)
     fields = _value(table, "fields", dict, where) or {}
     if not fields:
@@ -169,7 +175,7 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     if unit not in STAMP_UNITS:
         raise UsageError(f"{where}: unknown stamp_unit {unit!r}. Available: {', '.join(STAMP_UNITS)}", hint=_HINT)
     policies = {}
-    for key, available in (("missing", ("refuse", "drop")), ("repeated", ("refuse", "first"))):
+    for key, available in _POLICIES.items():
         policies[key] = _value(table, key, str, where) or "refuse"
         if policies[key] not in available:
             raise UsageError(f"{where}: unknown {key} {policies[key]!r}. Available: {', '.join(available)}", hint=_HINT)
@@ -201,7 +207,7 @@ def positive(value: float, where: str) -> float:
 
 
 def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
-    _known(table, ("source", "unit", "scale", "offset", "shape", "column"), where)
+    _known(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
     source = _value(table, "source", (str, list), where)
     sources = [source] if isinstance(source, str) else source or []
     if not sources or not all(isinstance(s, str) and s for s in sources):
@@ -213,6 +219,9 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
             raise UsageError(
                 f"{where}: {key} must be a finite number, got {scale if key == 'scale' else offset}", hint=_HINT
             )
+    turn = float(_value(table, "turn", (int, float), where) or 0.0)
+    if not 0.0 <= turn < math.inf:
+        raise UsageError(f"{where}: turn must be above 0, such as 360 for degrees, got {turn}", hint=_HINT)
     shape = _value(table, "shape", list, where)
     if shape is not None and not all(type(n) is int and n > 0 for n in shape):
         raise UsageError(f"{where}: shape must be a list of whole numbers above 0, got {shape}", hint=_HINT)
@@ -226,6 +235,7 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
         offset=float(offset or 0.0),
         shape=None if shape is None else tuple(shape),
         column=_value(table, "column", int, where),
+        turn=turn,
     )
 
 
@@ -266,13 +276,15 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
         keys: dict[str, Any] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
         keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}
         keys |= {"order": node.order} if node.order != int(name == _COMMANDING) else {}
-        keys |= {k: v for k in ("missing", "repeated") if (v := getattr(node, k)) != "refuse"}
+        keys |= {k: v for k in _POLICIES if (v := getattr(node, k)) != "refuse"}
         keys |= {"stamp_offset": node.stamp_offset} if node.stamp_offset else {}
         lines += ["", f"[nodes.{name}]", *(f"{key} = {_quoted(value)}" for key, value in keys.items())]
         for field, how in node.fields.items():
             parts: dict[str, Any] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
             parts |= {"unit": how.unit} if how.unit else {}
-            parts |= {k: v for k, plain in (("scale", 1.0), ("offset", 0.0)) if (v := getattr(how, k)) != plain}
+            parts |= {
+                k: v for k, plain in (("scale", 1.0), ("offset", 0.0), ("turn", 0.0)) if (v := getattr(how, k)) != plain
+            }
             parts |= {k: v for k in ("shape", "column") if (v := getattr(how, k)) is not None}
             inside = ", ".join(f"{key} = {_quoted(value)}" for key, value in parts.items())
             lines.append(f"fields.{field} = {{ {inside} }}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log import evidence
+from sim2real.log.following import following, on_grid
 from sim2real.log.names import Meaning
 from sim2real.log.signals import Signal, find_stamps
 
@@ -54,7 +54,7 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pa
         "measured position", path,
     )  # fmt: skip
     named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
-    series = [s for s in series if np.ptp(s.values[s.finite], axis=0).any()] or series
+    series = [s for s in series if _varies(s)] or series
     # A command that never changes is still the command, where there is no other: to say so is what `check` is for.
     commands = [s for s in named if any(s is other for other in series)] or named
     # A feed-forward beside a goal is no command of its own; a goal is what positions follow.
@@ -108,6 +108,11 @@ def _one(fitting: Sequence[Signal], what: str, path: str) -> Signal | None:
     )
 
 
+def _varies(signal: Signal) -> bool:
+    columns = [column[np.isfinite(column)] for column in signal.values.T]
+    return any(column.size and np.ptp(column) > 0 for column in columns)
+
+
 def _moves(signal: Signal) -> bool:
     good = signal.values[signal.finite]
     return bool(len(good) and (good.std(axis=0) > 0).any() and not (np.diff(good[:, 0]) > 0).all())
@@ -133,8 +138,8 @@ def _link(a: Signal, b: Signal, signals: Sequence[Signal], path: str, rate_hz: f
     t = find_stamps(signals, a, "measured", path, rate_hz).t_s
     good = a.finite & b.finite & np.isfinite(t)
     good[1:] &= np.diff(np.maximum.accumulate(np.where(np.isfinite(t), t, -np.inf))) > 0
-    held, joined, period = evidence.on_grid(t[good], b.values[good], t[good], a.values[good])
-    found = evidence.following(held, joined, period)
+    held, joined, period = on_grid(t[good], b.values[good], t[good], a.values[good])
+    found = following(held, joined, period)
     best = np.abs(found.r).max(axis=1)
     if not (best > 0).any():
         return 0.0, 0.0
@@ -187,8 +192,8 @@ def _halves(
     """Split columns into those that lead and those that follow, where each has a partner that is closest both ways."""
     t = find_stamps(signals, signal, "measured", path, rate_hz).t_s
     good = signal.finite
-    held, joined, period = evidence.on_grid(t[good], signal.values[good], t[good], signal.values[good])
-    found = evidence.following(held, joined, period)
+    held, joined, period = on_grid(t[good], signal.values[good], t[good], signal.values[good])
+    found = following(held, joined, period)
     distance = found.distance() + np.diag(np.full(signal.width, np.inf))
     partner = distance.argmin(axis=1)
     own = np.arange(signal.width)

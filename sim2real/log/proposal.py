@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log import evidence
-from sim2real.log.evidence import DEGREES, SURE, Following
+from sim2real.log.evidence import SURE
+from sim2real.log.following import following, on_grid
 from sim2real.log.foreign import ForeignFile
-from sim2real.log.lerobot import are_degrees
+from sim2real.log.goals import follows, goal, refuse_copies
 from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping
 from sim2real.log.names import meaning, same_joint
 from sim2real.log.pairing import find_pair
-from sim2real.log.quantities import Asked, clean, extras, field_of, radian, taken, velocity_of
+from sim2real.log.plausible import TURN_RAD
+from sim2real.log.positions import checked_positions, turned_commands
+from sim2real.log.quantities import Asked, clean, extras, field_of, matched, taken, velocity_of
 from sim2real.log.signals import Signal, Stamps, collect, find_stamps
 
 _FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
 _CLOSE = 0.9
 """Correlation of two streams whose clocks differ."""
+_SAME_ANGLE = 0.1
+"""Means that differ by whole turns but for this share of one are of the same angle."""
 _GAP = 5.0
 """A pause of this many periods is a gap."""
 
@@ -52,9 +57,13 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     Raises:
         UsageError: When something is ambiguous: the candidates are named.
     """
-    signals = collect(file)
-    pair = find_pair(signals, str(file.path), asked.rate_hz)
-    path, said = str(file.path), list(pair.said)
+    path = str(file.path)
+    signals, unread = collect(file)
+    try:
+        pair = find_pair(signals, path, asked.rate_hz)
+    except UsageError as error:
+        raise UsageError("; ".join([error.args[0], *unread]), hint=error.hint) from None
+    said = list(pair.said)
     measured, command = pair.measured, pair.command
     try:
         stamps = [find_stamps(signals, s, side, path, asked.rate_hz)
@@ -66,49 +75,51 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         _on_stamps(command, stamps[1]) if stamps[1].source != stamps[0].source else []
     )
     places, labels, ordered = _joint_order(measured, asked, path)
-    measured, said = taken(measured, places), said + ordered
-    clocks, offset_s, shift = _clocks(stamps, measured, command)
+    places, labels, empty = _with_numbers(measured, places, labels, asked, path)
+    measured, said = taken(measured, places), said + ordered + empty
+    # Positions that no joint can have had are no evidence, and would be motion to an identification.
+    checked = checked_positions(file, measured, stamps[0].t_s, asked)
+    measured, to_rad, said = checked.signal, checked.to_rad, said + checked.said
+    command, turn = turned_commands(command, checked)
+    clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
     rows = clean(clocks[0], measured), clean(clocks[1], command)
-    q, c = measured.values[rows[0]], command.values[rows[1]]
-    extra, others = extras(signals, command, places, path)
-    held, joined, period_s = evidence.on_grid(clocks[1][rows[1]], c, clocks[0][rows[0]], q, _acting(signals, rows[1]))
-    if len(held) < 50:
-        raise UsageError(
-            f"{path} has {len(held)} samples at which both {measured.name!r} and {command.name!r} are known",
-            hint="that is too few to tell what follows what: write a mapping",
-        )
-    found = evidence.following(held, joined, period_s)
+    t, q, c = (clocks[0][rows[0]], clocks[1][rows[1]]), measured.values[rows[0]], command.values[rows[1]]
+    held, joined, period_s = _compared(t, c, q, _acting(signals, rows[1]), [measured, command], path)
+    found = replace(following(held, joined, period_s), turn=TURN_RAD * to_rad)
+    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
     fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
-    proven = are_degrees(file.facts, _names_of(file, measured), q, path)
-    to_rad, why = (
-        (DEGREES, "its steps are those of encoders of 4096 a turn") if proven else radian(measured, q, asked, path)
+    fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width, checked.turn)
+    kind = pair.kind or (
+        "position" if command.meaning.unit in ("rad", "deg") or follows(found, command, path) else "duty"
     )
-    said.append(f"{measured.name!r} is in {'degrees' if to_rad != 1 else 'radians'}: {why}")
-    fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width)
-    kind = pair.kind or ("position" if command.meaning.unit in ("rad", "deg") or _follows(found) else "duty")
     if kind == "position":
-        command, scales, more = _goal(measured, command, found, to_rad, path)
-        fields["actuator"]["goal"] = field_of(command, "rad", scales)
+        command, scales, more = goal(measured, command, found, to_rad, path, asked.as_told)
+        in_rad = command.values[rows[1]] * scales, q / to_rad
+        turn, circle = _circle(command, turn, *in_rad, abs(scales[0]))
+        fields["actuator"]["goal"] = field_of(command, "rad", scales, turn)
+        copies = evidence.copied(t[1], t[0], *in_rad)
+        more += circle + refuse_copies(measured, command, copies, path, asked.as_told)
     else:
-        if command.width != measured.width:
-            raise UsageError(
-                f"{command.name!r} has {command.width} columns, {measured.name!r} {measured.width}",
-                hint="name which belong together in a mapping",
-            )
+        command = _other_command(command, measured, places)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
-        fields["actuator"][_FIELDS[kind]] = field_of(taken(command, places), unit, [1.0] * command.width)
+        fields["actuator"][_FIELDS[kind]] = field_of(command, unit, [1.0] * command.width)
         more = [f"{command.name!r} commands {kind}: it goes by its name, no position follows it (|r| at most "
                 f"{np.abs(found.r).max():.2f})"]  # fmt: skip
     said += more + shift
-    velocity, more = velocity_of(signals, measured, clocks[0], to_rad, places)
+    velocity, more, lacking = velocity_of(signals, measured, clocks[0], to_rad, places)
     fields["sensor"] |= velocity
     fields["actuator"] |= extra
     nodes = {}
-    for name, at, signal, offset in (("actuator", stamps[1], command, offset_s), ("sensor", stamps[0], measured, 0.0)):
-        nodes[name], policy = _node(name, fields[name], at, signal, offset)
+    for name, at, signal, offset, leapt in (
+        ("actuator", stamps[1], command, offset_s, np.zeros(len(command.values), bool)),
+        ("sensor", stamps[0], measured, 0.0, checked.leapt),
+    ):
+        lacks = ~(signal.finite | leapt)
+        lacks |= lacking if name == "sensor" else False
+        nodes[name], policy = _node(name, fields[name], at, lacks, offset, leapt)
         said += policy
     mapping = ImportMapping(asked.pipeline, nodes)
-    return Proposal(mapping, labels, tuple(said + more + others + list(file.notes)))
+    return Proposal(mapping, labels, tuple(said + more + others + unread + list(file.notes)))
 
 
 def _require_readable_stamps(file: ForeignFile) -> None:
@@ -116,15 +127,6 @@ def _require_readable_stamps(file: ForeignFile) -> None:
     for key in file.keys:
         if meaning(key).quantity == "stamp":
             file.signal(key)
-
-
-def _names_of(file: ForeignFile, signal: Signal) -> list[str]:
-    """Return the names of a signal's columns as the file has them."""
-    own = file.columns.get(signal.sources[0].partition("[")[0], ())
-    places = [s.rpartition("[:,")[2].rstrip("]") for s in signal.sources]
-    return [
-        own[int(p)] if p.isdigit() and int(p) < len(own) else s for p, s in zip(places, signal.sources, strict=True)
-    ]
 
 
 def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
@@ -135,15 +137,77 @@ def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
     return (found[0].values[rows] > 0).min(axis=1) if len(found) == 1 else None
 
 
-def _follows(found: Following) -> bool:
-    best, moved = np.abs(found.r).max(axis=1), found.moved.any(axis=1)
-    ratio = evidence.unit_ratio(_at_best(found)[best > SURE])
-    return bool(moved.any() and (best[moved] > SURE).mean() > 0.5) and ratio is not None
+def _circle(
+    command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float
+) -> tuple[float, list[str]]:
+    """Return a turn in the unit of the goals, where turns are counted or differ, else 0, and what to say of it."""
+    if turn:
+        return turn, [f"{command.name!r} jumps at the end of a turn: turns are counted"]
+    apart = (goal_rad.mean(axis=0) - q_rad.mean(axis=0)) / TURN_RAD
+    other = (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
+    if not other.any():
+        return 0.0, []
+    who = ", ".join(np.array(command.sources)[other])
+    return TURN_RAD / scale, [f"{who} is a turn away from its position: it is brought to the same turn"]
 
 
-def _at_best(found: Following) -> np.ndarray:
-    best = np.argmax(np.abs(found.r), axis=1)
-    return found.slope[np.arange(len(best)), best]
+def _other_command(command: Signal, measured: Signal, places: np.ndarray) -> Signal:
+    """Return commands that are no goals, in the order of the joints.
+
+    Raises:
+        UsageError: When they are not as many as the joints, and have no names to choose by.
+    """
+    if command.width != measured.width and not set(measured.labels) <= set(command.labels) - {""}:
+        raise UsageError(
+            f"{command.name!r} has {command.width} columns, {measured.name!r} {measured.width}",
+            hint="name which belong together in a mapping",
+        )
+    return matched(command, measured, places)
+
+
+def _compared(
+    t_s: Sequence[np.ndarray],
+    command: np.ndarray,
+    q: np.ndarray,
+    acting: np.ndarray | None,
+    pair: Sequence[Signal],
+    path: str,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return commands and positions on one grid of time, and its period [s].
+
+    Raises:
+        UsageError: When they have too little time in common.
+    """
+    held, joined, period_s = (
+        on_grid(t_s[1], command, t_s[0], q, acting) if min(map(len, t_s)) > 2 else (q[:0], q[:0], 1.0)
+    )
+    if len(held) < 50:
+        raise UsageError(
+            f"{path} has {len(held)} samples at which both {pair[0].name!r} and {pair[1].name!r} are known",
+            hint="that is too few to tell what follows what: write a mapping",
+        )
+    return held, joined, period_s
+
+
+def _with_numbers(
+    measured: Signal, places: np.ndarray, labels: tuple[str, ...], asked: Asked, path: str
+) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
+    """Return the joints that have numbers, and what to say of the others.
+
+    Raises:
+        UsageError: When a joint that was asked for has none.
+    """
+    kept = np.asarray(np.isfinite(measured.values[:, places]).any(axis=0))
+    if kept.all():
+        return places, labels, []
+    empty = ", ".join(measured.sources[i] for i in places[~kept])
+    if asked.joints or not kept.any():
+        raise UsageError(
+            f"{empty} in {path} has no number in any sample",
+            hint="leave that joint out: --joints names those that count",
+        )
+    names = tuple(label for label, k in zip(labels, kept.tolist(), strict=True) if k)
+    return places[kept], names, [f"left out: {empty} has no number in any sample"]
 
 
 def _joint_order(measured: Signal, asked: Asked, path: str) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
@@ -170,131 +234,81 @@ def _joint_order(measured: Signal, asked: Asked, path: str) -> tuple[np.ndarray,
     ]  # fmt: skip
 
 
-def _clocks(stamps: Sequence[Stamps], measured: Signal, command: Signal) -> tuple[list[np.ndarray], float, list[str]]:
-    """Return both streams' times, the offset of the commands' clock, and what to say of it."""
+def _clocks(
+    signals: Sequence[Signal], stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
+) -> tuple[list[np.ndarray], float, list[str]]:
+    """Return both streams' times, the offset of the commands' clock, and what to say of it.
+
+    Raises:
+        UsageError: When the clocks differ, and a command that repeats leaves open by how much.
+    """
     t, c = (s.t_s for s in stamps)
     if stamps[0].source == stamps[1].source and len(t) == len(c):
         return [t, t], 0.0, []
     rows = clean(t, measured), clean(c, command)
+    if min(r.sum() for r in rows) < 3:
+        return [t, c], 0.0, []
     period_s = float(np.median(np.diff(t[rows[0]])))
     overlap = min(t[rows[0]][-1], c[rows[1]][-1]) - max(t[rows[0]][0], c[rows[1]][0])
     apart = overlap < 0.5 * min(np.ptp(t[rows[0]]), np.ptp(c[rows[1]]))
     coarse = float(t[rows[0]][0] - c[rows[1]][0]) if apart else 0.0
-    held, joined, _ = evidence.on_grid(
-        c[rows[1]] + coarse, command.values[rows[1]], t[rows[0]], measured.values[rows[0]]
-    )
-    near = evidence.following(held, joined, period_s)
-    far = evidence.following(held, joined, period_s, 0.4 * len(joined) * period_s)
+    held, joined, _ = on_grid(c[rows[1]] + coarse, command.values[rows[1]], t[rows[0]], measured.values[rows[0]])
+    near = following(held, joined, period_s)
+    far = following(held, joined, period_s, 0.4 * len(joined) * period_s)
     best, farthest = (np.abs(f.r).max(initial=0.0) for f in (near, far))
     if max(best, farthest) < SURE:
         return [t, c], 0.0, ["no measurement follows a command: whether the clocks agree is not known"]
     # Far away a likeness may be chance: it must be close, and much closer than what is near.
     found = far if apart or (farthest > _CLOSE and best < _CLOSE * farthest) else near
-    lag_s = float(np.median(found.lag_s[np.abs(found.r) >= 0.98 * np.abs(found.r).max()]))
-    if not apart and found is near and lag_s > -0.5 * period_s:
-        return [t, c], 0.0, [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"]
+    sure = np.abs(found.r) >= 0.98 * np.abs(found.r).max()
+    lag_s = float(np.median(found.lag_s[sure]))
+    # One recorder's clock is one clock: what moves first on it is said where signs and lags are.
+    one = all((s.source or "").endswith(".log_time") for s in stamps)
+    if not apart and (one or (found is near and lag_s > -0.5 * period_s)):
+        return (
+            [t, c],
+            0.0,
+            [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"] * (not one),
+        )
+    if not apart and _leads_on_recorder(signals, (measured, command), rows):
+        return [t, c], 0.0, []  # no clock explains it
+    if (np.isfinite(found.against_s) | np.isfinite(found.repeats_s) | found.either)[sure].all():
+        raise UsageError(
+            f"the clocks of {measured.name!r} and {command.name!r} in {path} do not agree, and commands that repeat "
+            "leave open by how much",
+            hint="say it in a mapping: stamp_offset, or record a motion that does not repeat",
+        )
     # Nothing moves before it is told to: one period is left as the least delay that a computer can have.
     offset = coarse + lag_s - period_s
     said = (
-        f"the commands' clock is {-offset:.4f} s ahead of the measurements' (r {np.abs(found.r).max():.2f}): "
-        "stamp_offset aligns them; what is left of the true delay cannot be told from the clocks"
+        f"the commands' clock is {-offset:.4f} s ahead of the measurements' (r {np.abs(found.r).max():.2f}), unless "
+        "their names are exchanged: stamp_offset aligns them; what is left of the true delay cannot be told by clocks"
     )
     return [t, c + offset], offset, [said]
 
 
-def _goal(
-    measured: Signal, command: Signal, found: Following, to_rad: float, path: str
-) -> tuple[Signal, list[float], list[str]]:
-    """Return goals in the order of the joints, their scales, and what to say of them."""
-    ratio = evidence.unit_ratio(_at_best(found)[np.abs(found.r).max(axis=1) > SURE])
-    told = {"rad": 1.0, "deg": DEGREES}.get(command.meaning.unit)
-    if ratio is None and told is None:
-        raise UsageError(
-            f"{measured.name!r} follows {command.name!r} in {path}, but neither in radians nor in degrees: "
-            f"slopes {', '.join(f'{s:.3g}' for s in _at_best(found)[:6])}",
-            hint="write a mapping with the scale that its maker gives",
-        )
-    unit = to_rad / (ratio or to_rad / (told or 1.0))
-    if told is not None and ratio is not None and not np.isclose(told, unit):
-        raise UsageError(
-            f"{command.name!r} in {path} is in {command.meaning.unit} by its name, but {measured.name!r}, in "
-            f"{'degrees' if to_rad != 1 else 'radians'}, follows it with slopes of {_at_best(found)[:3].round(3)}",
-            hint="write a mapping with the scales that hold",
-        )
-    places, said = _command_order(measured, command, found, to_rad / unit, path)
-    at = np.arange(len(places)), places
-    r, slope, lag = found.r[at], found.slope[at], found.lag_s[at]
-    flipped = (r < -SURE) & (np.abs(slope) * unit / to_rad > 0.15)
-    scales = [float(-1 / unit if f else 1 / unit) for f in flipped]
-    sure = np.abs(r) > SURE
-    if sure.any():
-        said.append(
-            f"{measured.name!r} follows {command.name!r}: r {np.abs(r[sure]).min():.2f} to {np.abs(r[sure]).max():.2f},"
-            f" {1e3 * abs(np.median(lag[sure])):.0f} ms later, slope {np.median(np.abs(slope[sure])):.3g}"
-            + (": one is in degrees" if ratio not in (1.0, None) else "")
-        )
-    names = [label or str(i) for i, label in enumerate(measured.labels)]
-    if flipped.any():
-        said.append(
-            f"opposite signs, commands are turned: {', '.join(n for n, f in zip(names, flipped, strict=True) if f)}"
-        )
-    if (~sure).any():
-        weak = ", ".join(f"{n} ({x:.2f})" for n, x, s in zip(names, r, sure, strict=True) if not s)
-        said.append(f"no evidence of order and sign for {weak}: they hardly moved, or did not follow")
-    return taken(command, places), scales, said
-
-
-def _command_order(
-    measured: Signal, command: Signal, found: Following, scale: float, path: str
-) -> tuple[np.ndarray, list[str]]:
-    """Return the command of each joint."""
-    if command.width < measured.width:
-        raise UsageError(
-            f"{command.name!r} in {path} has {command.width} columns for {measured.width} joints",
-            hint="name the joints that were commanded with --joints, or write a mapping",
-        )
-    own, labelled = np.arange(measured.width), [label for label in measured.labels if label]
-    byname = [command.labels.index(label) if label in command.labels else None for label in labelled]
-    named = len(labelled) == measured.width and all(p is not None for p in byname)
-    if command.width != measured.width and not named:
-        raise UsageError(
-            f"{command.name!r} in {path} has {command.width} columns for {measured.width} joints, and no names to "
-            "choose by",
-            hint="choose them in a mapping: goal = { source = [...] }",
-        )
-    first = np.array(byname) if named else own
-    best = first[evidence.order(_columns(found, first), scale)]
-    if (best == first).all():
-        return first, []
-    wrong = np.flatnonzero(best != first)
-    pairs = ", ".join(f"{measured.sources[i]} follows {command.sources[best[i]]}" for i in wrong)
-    if named:
-        raise UsageError(
-            f"names and data of {path} contradict each other: by the data, {pairs}",
-            hint="correct the names, or say in a mapping which columns belong together",
-        )
-    still = [i for i in wrong if not found.moved[i].any()]
-    if still:
-        raise UsageError(
-            f"the order of {command.name!r} in {path} is not that of {measured.name!r}, and for joints that did not "
-            f"move it cannot be told: {', '.join(measured.sources[i] for i in still)}",
-            hint=f"say it in a mapping; candidates: {', '.join(command.sources[best[i]] for i in still)}",
-        )
-    return best, [f"commands are in another order: {pairs}"]
-
-
-def _columns(found: Following, places: np.ndarray) -> Following:
-    spread, mean = ((pair[0], pair[1][places]) for pair in (found.spread, found.mean))
-    return Following(found.r[:, places], found.lag_s[:, places], found.slope[:, places], spread, mean)
+def _leads_on_recorder(
+    signals: Sequence[Signal], pair: tuple[Signal, Signal], rows: tuple[np.ndarray, np.ndarray]
+) -> bool:
+    """Return whether positions move before their commands by the recorder's clock, too, which is one for both."""
+    names = [s.sources[0].partition(".")[0] + ".log_time" for s in pair]
+    found = [s.values[:, 0] * 1e-9 for name in names for s in signals if s.name == name]
+    if [len(x) for x in found] != [len(r) for r in rows]:
+        return False
+    q, c = (s.values[r] for s, r in zip(pair, rows, strict=True))
+    held, joined, period_s = on_grid(found[1][rows[1]], c, found[0][rows[0]], q)
+    own = following(held, joined, period_s)
+    sure = np.abs(own.r) > SURE
+    return bool(sure.any() and np.median(own.lag_s[sure]) < -1.5 * period_s)
 
 
 def _node(
-    name: str, fields: dict[str, FieldMapping], stamps: Stamps, signal: Signal, offset_s: float
+    name: str, fields: dict[str, FieldMapping], stamps: Stamps, lacks: np.ndarray, offset_s: float, leapt: np.ndarray
 ) -> tuple[NodeMapping, list[str]]:
     """Return a node's mapping, with policies only where the data needs them, and what to say of those."""
     said = []
     missing, repeated = "refuse", "refuse"
-    good = signal.finite & np.isfinite(stamps.t_s)
+    good = ~lacks & np.isfinite(stamps.t_s)
     if not good.all():
         missing = "drop"
         said.append(
@@ -321,6 +335,7 @@ def _node(
     node = NodeMapping(
         fields, stamps.rate_hz, stamps.source, stamps.unit, order,
         missing=missing, repeated=repeated, stamp_offset=offset_s,
+        implausible="drop" if leapt.any() else "refuse",
     )  # fmt: skip
     return node, said
 

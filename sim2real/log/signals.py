@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.log.cells import NoNumbers
 from sim2real.log.foreign import ForeignFile
 from sim2real.log.mapping import STAMP_UNITS
 from sim2real.log.names import Meaning, meaning
@@ -75,23 +76,42 @@ class Stamps:
     repeated: int = 0
 
 
-def collect(file: ForeignFile) -> list[Signal]:
-    """Return all signals of numbers, of at most two dimensions; columns that differ by the joint alone are one."""
+def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
+    """Return all signals of numbers, of at most two dimensions, and sentences on those that were left out.
+
+    Columns that differ by the joint alone are one signal.
+
+    Raises:
+        UsageError: When a signal that is named like a position or a command has numbers, but cannot be read.
+    """
     single: dict[tuple[Meaning, int], list[Signal]] = {}
     found: list[Signal] = []
+    said: list[str] = []
+    text: list[str] = []
     for key in file.keys:
+        about = meaning(key)
         try:
             values = file.signal(key).astype(np.float64)
-        except UsageError:
-            continue  # text, images: nothing to identify from
-        about = meaning(key)
-        if values.ndim <= 1:
+        except NoNumbers:
+            text.append(key)
+            continue
+        except UsageError as error:
+            # Without such a column another one might be taken for the positions, or a joint be missing.
+            if about.quantity == "position" or (about.side and not about.quantity):
+                raise
+            said.append(f"left out: {error.args[0]}")
+            continue
+        if values.size and values.ndim <= 2 and not np.isfinite(values).any():
+            said.append(f"left out: {key!r} has no number in any sample")
+        elif values.ndim <= 1:
             row = Signal((key,), (about.label,), about, values[..., None])
             single.setdefault((replace(about, label=""), values.size if values.ndim else 0), []).append(row)
         elif values.ndim == 2:
             n = values.shape[1]
             names = [meaning(name).label for name in file.columns.get(key, ("",) * n)]
             found.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), tuple(names), about, values, key))
+        else:
+            said.append(f"left out: {key!r} has samples of shape {values.shape[1:]}, as images have")
     for (about, _), rows in single.items():
         labels = [row.labels[0] for row in rows]
         together = len(rows) > 1 and len(set(labels)) == len(labels) and about.quantity != "stamp"
@@ -101,7 +121,7 @@ def collect(file: ForeignFile) -> list[Signal]:
             found.append(Signal(tuple(row.sources[0] for row in rows), tuple(labels), about, values))
         else:
             found += rows
-    return found
+    return found, [*said, *([f"left out, as they hold no numbers: {', '.join(text)}"] if text else [])]
 
 
 def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rate_hz: float | None) -> Stamps:
@@ -123,7 +143,7 @@ def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rat
         named = [s for s in fitting if s.meaning.quantity == "stamp"]
         chosen = [s for s in named if s.meaning.side == side] or [s for s in named if not s.meaning.side] or named
         # Of a bag, or of several files: stamps of the same topic, and the sender's rather than the recorder's.
-        chosen = [s for s in named if _group(s) == _group(of)] or chosen
+        chosen = [s for s in named if _group(of) and _group(s) == _group(of)] or chosen
         chosen = [s for s in chosen if s.name.endswith("stamp")] or chosen
         chosen = chosen or [s for s in fitting if s.meaning.quantity in ("", "stamp") and not _counts(s)]
         if len(chosen) > 1:

@@ -16,6 +16,7 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.log import dates
 from sim2real.log.budget import MOST_BYTES, MOST_COLUMNS, WHOLE, require_signals, require_size
+from sim2real.log.cells import MISSING, OTHER, NoNumbers, is_number, number_in
 from sim2real.log.names import meaning
 from sim2real.log.raw import RawSignals
 
@@ -74,14 +75,14 @@ def read_csv(path: Path) -> RawSignals:
     except (UnicodeError, csv.Error) as error:
         raise UsageError(f"{path} is no CSV: {error}", hint=WHOLE) from None
     notes = (f"{path.name} is no UTF-8: it is read as latin-1",) if encoding == "latin-1" else ()
-    return RawSignals(table.header, table.load, notes=notes)
+    return RawSignals([name for name in table.header if name], table.load, notes=(*notes, *table.left_out()))
 
 
 class _Table:
     """The columns of a table, read in blocks of lines: numbers take 8 bytes each, other cells stay texts.
 
     Attributes:
-        header: Names of the columns.
+        header: Names of the columns; empty for those without one.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,18 +108,16 @@ class _Table:
             raise UsageError(f"{self._path} is empty", hint=WHOLE)
         first = self._cells(head[0][1])
         named = [c for c in map(self._cells, comments[::-1]) if len(c) == len(first)]
-        if all(_is_number(name) for name in first):
-            if not named or all(_is_number(name) for name in named[0]):
+        if all(is_number(name) for name in first):
+            if not named or all(is_number(name) for name in named[0]):
                 raise UsageError(
                     f"the first line of {self._path} holds numbers, not names", hint="put the columns' names there"
                 )
             self.header, rest = named[0], head
         else:
             self.header, rest = first, head[1:]
-        while self.header and not self.header[-1]:
-            self.header.pop()
         require_signals(len(self.header), self._path)
-        twice = [name for name, count in Counter(self.header).items() if count > 1]
+        twice = [name for name, count in Counter(self.header).items() if name and count > 1]
         if twice:
             raise UsageError(f"{self._path} has more than one column {min(twice)!r}", hint="rename one of them")
         self._blocks = [[] for _ in self.header]
@@ -153,14 +152,17 @@ class _Table:
         return [name.strip() for name in rows[0]] if rows else []
 
     def _row(self, row: list[str]) -> list[str]:
-        """Return a line's cells without empty ones after the last column."""
+        """Return a line's cells; empty ones at its end belong to no column, or to one without a name."""
         width = len(self.header)
-        while len(row) > width and not row[-1].strip():
+        named = max((i + 1 for i, name in enumerate(self.header) if name), default=0)
+        while len(row) > named and not row[-1].strip():
             row.pop()
-        if len(row) != width:
-            comma = self._delimiter == "," and len(row) > width
+        if named <= len(row) <= width:
+            row += [""] * (width - len(row))
+        else:
+            comma = self._delimiter == "," and len(row) > named
             raise UsageError(
-                f"line {self._line} of {self._path} has {len(row)} cells, the first has {width}",
+                f"line {self._line} of {self._path} has {len(row)} cells, the first has {named}",
                 hint="decimal commas need semicolons or tabs between the cells" if comma else WHOLE,
             )
         return row
@@ -180,10 +182,18 @@ class _Table:
                 column.append(list(zip(numbers, cells, strict=True)))
             if self._delimiter != ",":
                 for n, cell in zip(numbers, cells, strict=True):
-                    if "," in cell and _is_number(cell.replace(",", ".")):
+                    if "," in cell and is_number(cell.replace(",", ".")):
                         self._comma = self._comma or (n, cell)
-                    elif "." in cell and _is_number(cell):
+                    elif "." in cell and is_number(cell):
                         self._point = self._point or (n, cell)
+
+    def left_out(self) -> list[str]:
+        """Return what to say of columns without a name."""
+        unnamed = [blocks for name, blocks in zip(self.header, self._blocks, strict=True) if not name]
+        filled = [
+            blocks for blocks in unnamed if any(isinstance(b, list) or np.isfinite(b).any() for b in blocks)
+        ]  # fmt: skip
+        return [f"left out: columns without a name: {len(filled)}"] * bool(filled)
 
     def load(self, name: str) -> Any:
         """Return a column.
@@ -192,7 +202,7 @@ class _Table:
             KeyError: When there is none of this name.
             UsageError: When a cell holds no number.
         """
-        if name not in self.header:
+        if not name or name not in self.header:
             raise KeyError(name)
         blocks = self._blocks[self.header.index(name)]
         if not blocks:
@@ -202,6 +212,8 @@ class _Table:
             return self._lists(texts, name)
         if len(texts) and dates.are_dates([texts[0][1]]):
             return self._dates(blocks, texts, name)
+        if len(texts) == sum(map(len, blocks)) and not any(self._may_be_number(cell) for _, cell in texts):
+            raise NoNumbers(f"column {name!r} of {self._path} holds no numbers: {texts[0][1][:60]!r}", hint=OTHER)
         parts = [
             block if isinstance(block, np.ndarray) else np.array([self._number(n, cell, name) for n, cell in block])
             for block in blocks
@@ -235,21 +247,21 @@ class _Table:
         return found
 
     def _number(self, line: int, text: str, name: str) -> float:
-        """Return the number in a cell, whose decimals may stand behind a comma; NaN if it is empty."""
-        own = text.strip()
-        if not own or _is_number(own):
-            return float(own) if own else float("nan")
-        comma = _is_number(own.replace(",", ".")) and own.count(",") == 1
+        """Return the number in a cell, whose decimals may stand behind a comma; NaN for one that is missing."""
+        own, where = text.strip(), f"line {line} of {self._path}, column {name!r}"
+        comma = is_number(own.replace(",", ".")) and own.count(",") == 1
         if comma and self._delimiter != ",":
             return float(own.replace(",", "."))
-        raise UsageError(
-            f"line {line} of {self._path}, column {name!r} holds {text[:60]!r}, no number",
-            hint="decimal commas need semicolons or tabs between the cells"
-            if comma
-            else "write dates as 2024-05-01T12:00:00.25"
-            if dates.is_other(own)
-            else "name another source in the mapping",
-        )
+        hint = "write dates as 2024-05-01T12:00:00.25" if dates.is_other(own) else ""
+        hint = "decimal commas need semicolons or tabs between the cells" if comma else hint
+        if hint:
+            raise UsageError(f"{where} holds {text[:60]!r}, no number", hint=hint)
+        return number_in(own, where)
+
+    def _may_be_number(self, text: str) -> bool:
+        """Return whether a cell holds a number or stands for one, or is meant as one that cannot be read."""
+        own = text.strip()
+        return is_number(own.replace(",", ".")) or own.lower() in MISSING or dates.is_other(own)
 
 
 def _delimiter(first: str, second: str) -> str:
@@ -258,11 +270,3 @@ def _delimiter(first: str, second: str) -> str:
     if best in first:
         return best
     return " " if len(first.split()) == len(second.split()) > 1 else ","
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

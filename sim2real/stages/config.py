@@ -211,7 +211,7 @@ class ImportConfig:
     together: bool = False
     """All files are of one recording: a log of all of them instead of one for each."""
     as_told: bool = False
-    """Import as the mapping says even where the data contradicts it."""
+    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
     pipeline: str | None = None
     """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
     format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None
@@ -276,7 +276,7 @@ class RobotFlags:
     contacts: bool = False
     """Simulate contacts."""
     as_told: bool = False
-    """Take the mapping as it is, even where the data contradicts it."""
+    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
 
 
 MODEL_IDENTIFY = IdentifyConfig(

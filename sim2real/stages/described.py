@@ -22,12 +22,15 @@ from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
 from sim2real.stages import importing
 from sim2real.stages.config import MODEL_IDENTIFY, RobotFlags
+from sim2real.stages.console import note
 from sim2real.stages.pipeline import Pipeline, load_pipeline
 
 _STEPS_S = (0.0005, 0.005)
 """Between these, the model's own time step is taken."""
 _FASTEST = 0.02
 """Of the periods between samples, this share is shorter than that of the rate which nodes get."""
+_FACTORS = ("kp", "kd", "goal_velocity", "torque", "duty")
+"""Commands that a parameter is multiplied with."""
 MODEL_FILE = "robot.xml"
 
 
@@ -102,7 +105,7 @@ def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
         mapping = load_mapping(told.mapping, name) if told.mapping else None
         if mapping is None:
             asked = importing.asked_of_model(told.mjcf, name, told.joints, told.rate_hz)
-            mapping, _ = importing.proposed(open_foreign(first), asked)
+            mapping, _ = importing.proposed(open_foreign(first), replace(asked, as_told=told.as_told))
         episode = importer.import_file(first, mapping)
         importing.refuse_contradictions(first, episode, told.as_told)
     description = _description(told, model, episode)
@@ -158,6 +161,11 @@ def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
     joints = told.joints or joints_of(model)
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
     driving = tuple(n for n in COMMANDS if n in commands)
+    # A factor of 0 leaves its parameter open: a recorder that does not know a gain writes 0.
+    if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
+        note(f"{', '.join(idle)} is 0 in all of the log: left out")
+        driving = tuple(n for n in driving if n not in idle)
+        commands = {n: values for n, values in commands.items() if n not in idle}
     if "position" not in sensed or not driving:
         raise UsageError(
             "the log has no sensor.position, or no command that drives a joint: "

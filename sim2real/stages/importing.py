@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,12 +84,13 @@ def described(home: pipeline.Pipeline) -> bool:
 def asked(config: ImportConfig) -> Asked:
     """Return what the user says of files without a mapping."""
     if config.mjcf is not None:
-        return asked_of_model(config.mjcf, config.pipeline or pipeline_name(config.mjcf), config.joints, config.rate_hz)
+        name = config.pipeline or pipeline_name(config.mjcf)
+        return replace(asked_of_model(config.mjcf, name, config.joints, config.rate_hz), as_told=config.as_told)
     home = pipeline.load_pipeline(config.pipeline) if config.pipeline else None
     if home is not None:
         own: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - `described` said so
-        return asked_of_model(own.model, home.name, own.joints, config.rate_hz)
-    return Asked("robot", config.rate_hz, config.joints)
+        return replace(asked_of_model(own.model, home.name, own.joints, config.rate_hz), as_told=config.as_told)
+    return Asked("robot", config.rate_hz, config.joints, as_told=config.as_told)
 
 
 def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> Asked:

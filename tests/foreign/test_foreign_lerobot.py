@@ -23,13 +23,16 @@ ENDS = np.array([(746, 3477), (822, 3190), (930, 3190), (850, 3200), (0, 4095), 
 
 
 def degrees(seed=0, size=25.0):
-    """Return goals, and positions 100 ms later [deg], ``(COUNT, 6)``, of encoders of 4096 counts a turn."""
+    """Return goals, and positions 100 ms later [deg], ``(COUNT, 6)``, of encoders of 4096 counts a turn.
+
+    Positions stay 3 % behind their goals: those that equal them would be copies.
+    """
     t = np.arange(COUNT + 3) / FPS
     phase = np.arange(6) + seed
     tones = [np.sin(2 * np.pi * np.outer(t, a + b * np.arange(6)) + phase) for a, b in ((0.21, 0.07), (0.47, 0.05))]
     goal = size * (0.7 * tones[0] + 0.3 * tones[1])
-    goal = np.round(goal * 4096 / 360) * 360 / 4096
-    return goal[3:], goal[:-3]
+    goal, q = (np.round(values * 4096 / 360) * 360 / 4096 for values in (goal, 0.97 * goal))
+    return goal[3:], q[:-3]
 
 
 def hundredths(values):

@@ -66,7 +66,7 @@ def test_forms_of_one_table(tmp_path, text):
         ('t,q\n0,"0,5"\n', r"line 2 .*'q' holds '0,5', no number.*decimal commas need semicolons"),
         ("t;q\n0,5;1.5\n", r"two ways: line 2 '0,5' with a comma, line 2 '1.5' with a point"),
         ("t;q\n0,5;1\n1.000,5;2\n", r"line 3 .*'1.000,5', no number"),
-        ("# note\nt,q\n0,1\n# note\n1,null\n", r"line 5 .*column 'q' holds 'null', no number"),
+        ("# note\nt,q\n0,1\n# note\n1,off\n", r"line 5 .*column 'q' holds 'off', no number"),
         ("t,q\n0,1\n1\n", r"line 3 .* 1 cells, the first has 2"),
         ("0,1\n1,2\n", "holds numbers, not names"),
         ("# a,b,c\n0,1\n1,2\n", "holds numbers, not names"),

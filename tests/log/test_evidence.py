@@ -4,7 +4,7 @@ import followers
 import numpy as np
 import pytest
 
-from sim2real.log import evidence
+from sim2real.log import evidence, following
 
 
 @pytest.fixture(scope="module")
@@ -13,8 +13,8 @@ def recorded():
 
 
 def found(t, goal, q):
-    held, joined, period_s = evidence.on_grid(t, goal, t, q)
-    return evidence.following(held, joined, period_s)
+    held, joined, period_s = following.on_grid(t, goal, t, q)
+    return following.following(held, joined, period_s)
 
 
 def test_lag_slope_and_correlation_are_those_of_the_recording(recorded):
@@ -58,8 +58,8 @@ def test_torque_that_is_off_says_nothing(recorded):
     t, goal, q = recorded
     acting = t < 6.0
     fallen = np.where(acting[:, None], q, -1.5)
-    held, joined, period_s = evidence.on_grid(t, goal, t, fallen, acting)
-    assert np.diag(evidence.following(held, joined, period_s).r).min() > 0.97
+    held, joined, period_s = following.on_grid(t, goal, t, fallen, acting)
+    assert np.diag(following.following(held, joined, period_s).r).min() > 0.97
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,187 @@
+"""Measured positions: their unit, turns that are to be counted, and readings that no joint can have had."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.log import evidence, plausible
+from sim2real.log.evidence import DEGREES
+from sim2real.log.foreign import ForeignFile
+from sim2real.log.lerobot import are_degrees
+from sim2real.log.quantities import Asked, clean
+from sim2real.log.signals import Signal
+
+_FAST_RAD_S, _SMALL_RAD = 30.0, 2.0
+"""What moves faster, as radians, and farther is asked about: it may be in degrees."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Positions that can be believed.
+
+    Attributes:
+        signal: With turns counted, and NaN in readings that leap.
+        to_rad: How many units a radian is.
+        turn: A turn in the signal's unit, where turns are counted; else 0.
+        leapt: Shape ``(N,)``: whether a reading of the sample leaps away and back.
+        said: What was found: sentences.
+    """
+
+    signal: Signal
+    to_rad: float
+    turn: float
+    leapt: np.ndarray
+    said: list[str]
+
+
+def checked_positions(file: ForeignFile, measured: Signal, t_s: np.ndarray, asked: Asked) -> Checked:
+    """Return measured positions with their turns counted and without leaps.
+
+    Args:
+        file: The file.
+        measured: Positions, in the order of the joints.
+        t_s: Shape ``(N,)``: their stamps [s].
+        asked: What the user knows.
+
+    Raises:
+        UsageError: When the unit is not clear, or positions change by more than a joint can move.
+    """
+    path = str(file.path)
+    rows = np.flatnonzero(clean(t_s, measured))
+    q, t = measured.values[rows], t_s[rows]
+    if len(rows) < 3:
+        raise UsageError(
+            f"{path} has {len(rows)} samples with a number in every column of {measured.name!r}",
+            hint="leave out the joint that lacks them: --joints names those that count",
+        )
+    named = {"rad": 1.0, "deg": DEGREES}.get(measured.meaning.unit)
+    jumping = [u for u in (1.0, DEGREES) if named in (None, u) and plausible.turns(q, plausible.TURN_RAD * u).any()]
+    guess = named or next(iter(jumping), 1.0 if np.quantile(np.abs(q), 0.99) <= 2.2 * np.pi else DEGREES)
+    leaps = plausible.glitches(t, plausible.counted(q, plausible.TURN_RAD * guess), guess)
+    kept = ~leaps.any(axis=1)
+    if are_degrees(file.facts, _names_of(file, measured), q[kept], path):
+        to_rad, why = DEGREES, "its steps are those of encoders of 4096 a turn"
+    else:
+        to_rad, why = radian(measured, q[kept], t[kept], asked, path, jumping)
+    turn = plausible.TURN_RAD * to_rad
+    over, values = plausible.turns(q, turn), plausible.counted(measured.values, turn)
+    angle = values[rows]
+    _refuse_turns(measured, over, angle / to_rad, asked, path)
+    if to_rad != guess:
+        kept = ~(leaps := plausible.glitches(t, angle, to_rad)).any(axis=1)
+    if (jump := plausible.leap(t[kept], angle[kept], to_rad)) is not None:
+        at = rows[kept][jump[0]]
+        raise UsageError(
+            f"{measured.sources[jump[1]]!r} in {path} changes by {jump[2]:.4g} rad before sample {at}, at "
+            f"{t_s[at]:.6g} s, as no joint can: its zero has changed, samples are missing, or it is no angle",
+            hint="cut the file there with --samples A:B, or leave this joint out",
+        )
+    said = [f"{measured.name!r} is in {'degrees' if to_rad != 1 else 'radians'}: {why}"]
+    if over.any():
+        who = ", ".join(np.array(measured.sources)[over])
+        said.append(f"{who} jumps by a turn ({turn:.4g}) at its end: turns are counted")
+    leapt = np.zeros(len(t_s), bool)
+    leapt[rows[~kept]] = True
+    if leapt.any():
+        k, i = rows[~kept][0], int(leaps[~kept][0].argmax())
+        said.append(
+            f"{int(leapt.sum())} samples hold readings that leap away and back, as {measured.sources[i]!r} does to "
+            f'{measured.values[k, i]:.4g} in sample {k}: no joint can. implausible = "drop" leaves them out'
+        )
+        values[leapt] = np.nan
+    return Checked(replace(measured, values=values), to_rad, turn * bool(over.any()), leapt, said)
+
+
+def turned_commands(command: Signal, checked: Checked) -> tuple[Signal, float]:
+    """Return commands with their turns counted, where they are angles on a circle, and a turn in their unit; else 0."""
+    known = {"rad": 1.0, "deg": DEGREES}.get(command.meaning.unit)
+    reach = (
+        np.nanmax(np.ptp(checked.signal.values[~np.isnan(checked.signal.values).any(axis=1)], axis=0)) / checked.to_rad
+    )
+    for unit in (1.0, DEGREES) if known is None else (known,):
+        turn = plausible.TURN_RAD * unit
+        # A joint within a turn may well be sent from one end to the other: then it goes all the way.
+        if plausible.turns(command.values, turn).any() and (checked.turn or reach > 1.1 * plausible.TURN_RAD):
+            return replace(command, values=plausible.counted(command.values, turn)), turn
+    return command, 0.0
+
+
+def radian(
+    measured: Signal, q: np.ndarray, t_s: np.ndarray, asked: Asked, path: str, jumping: list[float]
+) -> tuple[float, str]:
+    """Return how many units a radian is, and how that is known.
+
+    Args:
+        measured: Positions.
+        q: Shape ``(N, joints)``: those rows of them that have numbers.
+        t_s: Shape ``(N,)``: their stamps [s].
+        asked: What the user knows.
+        path: The file, for errors.
+        jumping: Units in a radian by whose turn the positions jump.
+
+    Raises:
+        UsageError: When it is not clear.
+    """
+    if measured.meaning.unit in ("rad", "deg"):
+        return (1.0 if measured.meaning.unit == "rad" else DEGREES), "by its name"
+    if len(jumping) == 1:
+        return jumping[0], f"it jumps by a turn of {2 * np.pi * jumping[0]:.4g}"
+    encoders = [e for column in q.T if (e := evidence.turn(column))]
+    kinds = {unit for unit, _ in encoders}
+    if len(kinds) == 1:
+        return (1.0 if kinds == {"rad"} else DEGREES), f"its steps are those of an encoder of {encoders[0][1]} a turn"
+    if asked.ranges is not None and len(asked.ranges) == q.shape[1]:
+        low, high = asked.ranges.T
+        known = high > low
+        room = 0.1 * (high - low)
+        inside = {u: ((q / u > low - room) & (q / u < high + room))[:, known] for u in (1.0, DEGREES)}
+        share = {u: float(rows.mean()) if known.any() else 1.0 for u, rows in inside.items()}
+        if share[1.0] < 0.9 < share[DEGREES]:
+            return DEGREES, f"as radians {1 - share[1.0]:.0%} of it would lie outside of the joints' ranges"
+        if share[DEGREES] < 0.9 < share[1.0]:
+            return 1.0, f"as degrees {1 - share[DEGREES]:.0%} of it would lie outside of the joints' ranges"
+    most = float(np.abs(q).max())
+    speed = float(np.quantile(np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None], 0.99))
+    if most <= 2.2 * np.pi and (speed <= _FAST_RAD_S or most <= _SMALL_RAD):
+        return 1.0, f"it stays within {most:.3g}"
+    if 30.0 < most <= 400.0 and speed > 2.0 * _FAST_RAD_S:
+        return DEGREES, f"as radians it would move at {speed:.3g} rad/s"
+    # A joint that turns on and on reaches as much in radians.
+    onward = np.abs(q[-1] - q[0]).max() > 0.7 * np.ptp(q, axis=0).max()
+    if 30.0 < most <= 400.0 and np.abs(np.median(q, axis=0)).max() <= 200.0 and not onward:
+        return DEGREES, f"it reaches {most:.3g}, more than a turn in radians"
+    raise UsageError(
+        f"is {measured.name!r} in {path} in radians or degrees? It reaches {most:.4g}, at up to {speed:.3g} a second. "
+        "Candidates: rad, deg",
+        hint="end its name with the unit, as in q_rad, or write a mapping with a scale",
+    )
+
+
+def _names_of(file: ForeignFile, signal: Signal) -> list[str]:
+    """Return the names of a signal's columns as the file has them."""
+    own = file.columns.get(signal.sources[0].partition("[")[0], ())
+    places = [s.rpartition("[:,")[2].rstrip("]") for s in signal.sources]
+    return [
+        own[int(p)] if p.isdigit() and int(p) < len(own) else s for p, s in zip(places, signal.sources, strict=True)
+    ]
+
+
+def _refuse_turns(measured: Signal, over: np.ndarray, angle_rad: np.ndarray, asked: Asked, path: str) -> None:
+    """Refuse jumps by a turn of a joint that cannot turn.
+
+    Raises:
+        UsageError: When a model's joint has a range, which it would leave.
+    """
+    if asked.ranges is None or len(asked.ranges) != len(over):
+        return
+    for i in np.flatnonzero(over):
+        low, high = asked.ranges[i]
+        if low < high and np.ptp(angle_rad[:, i]) > 1.1 * (high - low):
+            raise UsageError(
+                f"{measured.sources[i]!r} in {path} jumps by a turn, but the range of its joint is {low:.3g} to "
+                f"{high:.3g} rad",
+                hint="is it this joint's column? --joints names joints in the order of the columns",
+            )
