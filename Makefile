@@ -4,6 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.ready-docs
+WARP_READY := .venv/.ready-warp
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
 .PHONY: demo test test-all bench docs format
@@ -17,8 +18,8 @@ test: $(READY)
 	$(BIN)/ruff format --check
 	@nice $(BIN)/pyright & types=$$!; $(BIN)/python -m pytest --numprocesses 3; tests=$$?; wait $$types && exit $$tests
 
-# The tests and repetitions that `test` leaves out: together, both run everything once.
-test-all: $(READY)
+# The tests and repetitions that `test` leaves out: together, both run everything once. Warp's among them, on the CPU.
+test-all: $(WARP_READY)
 	$(BIN)/python -m pytest --full --numprocesses 3
 
 bench: $(READY)
@@ -34,14 +35,22 @@ format: $(READY)
 
 # uv and pip stay in .venv beside what uv.lock lists: hence --inexact.
 # Where packages come from a mirror that only pip is configured for, pip installs the same versions by their hashes.
-$(READY): pyproject.toml uv.lock | $(BIN)/uv
-	@echo "setting up .venv from uv.lock" >&2
-	@$(SYNC) --all-extras --no-extra warp || { \
+define INSTALL
+	@$(SYNC) --all-extras $(1) || { \
 	  echo "uv cannot reach the package index: installing the locked versions with pip" >&2; \
-	  $(BIN)/uv export --frozen --offline --quiet --all-extras --no-extra warp --no-dev --no-emit-project -o .venv/requirements.txt && \
+	  $(BIN)/uv export --frozen --offline --quiet --all-extras $(1) --no-dev --no-emit-project -o .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps -r .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps --editable .; }
 	@touch $@
+endef
+
+# Warp's wheel has 149 MB, and is needed by the tests of `test-all` only.
+$(READY): pyproject.toml uv.lock | $(BIN)/uv
+	@echo "setting up .venv from uv.lock" >&2
+	$(call INSTALL,--no-extra warp)
+
+$(WARP_READY): $(READY)
+	$(call INSTALL)
 
 $(DOCS_READY): $(READY)
 	@$(SYNC) --all-extras --no-extra warp --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser

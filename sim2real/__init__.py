@@ -38,17 +38,25 @@ if TYPE_CHECKING:
     from sim2real.graph import Timeline as Timeline
     from sim2real.graph import TrainableDist as TrainableDist
     from sim2real.graph.episode import MemoryRecorder as MemoryRecorder
+    from sim2real.graph.rebuilding import rebuild as rebuild
     from sim2real.graph.schedule import draw as draw
     from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
     from sim2real.runtime.clock import Clock as Clock
     from sim2real.runtime.compiled import CompiledGraph as CompiledGraph
+    from sim2real.stages.check import check as check
     from sim2real.stages.deploy import deploy as deploy
+    from sim2real.stages.exporting import export as export
+    from sim2real.stages.functions import report as report
+    from sim2real.stages.functions import run as run
     from sim2real.stages.identify import identify as identify
     from sim2real.stages.pipeline import Pipeline as Pipeline
     from sim2real.stages.pipeline import load_pipeline as load_pipeline
     from sim2real.stages.record import record as record
     from sim2real.stages.train import train as train
+    from sim2real.stages.validate import validate as validate
     from sim2real.train.networks import Policy as Policy
+    from sim2real.view.graphs import plot_graph as plot_graph
+    from sim2real.view.graphs import plot_timeline as plot_timeline
 
     __version__: str
 
@@ -85,12 +93,20 @@ __all__ = [
     "Timing",
     "TrainableDist",
     "UsageError",
+    "check",
     "deploy",
     "draw",
+    "export",
     "identify",
     "load_pipeline",
+    "plot_graph",
+    "plot_timeline",
+    "rebuild",
     "record",
+    "report",
+    "run",
     "train",
+    "validate",
 ]
 
 _HOMES = {
@@ -119,35 +135,53 @@ _HOMES = {
         "TrainableDist",
     ),
     "sim2real.graph.episode": ("MemoryRecorder",),
+    "sim2real.graph.rebuilding": ("rebuild",),
     "sim2real.graph.schedule": ("draw",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
     "sim2real.runtime.compiled": ("CompiledGraph",),
+    "sim2real.stages.check": ("check",),
     "sim2real.stages.deploy": ("deploy",),
+    "sim2real.stages.exporting": ("export",),
+    "sim2real.stages.functions": ("report", "run"),
+    "sim2real.stages.identify": ("identify",),
     "sim2real.stages.pipeline": ("Pipeline", "load_pipeline"),
     "sim2real.stages.record": ("record",),
+    "sim2real.stages.train": ("train",),
+    "sim2real.stages.validate": ("validate",),
     "sim2real.train.networks": ("Policy",),
+    "sim2real.view.graphs": ("plot_graph", "plot_timeline"),
 }
 _ROOMS = ("identify", "train")
-"""Rooms that are called like the stage that does their work: ``sim2real.identify(...)`` runs it, see ``room``."""
+"""Rooms that are called like the function that does their work, which is what this package has under the name."""
 _MODULES = ("interop",)
 """Modules whose functions people call as ``sim2real.interop.vector_env(...)``, without importing them."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
+class _Package(ModuleType):
+    """This package: importing anything from a room would set the room as the attribute of its name."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _ROOMS and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
 class _Room(ModuleType):
-    """A room of the package that, called, runs the stage of its name.
+    """A room whose modules are also attributes of the function of its name: ``sim2real.identify.links``."""
 
-    Importing anything from a room sets it as this package's attribute, so that a function of that name would be gone.
-    """
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        function = vars(sys.modules[__name__]).get(self.__name__.rpartition(".")[2])
+        if function is not None:
+            setattr(function, name, value)
 
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        name = self.__name__.rpartition(".")[2]
-        return getattr(importlib.import_module(f"sim2real.stages.{name}"), name)(*args, **options)
+
+sys.modules[__name__].__class__ = _Package
 
 
 def room(name: str) -> None:
-    """Let a room's module, which calls this while it is imported, run the stage of its name when it is called."""
+    """Let a room's modules, which calls this while it is imported, be attributes of the function of its name."""
     sys.modules[name].__class__ = _Room
 
 
@@ -157,15 +191,19 @@ def __getattr__(name: str) -> Any:
         from importlib import metadata
 
         value: Any = metadata.version("sim2real")
-    elif name in (*_ROOMS, *_MODULES):
+    elif name in _MODULES:
         value = importlib.import_module(f"sim2real.{name}")
     elif name in _HOME_OF:
         value = getattr(importlib.import_module(_HOME_OF[name]), name)
     else:
         raise AttributeError(f"module 'sim2real' has no attribute {name!r}")
+    if name in _ROOMS:
+        own = importlib.import_module(f"sim2real.{name}")
+        value.__dict__.update({n: m for n, m in vars(own).items() if isinstance(m, ModuleType)})
+        value.__dict__.update({n: getattr(own, n) for n in getattr(own, "__all__", ())})
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})
+    return sorted((*__all__, *_MODULES, "__version__"))

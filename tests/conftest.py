@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import skips
 from hypothesis import settings
 from repetitions import divided
 from xdist.scheduler import LoadScopeScheduling
@@ -91,6 +92,14 @@ def pytest_addoption(parser):
     parser.addoption(
         "--full", action="store_true", help="run only the tests and repetitions that `make test` leaves out"
     )
+    parser.addoption(
+        "--known-skips", action="store_true", help="fail where a test is skipped for a reason that is not in skips.py"
+    )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session):
+    skips.check(session)
 
 
 def pytest_collection_modifyitems(config, items):

@@ -63,6 +63,9 @@ SHAPES = (
 )
 """The links, in the order of the joints."""
 
+TRAVEL_RAD = {"shoulder_pan": 3.84, "shoulder_lift": 3.49, "elbow_flex": 3.38, "wrist_flex": 3.32, "gripper": 1.92}
+"""From stop to stop [rad]. The wrist's roll is not among them: LeRobot gives it a whole turn."""
+
 
 class Link(composer.Entity):
     """A rigid link."""

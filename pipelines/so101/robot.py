@@ -29,7 +29,7 @@ from sim2real.robots.payload import Hand
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo_robot import ServoRobot, Servos
 
-from .parts import JOINTS, SHEET, TIP_M, Arm
+from .parts import JOINTS, SHEET, TIP_M, TRAVEL_RAD, Arm
 from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
 LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
@@ -162,9 +162,9 @@ def read(path: Path) -> tuple[CalibratedJoint, ...]:
     """Return the joints of LeRobot's calibration file, in the order of the arm.
 
     Raises:
-        UsageError: It is no calibration of an SO-101.
+        UsageError: It is no calibration of an SO-101, or the range of a joint with stops is far from its travel.
     """
-    joints = {joint.name: joint for joint in read_calibration(path)}
+    joints = {joint.name: joint for joint in read_calibration(path, TRAVEL_RAD)}
     if lacking := [name for name in JOINTS if name not in joints]:
         raise UsageError(
             f"calibration file {path} has no motor {lacking[0]!r}. There are: {', '.join(joints)}",

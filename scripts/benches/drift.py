@@ -206,7 +206,7 @@ def restored(
         now.record(own[0], options.record_s, 1000)
         again = identify(pipeline, own, now.number, options, terms)
     config, bundle = repeated(
-        lambda config: sim2real.train(pipeline, config, again)[0],
+        lambda config: sim2real.train(pipeline, again, config),
         randomise.train_config(pipeline, "all", now.number, options),
         lambda config, bundle: for_longer(config, bundle.history),
         MOST["train"],
@@ -240,5 +240,5 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
-    tried = repeated(lambda c: sim2real.identify(recordings, pipeline, c), config, with_wider_bounds, MOST["identify"])
+    tried = repeated(lambda c: sim2real.identify(pipeline, recordings, c), config, with_wider_bounds, MOST["identify"])
     return tried[-1][1]

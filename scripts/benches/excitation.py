@@ -73,7 +73,7 @@ def compared(name: str, seed: int, folder: Path, options: argparse.Namespace) ->
         log = folder / f"{key}.mcap"
         session = simulated.record(pipeline, pipeline.record.gate, signal, number, log)
         sessions[key] = session
-        identified[key] = sim2real.identify(Recording.load(log), pipeline, fitting)
+        identified[key] = sim2real.identify(pipeline, Recording.load(log), fitting)
 
     recorded("first", usual(pipeline, replace(pipeline.record, duration_s=options.first_s, seed=3 * seed)), 3 * seed)
     asked = replace(asked, motions=options.motions or asked.motions, motion_s=options.motion_s or asked.motion_s)

@@ -55,7 +55,7 @@ def record(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int)
 
     folder.mkdir()
     config = replace(pipeline.record, duration_s=seconds, amplitude=volts, seed=seed)
-    return sim2real.record(pipeline, folder, config)[0]
+    return sim2real.record(pipeline, folder, config)
 
 
 def deploy(pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int) -> list[tuple[np.ndarray, ...]]:
@@ -72,7 +72,7 @@ def deploy(pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int
 
     folder.mkdir()
     config = replace(pipeline.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
-    found, _ = sim2real.deploy(bundle, pipeline, folder, config)
+    found = sim2real.deploy(pipeline, bundle, folder, config)
     motions = []
     for recording in found.recordings:
         t_s, states = recording.true_states()

@@ -108,11 +108,11 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         recording = recorded(robot, pipeline, options, Path(folder) / "record")
         config = replace(pipeline.identify, folds=0, generations=options.generations, seed=number)
-        identified = sim2real.identify(recording, pipeline, config)
+        identified = sim2real.identify(pipeline, recording, config)
         for way in options.ways:
             begin = time.perf_counter()
             try:
-                bundle, about = sim2real.train(pipeline, train_config(pipeline, way, number, options), identified)
+                bundle = sim2real.train(pipeline, identified, train_config(pipeline, way, number, options))
                 motions = deployed(robot, pipeline, bundle, options, Path(folder) / way)
             except Sim2RealError as error:  # what is not trained, or is stopped by the gate, succeeds never
                 ways[way] = {"success": [0.0] * options.trials, "refused": str(error)}
@@ -121,7 +121,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
             ways[way] = {
                 "success": [upright(*motion, np.inf) for motion in motions],
                 "still": [upright(*motion, STILL_RAD_S) for motion in motions],
-                "in simulation": about["success in simulation"],
+                "in simulation": bundle.summary["success in simulation"],
                 "seconds": time.perf_counter() - begin,
             }
             print(f"robot {number}, {way}: {np.round(ways[way]['success'], 2)}", flush=True)

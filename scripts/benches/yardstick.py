@@ -24,6 +24,8 @@ COMMIT = "51f54b7210f9034c78055b63517518bcce9c02f8"
 PATHS = ("sim2real", "pipelines", "datasets/pendulum")
 """Folders of that commit that the identification reads."""
 COMMAND = ("identify", "pendulum", "--log", "datasets/pendulum/chirp.mcap", "--runs", "runs")
+PACKAGES = ("optimistix==0.1.0", "equinox==0.13.8", "lineax==0.1.1", "jaxtyping==0.3.11", "wadler-lindig==0.1.8")
+"""Packages that the commit imports and the project no longer needs, in the versions of its uv.lock."""
 TEST_SETTINGS = ("JAX_", "PYTEST_", "XLA_FLAGS", "OPENBLAS_NUM_THREADS")
 """First letters of the environment variables by which a test run changes how long a program computes."""
 
@@ -62,16 +64,24 @@ def cold_identification(folder: Path) -> float:
         folder: An empty folder; the files of the commit, the compilation cache and the run are written there.
 
     Raises:
-        Sim2RealError: When the git history of this copy lacks the commit, or the identification fails.
+        Sim2RealError: When the git history of this copy lacks the commit, its packages cannot be installed, or the
+            identification fails.
     """
     extract(COMMIT, PATHS, folder, ROOT)
+    packages = folder / "packages"
+    install = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--target", str(packages))
+    if measure([sys.executable, *install, *PACKAGES], folder, os.environ).code:
+        raise Sim2RealError(
+            f"pip cannot install what commit {COMMIT[:7]} imports: {', '.join(PACKAGES)}",
+            hint="run the bench where a package index is reached, or give --cold-s of this machine",
+        )
     environment = plain_environment(os.environ) | {
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
-        "PYTHONPATH": str(folder),
+        "PYTHONPATH": os.pathsep.join([str(folder), str(packages)]),
     }
     # A user's checkout has its bytecode after the first command; the yardstick counts programs of XLA alone as cold.
-    measure([sys.executable, "-m", "compileall", "-q", *PATHS[:2]], folder, environment)
+    measure([sys.executable, "-m", "compileall", "-q", *PATHS[:2], packages.name], folder, environment)
     done = measure([sys.executable, "-m", "sim2real.cli", *COMMAND], folder, environment)
     if done.code:
         raise Sim2RealError(

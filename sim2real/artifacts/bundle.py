@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.episodes import EPISODES, Episodes
-from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.artifacts.files import check, made, malformed, read_json, write_json
+from sim2real.artifacts.paths import shown
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
+from sim2real.artifacts.summary import Rows, Summed
 from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
@@ -83,8 +86,8 @@ class History:
             return read_json(file, History)
 
 
-@dataclass(frozen=True)
-class Bundle:
+@dataclass(frozen=True, repr=False)
+class Bundle(Summed):
     """A policy and what it expects and promises.
 
     Attributes:
@@ -98,6 +101,7 @@ class Bundle:
         graph: The policy as an ONNX model, of a network that is not one of ours; not read again by ``load``.
         references: What JAX does on observations of the log and of training, with which the runner is compared when the
             bundle is saved.
+        summary: How training went, in text and numbers; empty for one that was loaded.
     """
 
     contract: PolicyContract
@@ -109,6 +113,18 @@ class Bundle:
     spec: NetworkSpec = field(default_factory=NetworkSpec)
     graph: bytes | None = None
     references: Mapping[str, PolicyReference] = field(default_factory=dict)
+    summary: Mapping[str, Any] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleMethodOverride]
+
+    def about(self) -> Mapping[str, Any]:
+        """Return what to say about it: name -> value."""
+        found: dict[str, Any] = {"rate": f"{self.contract.rate_hz:g} Hz"}
+        if self.history is not None:
+            found["success in simulation"] = float(self.history.success.max())
+        return found if self.path is None else {**found, "folder": shown(self.path)}
+
+    def rows(self) -> Rows | None:
+        """Return what there is to say about its training."""
+        return (("training", ""), list(self.summary.items())) if self.summary else None
 
     def runner(self, backend: str | None = None) -> PolicyRunner:
         """Return what runs the policy, in numpy or, with ``"onnx"``, in onnxruntime.
@@ -121,12 +137,13 @@ class Bundle:
             return load_bundle(self.path, backend)
         return make_runner(self.weights, self.contract, backend, self.spec, self.graph)
 
-    def save(self, folder: Path) -> dict[str, str]:
+    def save(self, folder: Path | str) -> dict[str, str]:
         """Write it into the folder of a train stage.
 
         Returns:
             Output -> name of the file or folder in it.
         """
+        folder = made(folder)
         save_bundle(
             folder / BUNDLE, self.weights, self.contract, spec=self.spec, graph=self.graph, references=self.references
         )
@@ -142,7 +159,7 @@ class Bundle:
         return written
 
     @staticmethod
-    def load(path: Path) -> Bundle:
+    def load(path: Path | str) -> Bundle:
         """Read a policy bundle.
 
         Args:
@@ -151,6 +168,7 @@ class Bundle:
         Raises:
             Sim2RealError: When a file is missing, damaged or of a format that this version does not know.
         """
+        path = Path(path)
         folder = path / BUNDLE if (path / BUNDLE).is_dir() else path
         contract, spec = read_contract(folder)
         beside = folder.with_name(HISTORY)

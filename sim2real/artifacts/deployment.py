@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from sim2real.artifacts.drift import Drift
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
+from sim2real.artifacts.summary import Rows, Summed
 from sim2real.errors import Sim2RealError
 
 FORMAT = 2
@@ -85,8 +86,8 @@ class Advice:
     joint: str = ""
 
 
-@dataclass(frozen=True)
-class Deployment:
+@dataclass(frozen=True, repr=False)
+class Deployment(Summed):
     """Episodes on the robot beside the same policy in simulation.
 
     Attributes:
@@ -102,6 +103,7 @@ class Deployment:
         drift: Which parameters are no longer what was identified; None where that was not tested.
         advice: What to do next; None in older files and after a dry run.
         dry_run: Whether nothing was moved: then there are no scores, no simulation and no gap.
+        summary: How the session of each episode went; empty for one that was loaded.
         format: Version of the file.
     """
 
@@ -117,18 +119,33 @@ class Deployment:
     advice: Advice | None = None
     dry_run: bool = False
     format: int = FORMAT
+    summary: tuple[Mapping[str, Any], ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __post_init__(self) -> None:
         """Check that there is an episode: it may come from a file."""
         check(bool(self.episodes), "no episode")
 
-    def save(self, folder: Path) -> dict[str, str]:
+    def about(self) -> Mapping[str, Any]:
+        """Return what to say about it: name -> value."""
+        advice = self.advice
+        found: dict[str, Any] = {"episodes": len(self.episodes), "dry run": self.dry_run or ""}
+        if advice is not None:
+            found |= {"verdict": advice.status, "why": "; ".join(advice.reasons), "next": advice.next}
+        return {name: value for name, value in found.items() if value}
+
+    def rows(self) -> Rows:
+        """Return a row for each quantity."""
+        headers = ("quantity", "robot", "simulation", "gap", "unit")
+        return headers, [[g.quantity, g.real, g.simulation, g.gap, g.unit] for g in self.gap]
+
+    def save(self, folder: Path | str) -> dict[str, str]:
         """Write scores and simulation into a folder; the sessions' logs stand in it already.
 
         Returns:
             Output -> name of the file in the folder.
         """
-        arrays, advice = ("simulated", "recordings", "probe"), self.advice
+        folder, advice = made(folder), self.advice
+        arrays = ("simulated", "recordings", "probe", "summary")
         if advice is not None:
             advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
@@ -161,12 +178,13 @@ class Deployment:
         return replace(found, advice=replace(found.advice, next=found.advice.next.replace(_RUN, shown(folder.parent))))
 
     @staticmethod
-    def load(folder: Path) -> Deployment:
+    def load(folder: Path | str) -> Deployment:
         """Read what ``save`` wrote, and the logs beside it.
 
         Raises:
             Sim2RealError: When something is missing, of another format, or not as it should be.
         """
+        folder = Path(folder)
         found = Deployment.read(folder)
         arrays: dict[str, np.ndarray] = {}
         if not found.dry_run:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -40,6 +42,13 @@ def malformed(path: Path, again: str) -> Iterator[None]:
         raise Sim2RealError(f"{path} is malformed: {reason}", hint=again) from error
 
 
+def made(folder: Path | str) -> Path:
+    """Return a folder's path; it is made if it is missing."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def check(good: bool, reason: str) -> None:
     """Raise ValueError unless ``good``; inside ``malformed`` it becomes an error that names the file."""
     if not good:
@@ -51,13 +60,14 @@ def read_json(path: Path, kind: type[T]) -> T:
 
     Args:
         path: The file.
-        kind: A dataclass; lists of numbers become arrays where it has arrays, null in them NaN.
+        kind: A dataclass; lists of numbers become arrays where it has arrays; null becomes NaN where a number stands.
 
     Raises:
         ValueError: When it is no JSON, or an entry is missing or of another kind: the message says which.
     """
     try:
-        return msgspec.convert(msgspec.json.decode(path.read_bytes()), kind, dec_hook=_array)
+        document = _numbers(kind, msgspec.json.decode(path.read_bytes()))
+        return msgspec.convert(document, kind, dec_hook=_array)
     except msgspec.MsgspecError as error:
         raise ValueError(str(error)) from error
 
@@ -68,11 +78,36 @@ def write_json(path: Path, document: object) -> None:
     Args:
         path: The file.
         document: What to write; infinite numbers and NaN, which JSON lacks, become null.
+
+    Raises:
+        Sim2RealError: When a text has bytes that are no text, as names of files may.
     """
-    text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
+    try:
+        text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
+    except UnicodeEncodeError as error:
+        raise Sim2RealError(f"{path} cannot be written: {error.object!r} has bytes that are no text") from None
     draft = path.with_name(f".{path.name}.tmp")
     draft.write_bytes(text)
     os.replace(draft, path)
+
+
+def _numbers(kind: Any, value: Any) -> Any:
+    """Return a document with NaN for null where a type has numbers alone."""
+    inner = get_args(kind)
+    if kind is float:
+        return math.nan if value is None else value
+    if isinstance(kind, UnionType) or get_origin(kind) is Union:
+        fitting = [k for k in inner if k is not NoneType and (k is float) != isinstance(value, dict | list)]
+        return value if value is None or not fitting else _numbers(fitting[0], value)
+    if isinstance(value, dict):
+        if dataclasses.is_dataclass(kind):
+            hints = get_type_hints(kind)
+            return {name: _numbers(hints.get(name), v) for name, v in value.items()}
+        return {name: _numbers(inner[-1] if inner else None, v) for name, v in value.items()}
+    if isinstance(value, list) and inner and kind is not np.ndarray:
+        kinds = [inner[0]] * len(value) if len(inner) == 1 or inner[-1] is Ellipsis else inner
+        return [_numbers(k, v) for k, v in zip(kinds, value, strict=False)] + value[len(kinds) :]
+    return value
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -90,9 +125,18 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a compressed npz file."""
-    named: dict[str, Any] = dict(arrays)
-    np.savez_compressed(path, **named)
+    """Write arrays to a compressed npz file, which takes any name but those with a null character.
+
+    Raises:
+        Sim2RealError: When a name has a null character, at which a zip file cuts it off.
+    """
+    if cut := [name for name in arrays if "\0" in name]:
+        raise Sim2RealError(f"{path} cannot be written: the name {cut[0]!r} has a null character")
+    # As numpy.savez_compressed does, whose arguments leave no room for an array called file.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
 
 
 def _array(kind: type, value: Any) -> Any:

@@ -9,11 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.links import Link
 from sim2real.artifacts.noise import Noise
 from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.quantity import Quantity
 from sim2real.artifacts.run_folder import Source
+from sim2real.artifacts.summary import Rows, Shown
 from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
 
@@ -191,39 +193,6 @@ class FreeRun:
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """One quantity, estimated from each of R recordings by itself, and from all together.
-
-    Attributes:
-        name: Its name.
-        unit: Its unit.
-        estimates: Shape ``(R,)``: one a recording.
-        standard_errors: Shape ``(R,)``.
-        mean: Their mean.
-        standard_error: Of the mean.
-        between: Deviation between recordings, beyond their standard errors.
-        low95: Lower end of the 95 % interval for a further recording.
-        high95: Its upper end.
-        agree: Whether their standard errors explain how much the estimates differ.
-    """
-
-    name: str
-    unit: str
-    estimates: np.ndarray
-    standard_errors: np.ndarray
-    mean: float
-    standard_error: float
-    between: float
-    low95: float
-    high95: float
-    agree: bool
-
-    def __post_init__(self) -> None:
-        """Check that every estimate has an error."""
-        check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")
-
-
-@dataclass(frozen=True)
 class Left:
     """What was identified without one part of the recordings, and how far it is off there.
 
@@ -244,8 +213,8 @@ class Left:
     free: Mapping[str, float | None] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Identification:
+@dataclass(frozen=True, repr=False)
+class Identification(Shown):
     """What identify found.
 
     Attributes:
@@ -313,6 +282,17 @@ class Identification:
     timing: Timing | None = None
     format: int = FORMAT
 
+    def about(self) -> Mapping[str, Any]:
+        """Return what to say about it: name -> value."""
+        found = {"pipeline": self.pipeline, "verdict": self.verdict.status, "why": "; ".join(self.verdict.reasons)}
+        found |= {"next": self.verdict.next, "parameters": len(self.parameters)}
+        return {name: value for name, value in found.items() if value}
+
+    def rows(self) -> Rows:
+        """Return a row for each parameter."""
+        own = [[p.name, p.estimate, p.low95, p.high95, p.unit, p.verdict] for p in self.parameters]
+        return ("parameter", "estimate", "low 95 %", "high 95 %", "unit", "verdict"), own
+
     @property
     def values(self) -> dict[str, float]:
         """Parameter -> the value found, without derived ones."""
@@ -344,12 +324,13 @@ class Identification:
                 end[own] = t_s[rows][-1]
         return chosen
 
-    def save(self, folder: Path) -> dict[str, str]:
+    def save(self, folder: Path | str) -> dict[str, str]:
         """Write it into a folder.
 
         Returns:
             Output -> name of the file in the folder.
         """
+        folder = made(folder)
         written = {"parameters": PARAMETERS}
         self.write(folder / PARAMETERS)
         for name, file, columns in (("predictions", PREDICTIONS, self.samples), ("free_runs", FREE_RUNS, self.free)):
@@ -364,7 +345,7 @@ class Identification:
         write_json(path, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
 
     @staticmethod
-    def load(path: Path) -> Identification:
+    def load(path: Path | str) -> Identification:
         """Read what ``save`` wrote.
 
         Args:
@@ -373,6 +354,7 @@ class Identification:
         Raises:
             Sim2RealError: When it is missing, of another format, or not as it should be.
         """
+        path = Path(path)
         file = path / PARAMETERS if path.is_dir() else path
         with malformed(file, _AGAIN):
             found = read_json(file, Identification)

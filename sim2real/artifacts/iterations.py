@@ -1,4 +1,4 @@
-"""The iterations of a run: what each did again, how it went, and what it found."""
+"""The iterations of a run: what each did again, how it went, what it found, and what the next one does."""
 
 from __future__ import annotations
 
@@ -32,12 +32,44 @@ class Iteration:
     why: str = ""
     then: str = ""
 
+    @property
+    def deployment(self) -> str | None:
+        """Folder of the deployment that was judged; None where it was refused."""
+        return next((name for name in reversed(self.stages) if name.partition(".")[0] == "deploy"), None)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an iteration does. It is on disk before the iteration starts, so that an interrupted one can go on.
+
+    Attributes:
+        stages: The stages that run, in order; none where the run stops.
+        words: That in words.
+        log: The logs to identify from, relative to the run folder; none: the newest recording.
+        terms: The optional terms to identify with; None: as the flags say.
+        seed: The seed of the training; None: as the flags say.
+        before: Stage folders that were finished when the iteration started.
+    """
+
+    stages: tuple[str, ...]
+    words: str
+    log: tuple[str, ...] = ()
+    terms: str | None = None
+    seed: int | None = None
+    before: tuple[str, ...] = ()
+
 
 @dataclass(frozen=True)
 class Iterations:
-    """All iterations of a run, the oldest first."""
+    """All iterations of a run, the oldest first.
+
+    Attributes:
+        rows: Those that ended.
+        plan: What the next one does; None where none is to come.
+    """
 
     rows: tuple[Iteration, ...] = ()
+    plan: Plan | None = None
 
     def save(self, run_dir: Path) -> Path:
         """Write them into the run folder; return the file."""
@@ -54,5 +86,5 @@ class Iterations:
         file = run_dir / ITERATIONS
         if not file.is_file():
             return Iterations()
-        with malformed(file, "remove it: it only tells what was done"):
+        with malformed(file, "remove it: the run then judges its newest deployment again"):
             return read_json(file, Iterations)

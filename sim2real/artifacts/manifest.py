@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
 import math
@@ -16,23 +17,34 @@ from numbers import Integral, Real
 from pathlib import Path, PurePath
 from typing import Any
 
+from sim2real.artifacts.locks import held_lock, read_with_lock
 from sim2real.errors import Sim2RealError
 
 MANIFEST = "manifest.json"
+RUNNING = "running"
+DIED = "died"
+"""Status of a stage whose process ended without a word: it was killed, or the machine lost its power."""
 _TEXTS = ("pipeline", "stage", "status", "started")
 _DRAFT = f".{MANIFEST}.tmp"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Most manifests have 4 kB; long summaries need more.
 _RESERVED_BYTES = 32 * 1024
 PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return a stage folder's manifest, or None if it is missing or malformed."""
+    """Return a stage folder's manifest, or None if it is missing or malformed.
+
+    The status is `died` where the manifest says `running` and no process holds the lock on it.
+    """
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        text, locked = read_with_lock(folder / MANIFEST)
+        manifest = json.loads(text)
+    except (OSError, ValueError, RecursionError):
         return None
-    return manifest if _is_manifest(manifest) else None
+    if not _is_manifest(manifest):
+        return None
+    return manifest | {"status": DIED} if manifest["status"] == RUNNING and not locked else manifest
 
 
 def _is_manifest(value: object) -> bool:
@@ -52,8 +64,16 @@ def _is_manifest(value: object) -> bool:
     return True
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+def write_manifest(folder: Path, manifest: Mapping[str, Any], lock: bool = False) -> int | None:
     """Write a stage folder's manifest; a reader sees the old one or the new one, never a part.
+
+    Args:
+        folder: The stage's folder.
+        manifest: What to write.
+        lock: Whether to hold a lock on it, which readers see as long as this process lives.
+
+    Returns:
+        The file descriptor that holds the lock; its owner closes it. None without a lock.
 
     Raises:
         TypeError: When a value has no plain JSON form.
@@ -66,7 +86,10 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
         file.truncate()
         file.flush()
         os.fsync(file.fileno())
+        # Locked before it has its name: no reader finds it without the lock.
+        held = held_lock(file.fileno()) if lock else None
     os.replace(draft, folder / MANIFEST)
+    return held
 
 
 def reserve(folder: Path) -> None:
@@ -75,6 +98,17 @@ def reserve(folder: Path) -> None:
         file.write(b" " * _RESERVED_BYTES)
         file.flush()
         os.fsync(file.fileno())
+
+
+def in_words(error: BaseException, folder: Path) -> BaseException:
+    """Return the exception to show the user: a plain error where a full disk is the cause, else the same."""
+    if not isinstance(error, OSError) or error.errno not in _FULL:
+        return error
+    where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
+    return Sim2RealError(
+        f"the disk is full: {error.strerror}{where}",
+        hint=f"free some space, or name a folder elsewhere with --runs DIR; what was written is in {folder}",
+    )
 
 
 def plain(value: object) -> Any:

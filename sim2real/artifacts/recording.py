@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.artifacts.paths import shown
+from sim2real.artifacts.summary import Summed
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.hardware.truth import Truth, read_truth
@@ -19,8 +21,8 @@ from sim2real.log.reader import TruncatedLogWarning, read_log
 LOG, TRUTH = "session.mcap", "truth.bin"
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Summed):
     """A recorded session.
 
     Attributes:
@@ -36,7 +38,7 @@ class Recording:
     warnings: tuple[str, ...] = ()
 
     @staticmethod
-    def load(path: Path, truth: Path | None = None) -> Recording:
+    def load(path: Path | str, truth: Path | None = None) -> Recording:
         """Read a log; one that was cut is read up to the cut.
 
         Args:
@@ -46,6 +48,7 @@ class Recording:
         Raises:
             Sim2RealError: When it is no log.
         """
+        path = Path(path)
         log = path / LOG if path.is_dir() else path
         truth = truth or log.with_name(TRUTH)
         with warnings.catch_warnings(record=True) as caught:
@@ -76,6 +79,17 @@ class Recording:
     def end(self) -> Mapping[str, Any]:
         """What the session said at its end; empty after a crash."""
         return self.episode.metadata.get("log", {}).get("session_end") or {}
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """How the session went: timing by node, losses, the gate's counts; empty after a crash."""
+        return self.end
+
+    def about(self) -> Mapping[str, Any]:
+        """Return what to say about it: name -> value."""
+        steps = ", ".join(f"{name} {len(s)}" for name, s in self.episode.steps.items())
+        found = {"pipeline": self.pipeline, "log": shown(self.path), "duration": f"{self.episode.duration_s:.1f} s"}
+        return {**found, "steps": steps, **({"warnings": "; ".join(self.warnings)} if self.warnings else {})}
 
     @cached_property
     def timing(self) -> Timing:

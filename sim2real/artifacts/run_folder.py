@@ -7,7 +7,6 @@ overwritten, references to files stay valid, and a failed attempt does not hide 
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import sys
@@ -19,7 +18,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sim2real.artifacts.manifest import git_state, plain, read_manifest, reserve, sha256, versions, write_manifest
+from sim2real.artifacts.manifest import (
+    RUNNING,
+    git_state,
+    in_words,
+    plain,
+    read_manifest,
+    reserve,
+    sha256,
+    versions,
+    write_manifest,
+)
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
@@ -28,7 +37,6 @@ TESTS = ("latency", "explain", "design")
 DRY = "dry run"
 """Status of a stage that ended well but moved nothing: later stages do not use it."""
 INTERRUPTED = 130
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NAME = re.compile(r"\w[\w.-]*")
 
 
@@ -172,14 +180,14 @@ def open_stage(
     hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
     running = OpenStage(folder)
     manifest = _first_manifest(pipeline, stage, config, hashed, dry_run)
-    start = time.monotonic()
+    start, lock = time.monotonic(), None
     try:
-        write_manifest(folder, manifest)
+        lock = write_manifest(folder, manifest, lock=True)
         reserve(folder)
         yield running
         _close(running, manifest, start, DRY if dry_run else "finished", OK)
     except BaseException as error:
-        told = _in_words(error, folder)
+        told = in_words(error, folder)
         try:
             _close(running, manifest, start, *_failure(told), told)
         except OSError as other:
@@ -187,6 +195,9 @@ def open_stage(
         if told is error:
             raise
         raise told from error
+    finally:
+        if lock is not None:
+            os.close(lock)
 
 
 def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str, Any], dry_run: bool) -> dict[str, Any]:
@@ -195,7 +206,7 @@ def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str,
         "format": 1,
         "pipeline": pipeline,
         "stage": stage,
-        "status": "running",
+        "status": RUNNING,
         "dry_run": dry_run,
         "exit_code": None,
         "started": datetime.now(UTC).isoformat(timespec="microseconds"),
@@ -244,11 +255,11 @@ def new_run(root: Path, pipeline: str) -> Path:
 
 
 def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
-    """Return all attempts at a stage in a run folder, the latest first."""
-    folders = [run_dir / stage, *(f for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdigit())]
+    """Return all attempts at a stage in a run folder, the latest first: by number, for a clock may be set back."""
+    numbers = [int(f.suffix[1:]) for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdecimal()]
+    folders = [*(run_dir / f"{stage}.{n}" for n in sorted(numbers, reverse=True)), run_dir / stage]
     found = [(folder, read_manifest(folder)) for folder in folders]
-    there = [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
-    return sorted(there, key=lambda a: (str(a.manifest.get("started", "")), a.folder.name), reverse=True)
+    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
 
 
 def finished(run_dir: Path, stage: str) -> StageFolder | None:
@@ -349,17 +360,6 @@ def _stage_folder(run_dir: Path, stage: str) -> Path:
 def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
     return Sim2RealError(
         f"cannot write the run folder {folder}: {error.strerror}", hint="name a folder of your own with --runs DIR"
-    )
-
-
-def _in_words(error: BaseException, folder: Path) -> BaseException:
-    """Return the exception to show the user: a plain error where a full disk is the cause, else the same."""
-    if not isinstance(error, OSError) or error.errno not in _FULL:
-        return error
-    where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
-    return Sim2RealError(
-        f"the disk is full: {error.strerror}{where}",
-        hint=f"free some space, or name a folder elsewhere with --runs DIR; what was written is in {folder}",
     )
 
 

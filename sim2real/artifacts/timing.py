@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.summary import Rows, Shown
 from sim2real.errors import Sim2RealError
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import TICKS_PER_S, Episode
@@ -110,8 +111,8 @@ class BusTiming:
     lateness: Spread
 
 
-@dataclass(frozen=True)
-class Timing:
+@dataclass(frozen=True, repr=False)
+class Timing(Shown):
     """The timing of one session.
 
     Attributes:
@@ -186,7 +187,16 @@ class Timing:
                 dropped[name] = int(took.size - usual.size)
         return delays, dropped
 
-    def save(self, folder: Path, name: str = "timing") -> dict[str, str]:
+    def about(self) -> Mapping[str, Any]:
+        """Return what to say about it: name -> value."""
+        return {"nodes": ", ".join(f"{name} {own.steps} steps" for name, own in self.nodes.items())}
+
+    def rows(self) -> Rows:
+        """Return a row for each node."""
+        own = [[n, t.steps, t.computation.p50, t.computation.p99, t.overruns] for n, t in self.nodes.items()]
+        return ("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), own
+
+    def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:
         """Write it into a folder.
 
         Args:
@@ -196,13 +206,14 @@ class Timing:
         Returns:
             Output -> name of the file in the folder.
         """
+        folder = made(folder)
         document, samples = f"{name}.json", f"{name}.npz"
         write_json(folder / document, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS})
         write_arrays(folder / samples, {f"{kind}/{n}": v for kind in _ARRAYS for n, v in getattr(self, kind).items()})
         return {name: document, f"{name}_samples": samples}
 
     @staticmethod
-    def load(path: Path) -> Timing:
+    def load(path: Path | str) -> Timing:
         """Read what ``save`` wrote.
 
         Args:
@@ -211,6 +222,7 @@ class Timing:
         Raises:
             Sim2RealError: When it is missing, of another format, or not as it should be.
         """
+        path = Path(path)
         file = path / TIMING if path.is_dir() else path
         with malformed(file, _AGAIN):
             found = read_json(file, Timing)

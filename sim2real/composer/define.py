@@ -45,12 +45,19 @@ class observable(cached_property):  # noqa: N801
     it is then the observable's value itself, and stays callable.
     """
 
+    _in_class = False
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Note that the decorated function is a method: its first argument is the object, whatever it is called."""
+        self._in_class = True
+
     @property
     def takes_physics(self) -> bool:
         """Whether the decorated function computes the value from the physics, rather than returning an observable."""
         getter: Any = self.fget
-        parameters = [p for p in inspect.signature(getter).parameters if p != "self"]
-        return bool(parameters)
+        kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        names = [name for name, p in inspect.signature(getter).parameters.items() if p.kind in kinds]
+        return len(names) > (1 if self._in_class or names[:1] == ["self"] else 0)
 
     def __get__(self, obj: Any, owner: type | None = None) -> Any:
         if obj is not None and self.takes_physics:

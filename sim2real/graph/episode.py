@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import StepState
 
 TICKS_PER_S = 1_000_000
 """All times of schedules and logs are whole ticks: microseconds."""
@@ -74,6 +79,23 @@ class Recorder(Protocol):
         """Take a message that was consumed, or that no step will consume any more."""
 
 
+@runtime_checkable
+class StepStateRecorder(Recorder, Protocol):
+    """A recorder that also receives what each step is given."""
+
+    @property
+    def keep(self) -> frozenset[str]:
+        """Parts of the step state that it keeps; empty: it wants none."""
+        ...
+
+    def given(self, node: str, step_state: StepState) -> None:
+        """Take what a step of a node is given, before the step is reported."""
+
+
+KEPT = ("state", "params", "inputs")
+"""Parts of a step state that a recorder may keep."""
+
+
 @dataclass(frozen=True)
 class Steps:
     """All steps of one node, by seq; every array has shape ``(N,)``, int64 ticks [us]."""
@@ -115,7 +137,7 @@ class Messages:
         return len(self.seq_out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Episode:
     """A recorded run of a graph.
 
@@ -126,6 +148,10 @@ class Episode:
         metadata: What the session's log says about itself (pipeline, configuration, versions, ...).
         complete: Whether the session ended properly; False after a crash.
         units: Node -> field, or entry of one (``"aim[0]"``) -> unit, as far as the recording says.
+        states: Node -> field -> array with one row a step, the state before it; empty where states were not kept.
+        params: The same for parameters.
+        inputs: (node, input name) -> ``seq``, ``ts_sent``, ``ts_recv`` and ``data.FIELD``, shape ``(N, W, ...)``: the
+            window that each step saw; empty where inputs were not kept.
     """
 
     steps: Mapping[str, Steps]
@@ -134,6 +160,12 @@ class Episode:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
     units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    states: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    params: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    inputs: Mapping[tuple[str, str], Mapping[str, np.ndarray]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Episode({self.duration_s:.3f} s, steps: {', '.join(f'{n} {len(s)}' for n, s in self.steps.items())})"
 
     @property
     def duration_s(self) -> float:
@@ -143,9 +175,21 @@ class Episode:
 
 
 class MemoryRecorder:
-    """A recorder that keeps everything in memory and returns it as an ``Episode``."""
+    """A recorder that keeps everything in memory and returns it as an ``Episode``.
 
-    def __init__(self) -> None:
+    Args:
+        keep: What is kept of each step beside its output: ``state`` (before the step), ``params``, ``inputs``. On the
+            wall clock it costs the step the time to copy it.
+
+    Raises:
+        UsageError: On another name.
+    """
+
+    def __init__(self, keep: Sequence[str] = ()) -> None:
+        self.keep = frozenset([keep] if isinstance(keep, str) else keep)
+        if unknown := sorted(self.keep - set(KEPT)):
+            raise UsageError(f"a recorder cannot keep {', '.join(unknown)}. Available: {', '.join(KEPT)}")
+        self._given: dict[str, list[StepState]] = {}
         self._steps: dict[str, list[StepRecord]] = {}
         self._outputs: dict[str, list[Any]] = {}
         self._messages: dict[tuple[str, str], list[MessageRecord]] = {}
@@ -153,7 +197,12 @@ class MemoryRecorder:
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Forget what was recorded before."""
         del epoch_ns, monotonic_ns
-        self._steps, self._outputs, self._messages = {}, {}, {}
+        self._steps, self._outputs, self._messages, self._given = {}, {}, {}, {}
+
+    def given(self, node: str, step_state: StepState) -> None:
+        """Keep parts of what a step is given."""
+        parts = {part: getattr(step_state, part) if part in self.keep else None for part in KEPT}
+        self._given.setdefault(node, []).append(_copied(step_state.replace(rng=None, **parts)))
 
     def step(self, record: StepRecord, output: Any) -> None:
         """Keep a step and its output."""
@@ -170,7 +219,23 @@ class MemoryRecorder:
             steps={n: steps_from_records(r) for n, r in self._steps.items()},
             messages={k: messages_from_records(r) for k, r in self._messages.items()},
             outputs={n: _stack(o) for n, o in self._outputs.items()},
+            states=self._part("state"),
+            params=self._part("params"),
+            inputs={
+                (n, i): _stack([step.inputs[i].replace(delay_dist=None) for step in self._of_steps(n)])
+                for n in (self._given if "inputs" in self.keep else ())
+                for i in self._given[n][0].inputs
+            },
         )
+
+    def _part(self, part: str) -> dict[str, dict[str, np.ndarray]]:
+        if part not in self.keep:
+            return {}
+        return {n: _stack([getattr(step, part) for step in self._of_steps(n)]) for n in self._given}
+
+    def _of_steps(self, node: str) -> list[StepState]:
+        """Return what finished steps were given: one that failed is not reported."""
+        return self._given[node][: len(self._steps.get(node, ()))]
 
 
 def steps_from_records(records: list[StepRecord]) -> Steps:
@@ -197,6 +262,17 @@ def named_leaves(tree: Any) -> dict[str, Any]:
         return ".".join(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path) or "value"
 
     return {label(path): leaf for path, leaf in flat}
+
+
+def _copied(tree: Any) -> Any:
+    """Return a tree with numpy copies of its arrays; of a JAX key its numbers."""
+    import jax
+
+    def one(leaf: Any) -> np.ndarray:
+        key = isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.array(jax.random.key_data(leaf) if key else leaf)
+
+    return jax.tree_util.tree_map(one, tree)
 
 
 def _stack(outputs: list[Any]) -> dict[str, np.ndarray]:

@@ -48,7 +48,9 @@ def draw(
     kept = recorded or Timeline({}, {})
     episodes = kept.episodes if recorded else episodes
     delays = {
-        name: _delays(node, duration_s, episodes, rng) for name, node in nodes.items() if name not in kept.vertices
+        name: computation_delays(node, duration_s, episodes, rng)
+        for name, node in nodes.items()
+        if name not in kept.vertices
     }
     transfers = {}
     for node in nodes.values():
@@ -56,7 +58,7 @@ def draw(
             if (node.name, c.name) not in kept.edges:
                 sender = kept.vertices.get(c.output_node.name)
                 count = sender.start.shape[1] if sender else delays[c.output_node.name].shape[1]
-                transfers[node.name, c.name] = _sampled(c.delay_dist, rng, (episodes, count), repr(c))
+                transfers[node.name, c.name] = transport_delays(c, (episodes, count), rng)
     return derive(nodes, delays, transfers, to_ticks(duration_s), kept)
 
 
@@ -121,8 +123,18 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
     return Timeline(vertices, derived.edges)
 
 
-def _delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration."""
+def computation_delays(
+    node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator, known: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration.
+
+    Args:
+        node: The node.
+        duration_s: The duration [s].
+        episodes: Number of episodes E.
+        rng: Source of the delays.
+        known: Delays that were drawn for a shorter duration, and are kept.
+    """
     last = to_ticks(duration_s) - 1 - phase_ticks(node)
     count = int(np.floor(last * (node.rate / TICKS_PER_S))) + 2 if last >= 0 else 0
     count = int((slot(node, np.arange(count)) <= last + phase_ticks(node)).sum())
@@ -131,7 +143,31 @@ def _delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Gen
             f"node {node.name!r} makes no step within {duration_s} s: its first is due after {node.phase} s",
             hint="draw longer timelines",
         )
-    return _sampled(node.delay_dist, rng, (episodes, count), f"node {node.name!r}")
+    return _more(node.delay_dist, rng, (episodes, count), f"node {node.name!r}", known)
+
+
+def transport_delays(
+    connection: Connection, shape: tuple[int, int], rng: np.random.Generator, known: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw a connection's communication delays [ticks].
+
+    Args:
+        connection: The connection.
+        shape: Number of episodes, and of messages.
+        rng: Source of the delays.
+        known: Delays that were drawn for fewer messages, and are kept.
+    """
+    return _more(connection.delay_dist, rng, shape, repr(connection), known)
+
+
+def _more(
+    dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, int], where: str, known: np.ndarray | None
+) -> np.ndarray:
+    if known is None:
+        return _sampled(dist, rng, shape, where)
+    if shape[1] <= known.shape[1]:
+        return known
+    return np.concatenate([known, _sampled(dist, rng, (shape[0], shape[1] - known.shape[1]), where)], axis=1)
 
 
 def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:

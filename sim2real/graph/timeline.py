@@ -21,12 +21,16 @@ from sim2real.graph.times import NEVER, Edge, Vertex
 _FORMAT = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Timeline:
     """E episodes of a graph: vertices by node, edges by (node, input name)."""
 
     vertices: Mapping[str, Vertex]
     edges: Mapping[tuple[str, str], Edge]
+
+    def __repr__(self) -> str:
+        steps = ", ".join(f"{n} {int(v.count.max(initial=0))}" for n, v in self.vertices.items())
+        return f"Timeline({self.episodes} episodes, steps: {steps})"
 
     @property
     def episodes(self) -> int:

@@ -14,9 +14,10 @@ import sys
 import time
 
 READY, BEAT, REST, LEAVE = b"r", b"+", b"-", b"q"
-TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
+HEARD, TRIPPED, SAFE, FAILED = b".", b"t", b"s", b"f"
 GIVE_UP_S = 10.0
 _QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 _PRIORITY = 3  # above the threads that it watches, which have 1: should one never rest, this must not wait for it
 
 
@@ -53,6 +54,8 @@ class Guard:
                     self.make_safe("the control process is gone")
                     return
                 armed, heard_s = said.endswith(BEAT), time.monotonic()
+                if armed:
+                    _write(link, HEARD)
             elif watched and time.monotonic() - heard_s >= silence_s:
                 # Stay until the control process leaves: it may resume, and switch torque on before it notices.
                 tripped = True
@@ -138,6 +141,16 @@ def _write(fd: int, message: bytes) -> None:
         pass
 
 
+def continue_when_host_dies() -> None:
+    """Let the kernel continue this process, should it be stopped, when the control process dies (Linux)."""
+    try:
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+    except (ImportError, OSError, AttributeError):  # on other systems nothing continues it
+        pass
+
+
 def main(arguments: list[str]) -> None:
     """Run until the control process ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -147,6 +160,7 @@ def main(arguments: list[str]) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except (AttributeError, OSError):
         pass
+    continue_when_host_dies()
     port_fd, link, silence_s, answer_s, off, *rest = arguments
     packets = [text.partition(":") for text in rest]
     servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]

@@ -24,7 +24,7 @@ import numpy as np
 from sim2real.errors import HardwareLost
 from sim2real.hardware.device import Counters, Transaction
 from sim2real.hardware.guardian import Guardian
-from sim2real.hardware.packets import Answer, Instruction, Packet, PacketFormat, Parser
+from sim2real.hardware.packets import Answer, Instruction, Packet, PacketFormat, Parser, of_servos
 from sim2real.hardware.port import LinkConfig, open_port
 from sim2real.hardware.registers import MemoryTable, Register
 
@@ -230,6 +230,15 @@ class ServoLink(ABC):
                 self._lock.release()
         return False
 
+    def answering(self, packet: bytes, wait_s: float) -> list[int]:
+        """Send an instruction once; return the id of each answer that comes in a while, in their order."""
+        found = []
+        with self.hold():
+            self._send(packet)
+            while (answer := self._next_answer(self._sent_ns + round(1e9 * wait_s))) is not None:
+                found.append(answer.servo_id)
+        return found
+
     def close(self) -> None:
         """Close the port; later instructions raise HardwareLost. Never raises itself."""
         self.closed = True
@@ -268,7 +277,7 @@ class ServoLink(ABC):
         """
         asked_ns = time.monotonic_ns()
         losses = 0
-        to_whom = f"{what}{_of(servo_ids)}"
+        to_whom = f"{what}{of_servos(servo_ids)}"
         with self.hold():
             began_ns = time.monotonic_ns()
             while True:
@@ -387,10 +396,3 @@ class ServoLink(ABC):
             self._withheld_goals |= {(servo_id, register): value for servo_id, value in values.items()}
         what = f"read of {register.name}"
         return self.read_each((next(iter(values)),), register.address, register.size, what)[1]
-
-
-def _of(servo_ids: Sequence[int]) -> str:
-    """Return whom an instruction is for, in words."""
-    if not servo_ids:
-        return ""
-    return f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"

@@ -220,3 +220,10 @@ class Parser:
     def _drop(self, count: int) -> tuple[None, int]:
         del self._buffer[:count]
         return None, count
+
+
+def of_servos(servo_ids: Sequence[int]) -> str:
+    """Return whom an instruction is for, in words."""
+    if not servo_ids:
+        return ""
+    return f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"

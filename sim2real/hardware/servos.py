@@ -15,11 +15,12 @@ from sim2real.hardware.device import Counters, WithoutHost
 from sim2real.hardware.guardian import Guardian
 from sim2real.hardware.link import ServoLink
 from sim2real.hardware.models import ServoModel
-from sim2real.hardware.packets import BROADCAST_ID
+from sim2real.hardware.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.port import LinkConfig
 
 _LOGGER = logging.getLogger(__name__)
 _SAFE_REPEATS: Final = 5
+_SHARED_PINGS: Final = 3
 _SAFE_PAUSE_S: Final = 0.002
 
 L = TypeVar("L", bound=ServoLink)
@@ -120,20 +121,32 @@ class GuardedServos(Generic[L]):
         self._off_packet = form.write_each(torque, dict.fromkeys(self.ids, 0)) if self.ids else b""
 
     def find(self, servo_id: int, whose: str = "") -> bytes:
-        """Return what a servo answers to a ping; raise HardwareLost, with the ids that do answer, if it does not.
+        """Return what a servo answers to a ping.
 
         Args:
             servo_id: The servo.
             whose: What it moves, for errors.
+
+        Raises:
+            HardwareLost: It does not answer, the message has the ids that do; or two servos have this id.
         """
         try:
-            return self.link.ping(servo_id)
+            found = self.link.ping(servo_id)
         except HardwareLost as error:
             raise HardwareLost(
                 f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
                 f"Available: {sorted(self.link.scan())}",
-                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms",
+                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
+                "one id garble each other's answers: connect one at a time",
             ) from error
+        # A late answer to an earlier ping does not come again and again, that of a second servo does.
+        ping, wait_s = self.link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
+        if all(self.link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
+            raise HardwareLost(
+                f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
+                hint="connect one of them at a time, and give each an id of its own",
+            )
+        return found
 
     def without_host(self) -> tuple[WithoutHost, ...]:
         """Return for each model of servo found what it does by itself when this process dies."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,10 @@ _THIN = 0.1
 """A bin counts as empty below this share of the samples that it would have if they were spread evenly."""
 _STILL = 0.05
 """A joint stands still below this share of its highest speed, or below three deviations of a measured speed."""
+
+_NOISE_ORDER = 6
+"""Differences of this order leave 0.2 % of a motion of a tenth of the sampling rate, and all of white noise."""
+_WINDOW_S = 0.03
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,37 @@ def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
         return Motion(0.0, 0.0, 0)
     signs = np.sign(velocity[fast])
     return Motion(float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum()))
+
+
+def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
+    """Return how a joint moves, by its positions; what their noise and their steps explain is no motion.
+
+    Speeds are those of positions averaged over 30 ms, so that noise of fast samples does not hide slow motion.
+
+    Args:
+        t_s: Shape ``(N,)`` [s].
+        position: Shape ``(N,)``.
+    """
+    t_s, position = np.asarray(t_s, np.float64), np.asarray(position, np.float64)
+    good = np.isfinite(position) & np.isfinite(t_s)
+    t_s, position = t_s[good], position[good]
+    if len(position) < 3 * _NOISE_ORDER:
+        return motion(speed(t_s, position))
+    period_s = max(float(np.median(np.diff(t_s))), 1e-9)
+    width = min(max(1, round(_WINDOW_S / period_s)), len(position) // 3)
+    mean = np.full(width, 1.0 / width)
+    deviation = _noise(position)
+    times, smooth = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
+    least = max(1.5 * float(np.diff(np.unique(position)).min(initial=np.inf)), 8.0 * deviation / np.sqrt(width))
+    if not np.ptp(np.quantile(smooth, [0.005, 0.995])) > least:
+        return Motion(0.0, 0.0, 0)
+    return motion(speed(times, smooth), deviation / (width * period_s))
+
+
+def _noise(values: np.ndarray) -> float:
+    """Return the deviation of white noise in values ``(N,)``: high differences take out motion; leaps are left out."""
+    squares = np.sort(np.diff(values, _NOISE_ORDER) ** 2)
+    return float(np.sqrt(squares[: math.ceil(0.98 * squares.size)].mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
 
 
 def band(t_s: np.ndarray, values: np.ndarray, share: float = 0.95) -> Band | None:

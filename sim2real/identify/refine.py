@@ -28,6 +28,8 @@ from sim2real.identify.uncertainty import (
 
 _COARSE = 1e-3
 """Relative gain of the loss at which the descent from each start ends; that from the best goes on."""
+_ROUGH = 1e-2
+"""The same for a model that others are compared with by percents."""
 _ROUNDS, _BACK = 4, 4
 """Most rounds of a descent, and how often a round goes half the way back to its start."""
 _NEAR = 1e-5
@@ -99,16 +101,15 @@ def refine(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
-    ends = [descent.down(z, _COARSE, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
-    z, loss = min(ends, key=lambda end: end[1])
-    if coarse:
-        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     fine = problem.evaluator.precision
+    first_gain = _ROUGH if coarse else _COARSE if settle else fine
+    ends = [descent.down(z, first_gain, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
+    z, loss = min(ends, key=lambda end: end[1])
+    if coarse or not settle:
+        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     if descent.shift.any():
         z, loss = descent.down(z, fine, _PIN)
     z, loss = descent.down(z, fine)
-    if not settle:
-        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     left, converged = remaining(problem, z, data), False
     for _ in range(_TRIES):
         if converged := left < _LEFT:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 import sys
 import tomllib
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.errors import UsageError
+from sim2real.log.toml_text import toml_key, toml_value
 
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Unit of time stamps -> nanoseconds."""
@@ -264,6 +264,11 @@ def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
             )
 
 
+def _printable(text: str) -> list[str]:
+    """Return the lines of a comment without characters that TOML refuses."""
+    return ["".join(c if c.isprintable() else "?" for c in line) for line in text.splitlines() or [""]]
+
+
 def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
     """Return a mapping as the text of a mapping file.
 
@@ -271,14 +276,17 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
         mapping: The mapping.
         comments: Lines that stand above it.
     """
-    lines = [*(f"# {line}" for line in comments), f"pipeline = {_quoted(mapping.pipeline)}"]
+    lines = [
+        *(f"# {part}" for line in comments for part in _printable(line)),
+        f"pipeline = {toml_value(mapping.pipeline)}",
+    ]
     for name, node in mapping.nodes.items():
         keys: dict[str, Any] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
         keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}
         keys |= {"order": node.order} if node.order != int(name == _COMMANDING) else {}
         keys |= {k: v for k in _POLICIES if (v := getattr(node, k)) != "refuse"}
         keys |= {"stamp_offset": node.stamp_offset} if node.stamp_offset else {}
-        lines += ["", f"[nodes.{name}]", *(f"{key} = {_quoted(value)}" for key, value in keys.items())]
+        lines += ["", f"[nodes.{toml_key(name)}]", *(f"{key} = {toml_value(value)}" for key, value in keys.items())]
         for field, how in node.fields.items():
             parts: dict[str, Any] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
             parts |= {"unit": how.unit} if how.unit else {}
@@ -286,15 +294,6 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
                 k: v for k, plain in (("scale", 1.0), ("offset", 0.0), ("turn", 0.0)) if (v := getattr(how, k)) != plain
             }
             parts |= {k: v for k in ("shape", "column") if (v := getattr(how, k)) is not None}
-            inside = ", ".join(f"{key} = {_quoted(value)}" for key, value in parts.items())
-            lines.append(f"fields.{field} = {{ {inside} }}")
+            inside = ", ".join(f"{key} = {toml_value(value)}" for key, value in parts.items())
+            lines.append(f"fields.{toml_key(field)} = {{ {inside} }}")
     return "\n".join(lines) + "\n"
-
-
-def _quoted(value: object) -> str:
-    """Return a value as TOML writes it."""
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_quoted, value))}]"
-    return repr(value)

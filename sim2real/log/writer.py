@@ -16,13 +16,16 @@ import numpy as np
 
 from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
+from sim2real.log.backlog import RECORD_BYTES, Backlog, most_bytes
 from sim2real.log.session_file import SessionFile
 
 # A crash may cost at most 0.25 s of data; 0.05 s are left for a writer thread that wakes late.
 FLUSH_PERIOD_S = 0.2
 SYNC_PERIOD_S = 1.0
-# Longer than any working disk needs for the queue.
-CLOSE_TIMEOUT_S = 60.0
+# How often `close` looks whether the writer comes on, and how often it says so.
+LOOK_S, SAY_S = 0.2, 5.0
+# Records between two looks at the memory that the queue takes.
+LOOK_EVERY = 256
 # The warning level of rcl_interfaces/msg/Log.
 WARN = 30
 
@@ -34,6 +37,9 @@ class McapRecorder:
     from any thread. An error while writing is raised by the next call. Used as a context manager, an exception that
     leaves the block becomes the status of the session. If the process ends without closing the log, it is closed with
     the status ``aborted``.
+
+    A writer that falls behind loses nothing: `backlog` says how far behind it is, and `close` waits as long as it
+    comes on. The memory of the queue has a bound: beyond it every call raises an error, and what is queued is written.
 
     Args:
         path: The file; it must not exist.
@@ -66,10 +72,24 @@ class McapRecorder:
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
-        self._queue: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[float, Callable[..., None], tuple[Any, ...]] | None]
+        self._queue = queue.SimpleQueue()
         self._longest_queue = 0
+        self._longest_behind_s = 0.0
+        self._most_bytes = most_bytes()
+        # Memory of the arrays of each node's outputs: all have the shapes of the example.
+        self._sizes = {
+            node: sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values())
+            for node, example in outputs.items()
+        }
+        self._queued = dict.fromkeys(outputs, 0)  # steps of each node, which one thread counts
+        self._written = dict.fromkeys(outputs, 0)
+        self._puts = 0
+        self._at_s = self._began_s = 0.0  # when the record being written was queued, and when that began
+        self._busy = False
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
+        self._overflow: Sim2RealError | None = None
         self._started = False
         self._closed = False
         self._lock = threading.Lock()
@@ -91,7 +111,10 @@ class McapRecorder:
 
     def step(self, record: StepRecord, output: Any) -> None:
         """Queue a step that has ended, and its output: a pytree like the example, or a mapping by leaf name."""
-        self._put(self._file.step, record, _snapshot(record.node, output, self._names.get(record.node, {})))
+        leaves = _snapshot(record.node, output, self._names.get(record.node, {}))
+        self._put(self._file.step, record, leaves)
+        if record.node in self._queued:
+            self._queued[record.node] += 1
 
     def message(self, record: MessageRecord) -> None:
         """Queue the record of a message."""
@@ -108,16 +131,33 @@ class McapRecorder:
         """
         self._put(self._file.event, time.monotonic_ns(), ticks, level, kind, text)
 
-    def close(self, status: str = "finished", exit_code: int = OK, summary: Mapping[str, Any] | None = None) -> None:
+    def backlog(self) -> Backlog:
+        """Return what waits to be written; from any thread."""
+        records = self._queue.qsize() + self._busy
+        arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
+        now_s = time.monotonic()
+        behind_s, idle_s = (now_s - self._at_s, now_s - self._began_s) if self._busy else (0.0, 0.0)
+        return Backlog(records, RECORD_BYTES * records + arrays, behind_s, idle_s)
+
+    def close(
+        self,
+        status: str = "finished",
+        exit_code: int = OK,
+        summary: Mapping[str, Any] | None = None,
+        told: Callable[[str], None] | None = None,
+    ) -> None:
         """Write everything that is queued and ``session_end``, and close the file. Later calls do nothing.
+
+        It waits as long as the writer comes on, however long the queue is.
 
         Args:
             status: How the session ended, in a word or a sentence.
             exit_code: Exit code of the command.
             summary: More facts for ``session_end`` (overruns, drops, ...): JSON-able.
+            told: Called with a sentence every few seconds while it waits.
 
         Raises:
-            Sim2RealError: When something could not be written.
+            Sim2RealError: When something could not be written, or the disk has taken no data for a minute.
         """
         with self._lock:
             if self._closed:
@@ -125,12 +165,7 @@ class McapRecorder:
             self._closed = True
         atexit.unregister(self._close_at_exit)
         self._queue.put(None)
-        self._thread.join(CLOSE_TIMEOUT_S)
-        if self._thread.is_alive():
-            raise Sim2RealError(
-                f"the disk took no data for {CLOSE_TIMEOUT_S:.0f} s: the log {self.path} has no end",
-                hint="what is there opens all the same; write logs to a local disk",
-            )
+        self._drain(told)
         if self._error is None:
             try:
                 self._file.finish(
@@ -140,6 +175,7 @@ class McapRecorder:
                         "exit_code": exit_code,
                         "messages": self._file.counts,
                         "longest_queue": self._longest_queue,
+                        "longest_behind_s": round(self._longest_behind_s, 3),
                     }
                 )
             except (OSError, Sim2RealError) as error:
@@ -170,7 +206,36 @@ class McapRecorder:
             raise self._failure() from self._error
         if self._closed:
             raise Sim2RealError(f"the log {self.path} is closed")
-        self._queue.put((write, *arguments))
+        if self._overflow is not None:
+            raise self._overflow
+        self._queue.put((time.monotonic(), write, arguments))
+        self._puts += 1
+        if not self._puts % LOOK_EVERY and self._overflow is None and (left := self.backlog()).bytes > self._most_bytes:
+            self._overflow = Sim2RealError(
+                f"{left}: more than {self._most_bytes / 1e6:.0f} MB of the log {self.path} would wait in memory",
+                hint="the log holds every record until now; record fewer or smaller outputs, at a lower rate, close "
+                "what else runs on this machine, or write to a faster, local disk",
+            )
+
+    def _drain(self, told: Callable[[str], None] | None) -> None:
+        """Wait until the writer has written the queue.
+
+        Raises:
+            Sim2RealError: When the disk is stuck; a slow writer is not.
+        """
+        say_s = time.monotonic() + SAY_S
+        while self._thread.is_alive():
+            self._thread.join(LOOK_S)
+            left = self.backlog()
+            if left.stuck and self._thread.is_alive():
+                raise Sim2RealError(
+                    f"the disk took no data for {left.idle_s:.0f} s: the log {self.path} has no end, "
+                    f"{left.records:,} records are lost",
+                    hint="what is there opens all the same; write logs to a local disk",
+                )
+            if told is not None and left.records and time.monotonic() >= say_s:
+                told(f"writing the log: {left}")
+                say_s += SAY_S
 
     def _failure(self) -> Sim2RealError:
         """Return the error that all calls raise from now on: always the same object, so that it is reported once."""
@@ -191,17 +256,30 @@ class McapRecorder:
                     item = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
                     if item is None:
                         return
-                    item[0](*item[1:])
+                    self._write(*item)
                 if (now := time.monotonic()) < flush_at:
                     continue
-                self._longest_queue = max(self._longest_queue, self._queue.qsize())
+                left = self.backlog()
+                self._longest_queue = max(self._longest_queue, left.records)
+                self._longest_behind_s = max(self._longest_behind_s, left.behind_s)
+                self._at_s, self._began_s, self._busy = self._at_s if left.records else now, now, True
                 self._file.flush()
                 flush_at = now + FLUSH_PERIOD_S
                 if now >= sync_at:
+                    self._began_s = time.monotonic()
                     self._file.sync()
                     sync_at = now + SYNC_PERIOD_S
+                self._busy = not self._queue.empty()
         except BaseException as error:
             self._error = error
+
+    def _write(self, at_s: float, write: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        """Write one record."""
+        self._at_s, self._began_s, self._busy = at_s, time.monotonic(), True
+        write(*arguments)
+        if write == self._file.step:
+            self._written[arguments[0].node] += 1
+        self._busy = not self._queue.empty()
 
     def _close_at_exit(self) -> None:
         # The interpreter is exiting: a failure could not be reported.

@@ -36,6 +36,8 @@ from sim2real.policy.runner import (
 FORMAT_VERSIONS = (1, 2)
 """1: a perceptron whose output is clipped. 2: the file says what the network is; who knows 1 alone must refuse it."""
 WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
+SEAL = "sha256"
+"""Entry of ``policy.json``: the hash of all others."""
 PARITY = 1e-5
 """Largest difference between the actions of numpy and ONNX that an export accepts, as a fraction of their range."""
 
@@ -109,8 +111,14 @@ def save_bundle(
     (folder / CONTRACT).unlink(missing_ok=True)
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    (folder / CONTRACT).write_text(json.dumps(about, indent=2) + "\n")
+    (folder / CONTRACT).write_text(json.dumps(sealed(about), indent=2) + "\n", encoding="utf-8")
     return folder
+
+
+def sealed(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of ``policy.json`` with the hash of all other entries, whatever the layout of the file."""
+    entries = {name: value for name, value in about.items() if name != SEAL}
+    return entries | {SEAL: hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()}
 
 
 def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Any]:
@@ -207,6 +215,12 @@ def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
     contract = PolicyContract.from_dict(about)
     spec = NetworkSpec() if about["format_version"] == 1 else NetworkSpec.from_dict(about.get("network"))
     _check_fit(read_weights(folder), contract, spec)
+    # Last, as a reason with a name says more than a hash. Bundles of older versions have none.
+    if SEAL in about and about[SEAL] != sealed(about)[SEAL]:
+        raise Sim2RealError(
+            f"{Path(folder) / CONTRACT} is not what was exported: its entries do not have the hash in its {SEAL!r}",
+            hint="copy or export the whole bundle again; a changed contract needs a policy that is trained for it",
+        )
     return contract, spec
 
 

@@ -9,6 +9,14 @@ from typing import Any
 
 from sim2real.errors import Sim2RealError, UsageError
 
+RATES_HZ = (1e-3, 1e5)
+"""Least and most policy steps per second: beyond them no robot is driven."""
+MOST_DELAY_S = 60.0
+"""Longest delay, and longest step of a node [s]."""
+MOST_HISTORY = 10_000
+LARGEST_BOUND = 1e9
+"""Largest magnitude of a bound or a limit, in any unit; float32 has steps of 64 there."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ObservationTerm:
@@ -30,19 +38,20 @@ class ObservationTerm:
 
     def __post_init__(self) -> None:
         """Check that the term has at least one entry."""
-        if isinstance(self.units, str) or not self.units or self.history < 1:
+        if isinstance(self.units, str) or not self.units or not 1 <= self.history <= MOST_HISTORY:
             raise UsageError(
                 f"observation term {self.name!r} needs at least one unit and one step of history, "
                 f"got units={self.units!r} and history={self.history!r}",
-                hint="units is a tuple with one unit per entry, e.g. ('rad/s',)",
+                hint=f"units is a tuple with one unit per entry, e.g. ('rad/s',), and history at most {MOST_HISTORY}",
             )
         bounds = len(self.low), len(self.high)
         if bounds not in ((0, 0), (self.size, self.size)) or any(
-            not -math.inf < low < high < math.inf for low, high in zip(self.low, self.high, strict=True)
+            not -LARGEST_BOUND <= low < high <= LARGEST_BOUND for low, high in zip(self.low, self.high, strict=True)
         ):
             raise UsageError(
                 f"observation term {self.name!r} of {self.size} entries has bounds low={self.low}, high={self.high}",
-                hint="give each entry both, finite and with low < high, or none of them any",
+                hint="give each entry both, finite and with low < high, or none of them any; "
+                f"no bound may be larger than {LARGEST_BOUND:g}",
             )
 
     @classmethod
@@ -54,7 +63,7 @@ class ObservationTerm:
             units: The unit of each entry.
             most: The largest magnitude [their units]; infinite: not known.
         """
-        known = math.isfinite(most)
+        known = most <= LARGEST_BOUND
         return cls(name, units, 1, (-most,) * len(units) * known, (most,) * len(units) * known)
 
     @property
@@ -81,9 +90,10 @@ class ActionTerm:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+        if not -LARGEST_BOUND <= self.low < self.high <= LARGEST_BOUND:
             raise UsageError(
-                f"action {self.name!r} needs finite bounds with low < high, got {self.low} and {self.high}"
+                f"action {self.name!r} needs finite bounds with low < high, got {self.low} and {self.high}",
+                hint=f"no bound may be larger than {LARGEST_BOUND:g}",
             )
 
 
@@ -120,14 +130,19 @@ class PolicyContract:
             double = sorted({name for name in names if names.count(name) > 1})
             if double:
                 raise UsageError(f"{kind} {', '.join(double)} appears more than once")
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise UsageError(f"rate_hz must be above 0, got {self.rate_hz}")
+        if not RATES_HZ[0] <= self.rate_hz <= RATES_HZ[1]:
+            raise UsageError(f"rate_hz must be above 0, from {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, got {self.rate_hz}")
         for name, delay in self.delays_s.items():
-            if not (math.isfinite(delay) and delay >= 0):
-                raise UsageError(f"delay {name!r} must be finite and at least 0 s, got {delay}")
+            if not 0 <= delay <= MOST_DELAY_S:
+                raise UsageError(f"delay {name!r} must be finite, from 0 to {MOST_DELAY_S:g} s, got {delay}")
         for name, (least, most) in self.trained_s.items():
-            if not 0 <= least <= most < math.inf:
-                raise UsageError(f"times of {name!r} must be finite and in order, got {least} to {most} s")
+            if not 0 <= least <= most <= MOST_DELAY_S:
+                raise UsageError(
+                    f"times of {name!r} must be finite and in order, up to {MOST_DELAY_S:g} s, got {least} to {most} s"
+                )
+        for name, limit in self.limits.items():
+            if not abs(limit) <= LARGEST_BOUND:
+                raise UsageError(f"limit {name!r} must be finite and at most {LARGEST_BOUND:g}, got {limit}")
 
     @property
     def observation_size(self) -> int:
@@ -167,22 +182,22 @@ class PolicyContract:
             return cls(
                 observation=tuple(
                     ObservationTerm(
-                        *(term["name"], tuple(term["units"]), int(term["history"])),
-                        *(tuple(map(float, term.get(bound, ()))) for bound in ("low", "high")),
+                        *(_text(term["name"]), tuple(map(_text, _list(term["units"]))), _count(term["history"])),
+                        *(tuple(map(_number, _list(term.get(bound, [])))) for bound in ("low", "high")),
                     )
                     for term in data["observation"]
                 ),
                 action=tuple(
-                    ActionTerm(term["name"], term["unit"], float(term["low"]), float(term["high"]))
+                    ActionTerm(_text(term["name"]), _text(term["unit"]), _number(term["low"]), _number(term["high"]))
                     for term in data["action"]
                 ),
-                rate_hz=float(data["rate_hz"]),
-                delays_s={name: float(delay) for name, delay in data["delays_s"].items()},
+                rate_hz=_number(data["rate_hz"]),
+                delays_s={name: _number(delay) for name, delay in data["delays_s"].items()},
                 trained_s={
-                    name: (float(least), float(most)) for name, (least, most) in data.get("trained_s", {}).items()
+                    name: (_number(least), _number(most)) for name, (least, most) in data.get("trained_s", {}).items()
                 },
-                limits={name: float(limit) for name, limit in data["limits"].items()},
-                hashes=dict(data["hashes"]),
+                limits={name: _number(limit) for name, limit in data["limits"].items()},
+                hashes={name: _text(digest) for name, digest in data["hashes"].items()},
             )
         except Sim2RealError:
             raise
@@ -191,3 +206,28 @@ class PolicyContract:
                 f"the policy's contract is incomplete: {type(error).__name__} {error}",
                 hint="export the policy again: sim2real train",
             ) from error
+
+
+def _number(value: Any) -> float:
+    """Return a number of a file; neither a text nor a truth value is one."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int:
+        raise TypeError(f"{value!r} is no whole number")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list | tuple):
+        raise TypeError(f"{value!r} is no list")
+    return list(value)

@@ -11,28 +11,19 @@ import numpy as np
 
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
+from sim2real.robots import model_file
+from sim2real.robots.holding import Holding, apply, plan
 
 NO_LIMIT = 1e6
 _LEAST_FRICTION = 1e-9
+_OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
+              "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
+"""Units of hinges -> units of slides."""
 
 
-def read_spec(path: Path) -> Any:
-    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file.
-
-    Raises:
-        UsageError: When the file is missing, or MuJoCo cannot read or compile it.
-    """
-    if not path.is_file():
-        raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
-    try:
-        spec = mj.MjSpec.from_file(str(path))
-        spec.copy().compile()
-    except (ValueError, RuntimeError, OSError) as error:
-        raise UsageError(
-            f"MuJoCo cannot read {path}: {str(error).strip().splitlines()[0]}",
-            hint="correct the file; meshes that it names must lie where it says, or be taken out",
-        ) from None
-    return spec
+def read_spec(path: Path, contacts: bool = False) -> Any:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``model_file.read``, and what that raises."""
+    return model_file.read(path, contacts)[0]
 
 
 def read_model(path: Path) -> Any:
@@ -46,14 +37,31 @@ def joints_of(model: Any) -> tuple[str, ...]:
     return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
 
 
+def slides_of(model: Any, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return those of a model's joints that are slides: their units have m for rad, and N for N m."""
+    return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
+
+
+def unit_for(unit: str, slide: bool) -> str:
+    """Return the unit of a hinge's quantity, or what takes its place at a slide."""
+    return _OF_SLIDES.get(unit, unit) if slide else unit
+
+
 def driven(
-    path: Path, joints: Sequence[str], step_s: float, fix_base: bool, contacts: bool, rubbing: bool = True
+    path: Path,
+    joints: Sequence[str],
+    step_s: float,
+    fix_base: bool,
+    contacts: bool,
+    rubbing: bool = True,
+    hold: Sequence[str] = (),
 ) -> Any:
     """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
     First stand those of force, in the order of the joints, then those of stiffness, whose force is ``-ctrl * angle``,
     then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the file's own actuators.
-    Joints that were not recorded are held where the model has them.
+    Joints that were not recorded are held, but for those that something moves together with recorded ones: see
+    ``holding.plan``. Where some are moved, the keyframe that the others are held at is the model's only one.
 
     Args:
         path: MJCF or URDF.
@@ -62,25 +70,16 @@ def driven(
         fix_base: Whether a floating base is held where the model has it.
         contacts: Whether bodies touch.
         rubbing: Whether joints have dry friction, be it little: MJX leaves it out for good where the model has none.
+        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
 
     Raises:
-        UsageError: When a joint is missing or is no hinge or slide, or the base floats.
+        UsageError: When a joint is missing or is no hinge or slide, the base floats, or a joint cannot be held.
     """
-    spec = read_spec(path)
-    model = spec.copy().compile()
-    own = joints_of(model)
-    if unknown := [j for j in joints if j not in own]:
-        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
-    free = [j for j in spec.joints if j.type not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE)]
-    if free and not fix_base:
-        raise UsageError(
-            f"the base of {path} floats: joint {free[0].name or 'without a name'!r} was not recorded",
-            hint="--fix-base holds it where the model has it, as on a stand",
-        )
+    spec = read_spec(path, contacts)
+    model = spec.compile()
+    holding = held_in(path, model, joints, fix_base, hold)
     limits = {j: limit_of(model, j) for j in joints}
-    held = [j for j in spec.joints if j.name not in joints]  # a floating base's among them
-    for element in (*spec.sensors, *spec.actuators, *spec.keys, *held):
-        spec.delete(element)
+    apply(spec, model, holding)
     for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
         for joint in joints:
             part: Any = spec.add_actuator(name=f"{joint}_{what}", target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
@@ -100,8 +99,28 @@ def driven(
         return spec.compile()
     except ValueError as error:
         raise UsageError(
-            f"{path} does not compile with joints held: {error}", hint="take what needs them out of the model"
+            f"{path} does not compile with joints held: {model_file.one_line(error)}",
+            hint="take what needs them out of the model",
         ) from None
+
+
+def held_in(path: Path, model: Any, joints: Sequence[str], fix_base: bool, hold: Sequence[str]) -> Holding:
+    """Return which joints of a file's compiled model are held, as ``driven`` holds them.
+
+    Args:
+        path: The file, for messages.
+        model: Its model.
+        joints: The joints that were recorded.
+        fix_base: Whether a floating base is held.
+        hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+
+    Raises:
+        UsageError: When a joint is missing, the base floats, or a joint cannot be held.
+    """
+    own = joints_of(model)
+    if unknown := [j for j in joints if j not in own]:
+        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    return plan(model, joints, hold, fix_base, path)
 
 
 @dataclass(frozen=True)

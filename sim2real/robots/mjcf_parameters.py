@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
-from sim2real.robots.mjcf import gains_of, limit_of
+from sim2real.robots.mjcf import gains_of, limit_of, slides_of, unit_for
 
 What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
@@ -213,20 +213,32 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
     for term in terms:
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
         offset = 1 if term.what == "payload" else 0
-        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name)]
+        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name, re.DOTALL)]
         if not at:
             raise UsageError(
                 f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",
                 hint="a pattern matches whole names: .*_hip_joint",
             )
-        groups = (
-            [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at] if term.each else [(at, term.label())]
-        )
+        sliding = set() if term.what == "payload" else set(slides_of(own, names))
+        if term.each:
+            groups = [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at]
+        else:
+            groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
         for group, name in groups:
             nominal = _nominal(term, [names[i] for i in group], own)
-            p = _parameter(term, name, nominal, _size(term, [names[i] for i in group], own))
+            unit = unit_for(_ABOUT[term.what][0], term.what not in TILT and names[group[0]] in sliding)
+            p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], own)), unit=unit)
             found.append(Placed(p, term.what, tuple(i + offset for i in group)))
     return found
+
+
+def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) -> list[tuple[list[int], str]]:
+    """Return the groups of joints that may share a value, and what is added to its name: slides are in other units."""
+    slides = [i for i in at if names[i] in sliding]
+    hinges = [i for i in at if names[i] not in sliding]
+    if what in TILT or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
+        return [(at, "")]
+    return [(hinges, ""), (slides, "_slide")]
 
 
 def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[ParameterPattern, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -10,16 +9,32 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from flax import struct
 
+from sim2real.artifacts.files import check
 from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.mjcf import NO_LIMIT, JointDrive, driven, joints_of, limit_of, read_model, read_spec, set_drives
+from sim2real.log.toml_text import toml_value
+from sim2real.robots.holding import Holding
+from sim2real.robots.mjcf import (
+    NO_LIMIT,
+    JointDrive,
+    driven,
+    held_in,
+    joints_of,
+    limit_of,
+    read_model,
+    read_spec,
+    set_drives,
+    slides_of,
+    unit_for,
+)
 from sim2real.robots.mjcf_parameters import (
     FALLBACK,
     LAWS,
@@ -60,6 +75,7 @@ class RobotConfig:
         kd_unit: What 1 stands for in the log's own damping.
         fix_base: Whether a floating base is held.
         contacts: Whether bodies touch.
+        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
         terms: What is identified.
     """
 
@@ -76,7 +92,16 @@ class RobotConfig:
     kd_unit: float = 1.0
     fix_base: bool = False
     contacts: bool = False
+    hold: tuple[str, ...] = ()
     terms: tuple[ParameterPattern, ...] = ()
+
+    def driven(self, rubbing: bool = True) -> Any:
+        """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
+        return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
+
+    def held(self) -> Holding:
+        """Return what becomes of the joints that were not recorded."""
+        return held_in(self.model, read_model(self.model), self.joints, self.fix_base, self.hold)
 
     def to_toml(self, model: str) -> str:
         """Return the text of a ``robot.toml`` that names the model's file."""
@@ -84,11 +109,11 @@ class RobotConfig:
         plain = {f.name: f.default for f in fields(self)}
         lines = ["# A robot that was recorded: sim2real.robots.mjcf_robot.RobotConfig says what each key is."]
         own["model"] = model
-        lines += [f"{k} = {json.dumps(v)}" for k, v in own.items() if v != plain[k]]
+        lines += [f"{k} = {toml_value(v)}" for k, v in own.items() if v != plain[k]]
         for term in self.terms:
             usual = asdict(ParameterPattern(term.what))
             said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
-            lines += ["", "[[terms]]", *(f"{k} = {json.dumps(v)}" for k, v in said.items())]
+            lines += ["", "[[terms]]", *(f"{k} = {toml_value(v)}" for k, v in said.items())]
         return "\n".join(lines) + "\n"
 
     @staticmethod
@@ -98,15 +123,17 @@ class RobotConfig:
         Raises:
             UsageError: When a key is unknown, missing or of the wrong kind.
         """
+        known = [f.name for f in fields(RobotConfig)]
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
             terms = tuple(ParameterPattern(**row) for row in table.pop("terms", []))
-            rest: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-            found = RobotConfig(**rest, terms=terms)
-            return replace(found, model=path.parent / found.model)
-        except (tomllib.TOMLDecodeError, TypeError, OSError) as error:
-            known = ", ".join(f.name for f in fields(RobotConfig))
-            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {known}") from None
+            check(table.keys() <= set(known), f"unknown key {min(table.keys() - set(known), default='')!r}")
+            found = msgspec.convert(table, RobotConfig, dec_hook=lambda _, text: Path(text))
+            return replace(found, model=path.parent / found.model, terms=terms)
+        except UsageError:
+            raise
+        except (ValueError, TypeError, OSError) as error:
+            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(known)}") from None
 
 
 @struct.dataclass
@@ -187,7 +214,7 @@ class MjcfRobot(LoggedRobot):
         own = read_model(config.model)
         self.lawful = any(term.what in LAWS for term in config.terms)
         rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
-        self.model = driven(config.model, config.joints, config.step_s, config.fix_base, config.contacts, rubbing)
+        self.model = config.driven(rubbing)
         self.placed = tuple(expand(config.terms, config.joints, self.model, own))
         self._limits = [limit_of(own, joint) for joint in config.joints]
 
@@ -201,10 +228,14 @@ class MjcfRobot(LoggedRobot):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Field -> unit."""
+        """Field -> unit; entry of a field, such as ``position[0]``, where some joints are slides and others hinges."""
         known = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
         there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
-        return {field: unit for field, unit in known.items() if field in there}
+        known = {field: unit for field, unit in known.items() if field in there}
+        slides = [joint in slides_of(self.model, self.config.joints) for joint in self.config.joints]
+        if len(set(slides)) == 1:
+            return {field: unit_for(unit, slides[0]) for field, unit in known.items()}
+        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in known.items() for i, s in enumerate(slides)}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
@@ -307,9 +338,9 @@ class IdentifiableMjcf(IdentifiableRecording):
         super().__init__(robot, max_delay_s)
         self.parameters = ParameterTable(p for p in self.parameters if p.name != "sensor_delay")
         self.ahead_s = robot.tick_s
-        world = robot.make_nodes()[2]
+        self._world = world = robot.make_nodes()[2]
         self._placed: Sequence[Placed] = robot.placed
-        self._joints, self._dofs, self._qpos = world.joints, world.qvel_at, world.qpos_at
+        self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
 
     def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
@@ -327,8 +358,11 @@ class IdentifiableMjcf(IdentifiableRecording):
         if world.terms is not None:
             angle = world.terms.angle(angle)
             speed = speed / world.terms.rate(angle, 1.0)
-        qpos, qvel = world.qpos.at[self._qpos].set(angle), world.qvel.at[self._dofs].set(speed)
-        return {**tree, "world": world.replace(qpos=qpos, qvel=qvel), "sensor": EncoderParams(world.zero, world.terms)}
+        return {
+            **tree,
+            "world": self._world.started(world, angle, speed),
+            "sensor": EncoderParams(world.zero, world.terms),
+        }
 
 
 def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:

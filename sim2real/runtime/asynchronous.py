@@ -14,6 +14,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.episode import Recorder
+from sim2real.graph.growing import Growing
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
@@ -51,7 +52,8 @@ class AsyncGraph:
         clock: The wall clock or the simulated clock.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
         recorder: Receives all steps and messages.
-        duration_s: Length of drawn timelines [s]. Simulated clock only; needed unless ``timeline`` is given.
+        duration_s: Length of drawn timelines [s]; default: no end, further delays are drawn when they are needed.
+            Simulated clock only.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: How long a call waits for the next step, and the supervisor for its caller [s].
         spin_s: How long before each step a thread polls the clock instead of sleeping [s]. Wall clock only.
@@ -243,8 +245,8 @@ class AsyncGraph:
     def _check_options(self) -> None:
         simulated = self.clock is Clock.SIMULATED
         if simulated:
-            if (self._duration_s is None) == (self._timeline is None):
-                raise UsageError("the simulated clock needs a duration_s or a timeline, one of them")
+            if self._duration_s is not None and self._timeline is not None:
+                raise UsageError("the simulated clock takes a duration_s or a timeline, not both")
             if self._spin_s or self._step_timeout_s is not None:
                 raise UsageError("spin_s and step_timeout_s are for the wall clock")
         elif self._factor or self._duration_s is not None or self._timeline is not None:
@@ -290,8 +292,10 @@ class AsyncGraph:
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, own)
         if self.clock is Clock.SIMULATED:
-            timeline, episode = self._timeline_of(graph_state)
-            run = SimulatedRun(*common, timeline, episode, self._factor)
+            endless = self._duration_s is None and self._timeline is None
+            drawn = Growing(self.nodes, self._seed(graph_state), check_bursts) if endless else None
+            timeline, episode = (drawn.timeline, 0) if drawn else self._timeline_of(graph_state)
+            run = SimulatedRun(*common, timeline, episode, self._factor, drawn)
         else:
             run = WallClockRun(*common, self._spin_s, self._timeout_s, self._step_timeout_s)
         with self._lock:
@@ -319,13 +323,15 @@ class AsyncGraph:
                 raise UsageError(f"there is no episode {eps}: the timeline has {self._timeline.episodes}")
             check_bursts(self.nodes, self._timeline[[eps]])
             return self._timeline, eps
+        timeline = draw(self.nodes, self._duration_s or 0.0, 1, self._seed(graph_state))
+        check_bursts(self.nodes, timeline)
+        return timeline, 0
+
+    def _seed(self, graph_state: GraphState) -> np.random.Generator:
         key = graph_state.rng[self.supervisor.name]
         if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key):
             key = jax.random.key_data(key)
-        seed = np.random.default_rng([eps, *np.asarray(key).ravel().tolist()])
-        timeline = draw(self.nodes, self._duration_s or 0.0, 1, seed)
-        check_bursts(self.nodes, timeline)
-        return timeline, 0
+        return np.random.default_rng([int(graph_state.eps), *np.asarray(key).ravel().tolist()])
 
     def _running(self) -> WallClockRun | SimulatedRun:
         if self._run is None:

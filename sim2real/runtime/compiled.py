@@ -23,7 +23,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.runtime.fit import check_fit, nodes_of, supervisor_of
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.program import Rollout, RowProgram, has_mjx_data, scan_rows
+from sim2real.runtime.program import Rollout, RowProgram, has_mjx_data, scan_rows, select
 from sim2real.runtime.repetition import Repetition
 from sim2real.runtime.report import report_of
 from sim2real.runtime.walk import Walk
@@ -48,8 +48,8 @@ class CompiledGraph:
     - ``observe`` and ``advance``: the same row by row. In some rows the supervisor makes no step.
 
     Running past the end of the timeline, stepping before a reset, and mixing the three ways are errors. Under ``jit``
-    and ``vmap`` the position in the timeline may not be known when the program is traced; past the end the state then
-    stays unchanged, and the supervisor's step state has ``seq`` -1.
+    and ``vmap`` the position in the timeline may not be known when the program is traced; past the end, and in an
+    episode that does not exist, the state then stays unchanged, and every step state and record has ``seq`` -1.
 
     Args:
         nodes: The nodes, by name or as a list. Those that are not in the timeline are left out.
@@ -148,10 +148,10 @@ class CompiledGraph:
             eps: Index of the episode, int or traced.
 
         Raises:
-            UsageError: When there is no such episode, or a name is unknown.
+            UsageError: When there is no such episode, or a name is unknown. A traced ``eps`` cannot be checked: in an
+                episode that does not exist no step is made.
         """
-        if not _traced(eps) and not 0 <= int(eps) < self.episodes:
-            raise UsageError(f"there is no episode {int(eps)}: the timeline has {self.episodes}")
+        self._check_episode(eps)
         gs = init_graph_state(self.nodes, self.supervisor, rng, params, order, self.program.bounds)
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
@@ -219,7 +219,7 @@ class CompiledGraph:
             The graph's state, and each node's steps of the row.
         """
         self._check_row_start(gs, "run_row")
-        return self._run_row(gs, inside=not _traced(gs.step))
+        return self._run_row(gs, _known(gs))
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
@@ -244,15 +244,26 @@ class CompiledGraph:
         # XLA compiles each tick of MJX for seconds, and masks do not slow it down: rows have fewer ticks.
         if fresh and not has_mjx_data(gs.state) and self.repetition is not None:
             self._check_record(record)
-            gs, records = self.repetition.rollout(gs, record)
-            return gs.replace(step=np.int32(self.rows)), records
+            end, records = self.repetition.rollout(gs, record)
+            return self._of_existing(gs, end.replace(step=np.int32(self.rows)), records)
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
             raise UsageError(f"{left} of this graph's {self.rows} rows are left, {rows} were asked for")
         self._check_record(record)
         inside = not _traced(gs.step)
-        return scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
+        end, records = scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
+        return self._of_existing(gs, end, records) if inside else (end, records)
+
+    def _of_existing(
+        self, begin: GraphState, end: GraphState, records: dict[str, Rollout]
+    ) -> tuple[GraphState, dict[str, Rollout]]:
+        """Return the results of rows whose updates are not masked: none where a traced ``eps`` is no episode."""
+        if not _traced(begin.eps):
+            return end, records
+        exists = self.program.within(begin)
+        records = {n: r._replace(seq=jnp.where(exists, r.seq, -1)) for n, r in records.items()}
+        return select(exists, end, begin.replace(step=end.step)), records
 
     def _check_record(self, record: Sequence[str]) -> None:
         for name in record:
@@ -265,8 +276,8 @@ class CompiledGraph:
 
         Args:
             gs: A state at the start of a row.
-            inside: Promise that the row is not past the end of the timeline, because episodes end earlier. It saves
-                masking every update.
+            inside: Promise that the row is not past the end of the timeline, because episodes end earlier, and that
+                the timeline has the episode. It saves masking every update.
 
         Returns:
             The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
@@ -276,7 +287,7 @@ class CompiledGraph:
         """
         self._check_row_start(gs, "observe")
         turn = self.walk.only_turn()
-        inside = inside or not _traced(gs.step)
+        inside = inside or _known(gs)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
@@ -294,7 +305,7 @@ class CompiledGraph:
             The state at the start of the next row.
         """
         turn, k = self.walk.only_turn(), self._awaited(gs, "advance")
-        inside = inside or not _traced(gs.step)
+        inside = inside or _known(gs)
         ran = None if inside and self.program.always(turn) else k >= 0
         gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
         gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
@@ -324,9 +335,15 @@ class CompiledGraph:
                 f"{call}() needs a state in which a step of the supervisor {self.supervisor!r} awaits",
                 hint="call observe() first" if call == "advance" else "call reset() first",
             )
+        self._check_episode(gs.eps)
         return gs.seq[self.supervisor]
 
+    def _check_episode(self, eps: Number) -> None:
+        if not _traced(eps) and not 0 <= int(eps) < self.episodes:
+            raise UsageError(f"there is no episode {int(eps)}: the timeline has {self.episodes}")
+
     def _check_row_start(self, gs: GraphState, call: str) -> None:
+        self._check_episode(gs.eps)
         if gs.seq:
             raise UsageError(
                 f"{call}() was called while a step of the supervisor {self.supervisor!r} awaits",
@@ -336,6 +353,11 @@ class CompiledGraph:
             raise UsageError(
                 f"{call}() was called at row {int(gs.step)} of {self.rows}", hint="start a new episode with init()"
             )
+
+
+def _known(gs: GraphState) -> bool:
+    """Return whether it is known that the timelines have the state's episode and row: both were checked."""
+    return not (_traced(gs.step) or _traced(gs.eps))
 
 
 def _traced(x: Any) -> bool:

@@ -55,6 +55,8 @@ class Format:
             if array.shape != like.shape or not np.can_cast(array.dtype, like.dtype, "same_kind"):
                 raise self._differs(f"a leaf {array.dtype}{array.shape}, not {like.dtype}{like.shape}")
             arrays[i] = array.astype(like.dtype, copy=False)
+            if array.dtype.kind in "iu" and array.dtype != like.dtype and not np.array_equal(array, arrays[i]):
+                raise self._differs(f"{array.tolist()}, which does not fit into {like.dtype}")
         return arrays
 
     def unpack(self, leaves: Sequence[Array]) -> Any:

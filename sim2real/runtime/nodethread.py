@@ -200,6 +200,7 @@ class NodeThread(threading.Thread):
     def _step(self, k: int, begin: int) -> Result:
         given = self.data.step_state(k, begin)
         reply = self.handover.meet(given, self.shared.answer_timeout_s) if self.handover else Reply()
+        self.stepper.show(self.shared.recorder, given, {}, reply)
         self.since_s = time.monotonic()  # only now: the caller's time does not count
         return self.stepper.answer(self.data, given, {}, reply)
 

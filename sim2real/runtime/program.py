@@ -99,14 +99,14 @@ class RowProgram:
         inside: bool = False,
         full: bool = False,
     ) -> GraphState:
-        """Run some slots of the row; after the last row nothing changes.
+        """Run some slots of the row; outside of the timelines nothing changes.
 
         Args:
             gs: The graph's state.
             begin: First slot.
             end: Slot after the last.
             outputs: Node -> its steps; those of these slots are appended.
-            inside: Promise that this is not after the last row, which saves masking every update.
+            inside: Promise that the timelines have this row and episode, which saves masking every update.
             full: Promise that each of the slots makes a step.
         """
         for i in range(begin, end):
@@ -119,14 +119,14 @@ class RowProgram:
         return gs
 
     def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]], inside: bool = False) -> GraphState:
-        """Run the world's ticks and go to the next row; after the last row nothing changes.
+        """Run the world's ticks and go to the next row; outside of the timelines nothing changes.
 
         Args:
             gs: The graph's state.
             outputs: Node -> its steps; the world's ticks are appended.
             inside: As in ``run_slots``.
         """
-        name, before, here = self.wiring.world, gs, None if inside else gs.step < self.wiring.rows
+        name, before, here = self.wiring.world, gs, None if inside else self.within(gs)
         if name is not None:
             # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
             # worlds compile in half the time.
@@ -173,7 +173,7 @@ class RowProgram:
         Args:
             gs: The graph's state.
             slot: The slot.
-            inside: Promise that this is not after the last row, where ``seq`` is -1 too.
+            inside: Promise that the timelines have this row and episode; ``seq`` is -1 elsewhere too.
         """
         table = _at(self._tables[slot], gs)
         if not inside:
@@ -181,9 +181,12 @@ class RowProgram:
         return self._step_state(gs, self.wiring.slots[slot], table, self._ages[slot])
 
     def seq(self, gs: GraphState, slot: int) -> jax.Array:
-        """Return the number of the step that a slot makes; -1 if it makes none, and after the last row."""
-        inside = gs.step < self.wiring.rows
-        return jnp.where(inside, self._tables[slot]["seq"][gs.step, gs.eps], -1)
+        """Return the number of the step that a slot makes; -1 if it makes none, and outside of the timelines."""
+        return jnp.where(self.within(gs), self._tables[slot]["seq"][gs.step, gs.eps], -1)
+
+    def within(self, gs: GraphState) -> Number:
+        """Return whether the timelines have the state's episode and row; XLA clamps an index that they lack."""
+        return (gs.step < self.wiring.rows) & (gs.eps >= 0) & (gs.eps < self.episodes)
 
     def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Number | None) -> GraphState:
         """Put the results of a node's step into the graph's state.
@@ -287,7 +290,8 @@ def scan_rows(
         return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
 
     gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
-    merge = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731 - (rows, per row, ...) -> (C, ...)
+    # (rows, per row, ...) -> (C, ...); counted, as -1 cannot be inferred for a leaf of size 0
+    merge = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])  # noqa: E731
     return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
 
 

@@ -12,6 +12,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
+from sim2real.graph.growing import Growing
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.rules import at_delay, next_drift, slot
 from sim2real.graph.schedule import topological
@@ -40,6 +41,18 @@ class _Link:
     """
 
     def __init__(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
+        self.waiting: dict[int, list[np.ndarray]] = {}
+        self.plan(edge, told, episode, steps)
+
+    def plan(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
+        """Take a timeline, which may be a longer one; see the class for the arguments.
+
+        Args:
+            edge: The timeline's.
+            told: The record's.
+            episode: Which episode of both.
+            steps: Steps of the reader in it.
+        """
         self.sender = edge.sender
         self.told_received: list[int] = told.received[episode].tolist()
         self.told_seq_in: list[int] = told.seq_in[episode].tolist()
@@ -49,7 +62,6 @@ class _Link:
         self.seq_in: list[int] = edge.seq_in[episode].tolist()
         self.used = np.flatnonzero(edge.seq_in[episode] >= 0)
         self.bounds: list[int] = np.searchsorted(edge.seq_in[episode][self.used], np.arange(steps + 1)).tolist()
-        self.waiting: dict[int, list[np.ndarray]] = {}
 
     def consumed(self, k: int) -> list[int]:
         """Return the messages that step ``k`` consumes, oldest first."""
@@ -59,9 +71,9 @@ class _Link:
         """Return the messages that step ``k`` was the first to see, oldest first."""
         return self._told[self._told_bounds[k] : self._told_bounds[k + 1]].tolist()
 
-    def put(self, m: int, leaves: list[np.ndarray]) -> None:
-        """Keep message ``m`` if a step will consume it."""
-        if self.seq_in[m] >= 0:
+    def put(self, m: int, leaves: list[np.ndarray], always: bool) -> None:
+        """Keep message ``m`` if a step will consume it; ``always``: a step of a longer timeline may."""
+        if always or self.seq_in[m] >= 0:
             self.waiting[m] = leaves
 
 
@@ -69,21 +81,29 @@ class _Player:
     """One node's steps in the timeline; ``k`` is the next one."""
 
     def __init__(self, stepper: Stepper, data: NodeData, timeline: Timeline, episode: int) -> None:
-        node = stepper.node
-        vertex = timeline.vertices[node.name]
-        steps = int(vertex.count[episode])
         self.stepper, self.data = stepper, data
-        self.begins: list[int] = [*vertex.start[episode, :steps].tolist(), _NEVER]
-        self.ends: list[int] = vertex.end[episode, :steps].tolist()
-        self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
-        self.links = {
-            i: _Link(timeline.edges[node.name, i], _told(data, i, timeline), episode, steps) for i in node.inputs
-        }
+        self.links: dict[str, _Link] = {}
+        self.plan(timeline, episode)
         self.outputs: list[_Link] = []
         self.k = 0
         self.drift = 0
         # With a trainable delay the step itself picks the message; the timeline does not say which.
-        self.log = StepLog(n for n, c in node.inputs.items() if not c.trainable)
+        self.log = StepLog(n for n, c in stepper.node.inputs.items() if not c.trainable)
+
+    def plan(self, timeline: Timeline, episode: int) -> None:
+        """Take a timeline, which may be longer than the one so far and begins as that one does."""
+        node, data = self.stepper.node, self.data
+        vertex = timeline.vertices[node.name]
+        steps = int(vertex.count[episode])
+        self.begins: list[int] = [*vertex.start[episode, :steps].tolist(), _NEVER]
+        self.ends: list[int] = vertex.end[episode, :steps].tolist()
+        self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
+        for i in node.inputs:
+            given = (timeline.edges[node.name, i], _told(data, i, timeline), episode, steps)
+            if i in self.links:
+                self.links[i].plan(*given)
+            else:
+                self.links[i] = _Link(*given)
 
     def blocked(self, k: int) -> int:
         """Return the last arrival among the messages that step ``k`` waited for [ticks]; 0 if there are none."""
@@ -123,6 +143,7 @@ class SimulatedRun:
         timeline: The timelines.
         episode: Index of the episode to play.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
+        growing: Draws longer and longer timelines, of which ``timeline`` is the first; None: the episode ends with it.
     """
 
     def __init__(
@@ -137,7 +158,9 @@ class SimulatedRun:
         timeline: Timeline,
         episode: int,
         real_time_factor: float,
+        growing: Growing | None = None,
     ) -> None:
+        self._growing = growing
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
         self._graph_state, self._recorder, self._own, self._factor = graph_state, recorder, own, real_time_factor
         # Senders before readers: of two steps that start at the same time, the sender's comes first.
@@ -181,7 +204,8 @@ class SimulatedRun:
         deadline = time.monotonic() + timeout_s
         player = self._players[self._supervisor]
         while self._pending is None:
-            if player.begins[player.k] == _NEVER:
+            self._grow()
+            if player.begins[player.k] == _NEVER and self._growing is None:
                 raise UsageError(
                     f"the timeline ends after step {player.k - 1} of the supervisor {self._supervisor!r}",
                     hint="reset the graph, or give AsyncGraph a longer duration_s or timeline",
@@ -247,7 +271,7 @@ class SimulatedRun:
         try:
             if self._pending is not None:
                 self.reply(Reply())
-            while not self.ended and min(p.begins[p.k] for p in self._players.values()) < limit:
+            while not self.ended and self._next() < limit:
                 if deadline is not None and time.monotonic() > deadline:
                     return False
                 self._event()
@@ -255,6 +279,19 @@ class SimulatedRun:
             self._own = own
         self._now = max(self._now, limit) if limit < _NEVER - 1 else self._now
         return True
+
+    def _next(self) -> int:
+        """Return when the next step starts [ticks], once the timeline is long enough to know."""
+        self._grow()
+        return min(p.begins[p.k] for p in self._players.values())
+
+    def _grow(self) -> None:
+        """Take a longer timeline where the next step may lie behind the end of this one."""
+        growing = self._growing
+        while growing and min(p.begins[p.k] for p in self._players.values()) >= growing.ticks:
+            growing.grow()
+            for player in self._players.values():
+                player.plan(growing.timeline, 0)
 
     def _event(self) -> None:
         """Make the step that comes next in time, or offer it to the caller; do nothing once the graph is stopped."""
@@ -287,8 +324,10 @@ class SimulatedRun:
         """Make a step, send its output and record it."""
         node, k = player.data.node, player.k
         begin, end = player.begins[k], player.ends[k]
+        ages = player.data.ages(begin)
         try:
-            result = player.stepper.answer(player.data, given, player.data.ages(begin), reply)
+            player.stepper.show(self._recorder, given, ages, reply)
+            result = player.stepper.answer(player.data, given, ages, reply)
             moved = overwritten(result.ts, begin, end, node.name)
         except Exception as error:
             self.stop(0.0)
@@ -296,7 +335,7 @@ class SimulatedRun:
             raise failure from failure.__cause__
         player.k += 1
         for link in player.outputs:
-            link.put(k, result.leaves)
+            link.put(k, result.leaves, self._growing is not None)
         player.data.keep(result.changed)
         before = player.ends[k - 1] if k else 0
         later = int(next_drift(node.scheduling, player.slots[k], player.drift, before))

@@ -12,6 +12,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.delays import TrainableDist
+from sim2real.graph.episode import Recorder, StepStateRecorder
 from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.handover import Reply
@@ -113,6 +114,18 @@ class Stepper:
             return Result(before, before.pop("ts", None), reply.leaves)
         made = self.run(data, reply.step_state or given, ages)
         return Result({**before, **made.changed}, made.ts, made.leaves)
+
+    def show(self, recorder: Recorder | None, given: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> None:
+        """Let a recorder see what the next step is given, if it wants to.
+
+        Args:
+            recorder: The recorder.
+            given: What the step gets, with whole windows.
+            ages: As in ``run``.
+            reply: The caller's reply.
+        """
+        if isinstance(recorder, StepStateRecorder) and recorder.keep:
+            recorder.given(self.node.name, _served(self.node, reply.step_state or given, ages))
 
     def _call(self, step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, Any], Any]:
         result = self.node.step(_served(self.node, step_state, ages))

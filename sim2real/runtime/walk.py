@@ -139,7 +139,7 @@ class Walk:
         def sweep(carry: Any, _: None) -> tuple[Any, None]:
             gs, turn, found = carry
             for i in range(turns):
-                active = ~found & (gs.step < self.rows)
+                active = ~found & self.program.within(gs)
                 active = active if turns == 1 else active & (turn == i)
                 gs = select(active, self._hop(gs, i), gs)
                 arrived = (i + 1) % turns

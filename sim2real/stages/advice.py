@@ -84,7 +84,10 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
         root: Folder of all runs.
         flags: The further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
-    new = flags.split()
+    new = shlex.split(flags)
+    if not pipeline.has_commands:
+        call = "sim2real.identify(robot, recording, ...)"
+        return f"{call} with the settings {flags}" if flags else call
     named = {name for flag, name in pairwise(new) if flag in ("--bounds", "--fix")}
     words = ["sim2real", "identify", *pipeline.words]
     for f in fields(config):

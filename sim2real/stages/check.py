@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sim2real.artifacts.checked import Checked
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.manifest import plain
 from sim2real.artifacts.run_folder import newest
@@ -20,17 +21,20 @@ from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify import excitation, identifiability, uncertainty
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import SURE_S
 from sim2real.identify.segments import Span, check_log
-from sim2real.robots.base import Robot
+from sim2real.log.schema import unit_of
+from sim2real.robots.base import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages import advice
+from sim2real.stages.arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.config import CheckConfig, IdentifyConfig
-from sim2real.stages.console import note, pairs, shown, table
+from sim2real.stages.console import note, pairs, progress, shown, table
 from sim2real.stages.cutting import reach
 from sim2real.stages.excitation import excitation as command_signal
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline import Pipeline, pipeline_of
 from sim2real.stages.planned import simulate
 from sim2real.stages.recordings import open_recording
 from sim2real.stages.robot import moving_robot
@@ -60,22 +64,46 @@ def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
+    found = check(pipeline, None, config)
+    if config.json:
+        print(json.dumps(plain(asdict(found)), indent=1))
+    else:
+        show(asdict(found))
+    return found.determined
+
+
+def check(
+    robot: RecordedRobot | Pipeline | str,
+    recording: AnyRecording | Sequence[AnyRecording] | None = None,
+    config: CheckConfig | Mapping[str, Any] | None = None,
+) -> Checked:
+    """Judge what recordings can tell about the parameters, before anything is searched.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        recording: One recording, or several; or the paths of their logs. None: those that ``config`` names, the newest
+            recording in its ``runs``, or, without one, the planned excitation.
+        config: How. A dict has what is different from the default.
+    """
+    pipeline = pipeline_of(robot)
+    config = config_of(config, CheckConfig(record=pipeline.record))
     robot = in_world(pipeline.load(), config.world)
     # A robust loss would hide what is wrong with the nominal model.
     fitting = replace(pipeline.identify, bounds=config.bounds, fix=config.fix, loss="squared")
     model = robot.identifiable(fitting.max_delay_s)
     parameters = model.parameters.with_bounds(config.bounds).with_fixed(config.fix)
-    source = find_source(pipeline, config, model, parameters, fitting)
-    found = judge(model, source, fitting, parameters, dict(robot.units))
-    found = {"pipeline": pipeline.name, **found}
+    if recording is None:
+        source = find_source(pipeline, config, model, parameters, fitting)
+    else:
+        logs = recordings_of(recording, pipeline)
+        config = replace(config, log=tuple(str(log.path) for log in logs), plan=False)
+        source = JudgedLogs([shown(log.path) for log in logs], [log.episode for log in logs], False)
+    with progress(None, "check: simulate"):
+        found = judge(model, source, fitting, parameters, dict(robot.units))
     own = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
     identify = advice.command(pipeline, replace(pipeline.identify, **own), config.runs)
-    found["recommendation"] = advice.recommend(found, identify, f"sim2real record {pipeline.name}")
-    if config.json:
-        print(json.dumps(plain(found), indent=1))
-    else:
-        show(found)
-    return found["determined"]
+    advised = advice.recommend({"pipeline": pipeline.name, **found}, identify, f"sim2real record {pipeline.name}")
+    return Checked(pipeline.name, **found, recommendation=advised)
 
 
 def find_source(
@@ -192,9 +220,9 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
         joints.append(
             {
                 "name": c.name,
-                "unit": units.get(c.position, ""),
+                "unit": unit_of(position_of(c), units),
                 **{k: _as_json(v) for k, v in own.items()},
-                **asdict(excitation.motion(velocity, c.velocity_sigma)),
+                **asdict(excitation.motion_of(t_s, position)),
             }
         )
     commands = []
@@ -208,7 +236,7 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
                 commands.append(
                     {
                         "name": name,
-                        "unit": units.get(field, ""),
+                        "unit": unit_of(f"{field}[{i}]", units),
                         **_as_json(excitation.spread(values)),
                         **(asdict(band) if band else {"low_hz": None, "high_hz": None}),
                     }

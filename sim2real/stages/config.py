@@ -155,8 +155,7 @@ class DeployConfig:
     seed: int = 0
     """Seed of the embedded robot."""
     backend: Literal["numpy", "onnx"] | None = None
-    """What runs the policy: numpy, or onnxruntime, where that is installed; default: numpy, for a network of your own
-    onnxruntime."""
+    """What runs the policy: numpy, or onnxruntime; default: numpy, but onnxruntime for a network of your own."""
     blend_s: float = 0.0
     """Time in which the policy's action grows from none to all of it, for a first try on a robot [s]."""
     measure_delay: bool = True
@@ -261,8 +260,7 @@ class RobotFlags:
     """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
     parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
     """What is identified: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
-    kp@.*_calf_joint; with =VALUE it is held. WHAT is kp, kd, gain, torque, speed, released, damping, armature,
-    frictionloss, zero, payload, load, static, stribeck_rad_s, drag, bias or back_emf."""
+    kp@.*_calf_joint; with =VALUE it is held. An unknown WHAT is refused, with a list."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of the log, if it is of another recorder; default: one is proposed."""
     rate_hz: float | None = None
@@ -275,6 +273,8 @@ class RobotFlags:
     """Hold a floating base where the model has it, as on a stand."""
     contacts: bool = False
     """Simulate contacts."""
+    hold: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """Where joints that were not recorded are held: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
     as_told: bool = False
     """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 import sys
+import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 from sim2real.artifacts.paths import shown as shown
 
-# Shortest time between two lines of progress in a log file.
-_LINE_EVERY_S = 15.0
+_TICK_S = 1.0
+"""How often a terminal's progress is drawn again, whatever is computed [s]."""
+_LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
+"""When a log file gets a line of progress [s after its start]; after the last one, a line each time as long again."""
 
 # Characters that control a terminal: control characters except line feed and tab, and changes of text direction.
 _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -78,8 +81,11 @@ class Bar(Protocol):
 
 
 @contextmanager
-def progress(total: int | None, desc: str, shown: bool = True) -> Iterator[Bar]:
+def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar]:
     """Show a progress bar on stderr, or plain lines if that is not a terminal (a log file).
+
+    The time goes on while one step takes long: on a terminal every second, in a log file after 1, 2, 4, 8, 15 s and
+    then every 15 s.
 
     Args:
         total: Number of steps; None if unknown.
@@ -89,25 +95,48 @@ def progress(total: int | None, desc: str, shown: bool = True) -> Iterator[Bar]:
     if sys.stderr.isatty() or not shown:
         from tqdm import tqdm  # not needed for --help
 
-        with tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not shown) as bar:
+        # Without a total there is nothing to count: the time alone.
+        look = None if total else "{desc}: {elapsed}{postfix}"
+        bar = tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not shown, bar_format=look)
+        with bar, _ticking(bar.refresh):
             yield bar
         return
     lines = _Lines(total, desc)
     try:
-        yield lines
+        with _ticking(lines.refresh):
+            yield lines
     except BaseException:
         lines.end("ended")
         raise
     lines.end("finished")
 
 
+@contextmanager
+def _ticking(tick: Callable[[], object]) -> Iterator[None]:
+    """Call a function every second, in a thread, while the block runs."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.wait(_TICK_S):
+            tick()
+
+    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 class _Lines:
-    """Progress as lines of text: one at the start, one at the end, and one every 15 s in between."""
+    """Progress as lines of text: one at the start, one at the end, and fewer and fewer in between."""
 
     def __init__(self, total: float | None, desc: str) -> None:
         self.n: float = 0
         self.total = total
         self._postfix = ""
+        self._lock = threading.Lock()
         self._begin(desc)
 
     def update(self, n: float = 1) -> None:
@@ -115,11 +144,14 @@ class _Lines:
         self.refresh()
 
     def refresh(self) -> None:
-        now = time.monotonic()
-        if now - self._told_s >= _LINE_EVERY_S:
-            self._told_s = now
-            done = f"{self.n:g} of {self.total:g}" if self.total else f"{self.n:g}"
-            note(f"{self._desc}: {', '.join(filter(None, [done, self._postfix]))}, {now - self._begun_s:.0f} s so far")
+        with self._lock:
+            passed = time.monotonic() - self._begun_s
+            if passed < self._due_s:
+                return
+            last = _LINES_S[-1]
+            self._due_s = next((s for s in _LINES_S if s > passed), last * (passed // last + 1))
+            done = f"{self.n:g} of {self.total:g}" if self.total else f"{self.n:g}" if self.n else ""
+            note(f"{self._desc}: {', '.join(filter(None, [done, self._postfix, f'{passed:.0f} s so far']))}")
 
     def set_description_str(self, desc: str) -> None:
         if desc != self._desc:
@@ -131,7 +163,7 @@ class _Lines:
 
     def _begin(self, desc: str) -> None:
         self._desc = desc
-        self._begun_s = self._told_s = time.monotonic()
+        self._begun_s, self._due_s = time.monotonic(), _LINES_S[0]
         note(f"{desc}: started")
 
     def end(self, how: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,40 +20,54 @@ from sim2real.policy.upright import UprightRunner
 from sim2real.robots.base import Robot, Session
 from sim2real.robots.probe import Witness
 from sim2real.stages.admission import check_delay, require_fit, require_untouched
+from sim2real.stages.arguments import (
+    AnyBundle,
+    AnyIdentification,
+    AnyPath,
+    bundle_of,
+    config_of,
+    folder_of,
+    identification_of,
+    robot_first,
+)
 from sim2real.stages.config import DeployConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.parameters import check_parameters, open_identification
-from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.probed import write_probe
 from sim2real.stages.rig import opened, show_withheld, warn
 from sim2real.stages.robot import moving_robot
 from sim2real.stages.session import check_deadlines, run_episode, timing_rows
+from sim2real.stages.targets import warn_of_stale
 
 
 def deploy(
-    bundle: Bundle,
-    robot: Robot | Pipeline,
-    folder: Path,
-    config: DeployConfig | None = None,
-    identification: Identification | None = None,
-) -> tuple[Deployment, list[dict[str, Any]]]:
+    robot: Robot | Pipeline | str,
+    bundle: AnyBundle,
+    folder: AnyPath,
+    config: DeployConfig | Mapping[str, Any] | None = None,
+    identification: AnyIdentification | None = None,
+) -> Deployment:
     """Run a policy on the robot, and compare with the simulation.
 
     Args:
-        bundle: The policy.
-        robot: The robot, or its pipeline.
-        folder: Takes the logs.
-        config: How; default: that of the pipeline that loaded the robot. The bundle that it may name is not read.
-        identification: What to simulate with; without one nothing is compared.
+        robot: The robot, its pipeline, or the pipeline's name.
+        bundle: The policy, or its folder.
+        folder: Takes the logs; a log is never overwritten.
+        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it. The
+            bundle that it may name is not read.
+        identification: What to simulate with, or its folder; without one nothing is compared.
 
     Returns:
-        What happened on the robot beside the same in simulation, and the summary of each episode's session.
+        What happened on the robot beside the same in simulation; its ``summary`` has that of each episode's session.
 
     Raises:
         Sim2RealError: When the policy does not fit the robot, or what stopped the robot.
     """
-    pipeline = pipeline_of(robot)
-    config = config or pipeline.deploy
+    pipeline, bundle = robot_first(robot, bundle)
+    bundle, folder = bundle_of(bundle), folder_of(folder)
+    config = config_of(config, pipeline.deploy)
+    identification = None if identification is None else identification_of(identification)
     robot = moving_robot(pipeline)
     require_fit(robot, bundle)
     _require_tilt(robot, config)
@@ -69,7 +84,8 @@ def deploy(
     if config.dry_run:  # nothing was moved: there is nothing to judge or to compare
         nothing = tuple(Scores({}) for _ in recordings)
         none: tuple[dict[str, np.ndarray], ...] = tuple({} for _ in recordings)
-        return Deployment(nothing, (), dict(robot.units), none, tuple(recordings), dry_run=True), sessions
+        units = dict(robot.units)
+        return Deployment(nothing, (), units, none, tuple(recordings), dry_run=True, summary=tuple(sessions))
     sessions = [{**summary, **delay} for summary in sessions]
     from sim2real.stages.gap import compare  # what simulates is imported, and compiled, when the robot is at rest
     from sim2real.stages.judging import judged
@@ -80,7 +96,7 @@ def deploy(
     gap = compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s)
     probe = folder / PROBE
     gap = replace(gap, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
-    return judged(gap, pipeline, bundle, identification, folder), sessions
+    return replace(judged(gap, pipeline, bundle, identification, folder), summary=tuple(sessions))
 
 
 def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -102,7 +118,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        found, sessions = deploy(bundle, pipeline, stage.folder, config, _identified(pipeline, stage.run_dir))
+        found = deploy(pipeline, bundle, stage.folder, config, _identified(pipeline, stage.run_dir))
+        sessions = found.summary
         print(table(*timing_rows(sessions[-1])))
         for summary in sessions:
             warn(summary)
@@ -158,7 +175,7 @@ def _measured_delay(
         write_probe(folder, pipeline, robot, witness)
 
 
-def _summary(found: Deployment, sessions: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary(found: Deployment, sessions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the few lines that the console shows at the end."""
     scores = {f"success, deployment {i}": e.real.get("success") for i, e in enumerate(found.episodes)}
     success = {name: round(value, 3) for name, value in scores.items() if value is not None}
@@ -197,7 +214,7 @@ def _find_bundle(
 ) -> tuple[Path, Path | None]:
     if config.bundle is not None:
         return Path(config.bundle), run_dir
-    trained = newest(root, pipeline.name, "train", run_dir)
+    trained = warn_of_stale(newest(root, pipeline.name, "train", run_dir))
     require_untouched(trained)
     return trained.output("bundle"), run_dir or trained.run_dir
 

@@ -17,10 +17,11 @@ from sim2real.log.foreign import open_foreign
 from sim2real.log.mapping import ImportMapping, load_mapping
 from sim2real.log.proposal import pipeline_name
 from sim2real.log.reader import read_log
+from sim2real.robots import model_file
 from sim2real.robots.mjcf import joints_of, read_model, read_spec
 from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
-from sim2real.stages import importing
+from sim2real.stages import console, importing
 from sim2real.stages.config import MODEL_IDENTIFY, RobotFlags
 from sim2real.stages.console import note
 from sim2real.stages.pipeline import Pipeline, load_pipeline
@@ -109,10 +110,22 @@ def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
         episode = importer.import_file(first, mapping)
         importing.refuse_contradictions(first, episode, told.as_told)
     description = _description(told, model, episode)
+    note_held(description)
     summary = f"{len(description.joints)} joints of {told.mjcf.name}"
     return DescribedPipeline(
         name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, told=_words(told)
     )
+
+
+def note_held(description: RobotConfig) -> None:
+    """Print which files were left out, where joints that were not recorded are held, and what moves the others."""
+    holding, model = description.held(), read_model(description.model)
+    if left_out := model_file.read(description.model, description.contacts)[1]:
+        console.note(f"left out, as nothing but contacts and pictures needs them: {', '.join(left_out)}")
+    for held in holding.held:
+        console.note(f"not recorded, held: {held}")
+    for number, name in holding.moved.items():
+        console.note(f"not recorded, free: {model.joint(number).name or 'a joint without a name'}, which {name} moves")
 
 
 def _words(told: RobotFlags) -> tuple[str, ...]:
@@ -120,7 +133,7 @@ def _words(told: RobotFlags) -> tuple[str, ...]:
     found: list[str] = []
     for f in fields(told):
         flag, value = f"--{f.name.replace('_', '-')}", getattr(told, f.name)
-        if f.name == "parameter":
+        if f.name in ("parameter", "hold"):
             found += [word for one in value for word in (flag, one)]
         elif value != f.default:
             found += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
@@ -192,6 +205,7 @@ def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
         step_s=told.step_s or min(max(own_s, _STEPS_S[0]), _STEPS_S[1]),
         fix_base=told.fix_base,
         contacts=told.contacts,
+        hold=told.hold,
     )
     if told.velocity and not found.velocity:
         raise UsageError("the log has no velocity", hint="leave --velocity out: it is not needed")

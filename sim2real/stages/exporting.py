@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
-import sim2real
 from sim2real.artifacts.files import write_json
 from sim2real.artifacts.identification import PARAMETERS, UNFINISHED, Identification
 from sim2real.artifacts.run_folder import newest, pipeline_of
@@ -17,12 +18,14 @@ from sim2real.identify.export.mjlab import mjlab_source
 from sim2real.identify.export.terms import find_delays, find_terms, values_of
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.base import RecordedRobot
+from sim2real.stages import arguments
+from sim2real.stages.arguments import AnyIdentification, AnyPath, identification_of
 from sim2real.stages.config import ExportConfig
 from sim2real.stages.console import note, wrote
 from sim2real.stages.described import pipeline_beside
 from sim2real.stages.left_out import having
-from sim2real.stages.pipeline import available
-from sim2real.stages.targets import find_run
+from sim2real.stages.pipeline import Pipeline, available
+from sim2real.stages.targets import find_run, warn_of_stale
 
 _FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json"}
 _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
@@ -43,27 +46,59 @@ def run(config: ExportConfig) -> Path:
     """
     file = find_parameters(config)
     found = Identification.load(file)
+    out = config.out or Path(f"{found.pipeline}_{_FILES[config.to]}")
+    _export(found, pipeline_beside(file, found), config.to, out, str(file))
+    wrote(out)
+    return out
+
+
+def export(
+    robot: RecordedRobot | Pipeline | str,
+    identification: AnyIdentification,
+    out: AnyPath,
+    to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf",
+) -> Path:
+    """Write what was identified in the terms of another simulator.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        identification: What was identified, or its folder.
+        out: The file to write.
+        to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
+
+    Returns:
+        The file.
+
+    Raises:
+        UsageError: When it was interrupted, is of another robot, or the target cannot hold the robot's model.
+    """
+    pipeline, found, out = arguments.pipeline_of(robot), identification_of(identification), Path(out)
+    if to not in _FILES:
+        raise UsageError(f"cannot export to {to!r}. Available: {', '.join(_FILES)}")
+    if found.pipeline != pipeline.name:
+        raise UsageError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}")
+    _export(found, pipeline, to, out, "memory" if isinstance(identification, Identification) else str(identification))
+    return out
+
+
+def _export(found: Identification, pipeline: Pipeline, to: str, out: Path, where: str) -> None:
     if found.posterior is None:
         ended = UNFINISHED.get(found.verdict.status, "has no intervals")
         raise UsageError(
-            f"the identification in {file} {ended}: its estimates may be far off",
+            f"the identification in {where} {ended}: its estimates may be far off",
             hint=found.verdict.next or f"sim2real identify {found.pipeline}",
         )
-    pipeline = pipeline_beside(file, found)
     robot = having(pipeline.load(), [p.name for p in found.parameters])
     table = robot.identifiable(pipeline.identify.max_delay_s).parameters
-    out = config.out or Path(f"{found.pipeline}_{_FILES[config.to]}")
     about = [
         ("pipeline", found.pipeline),
         ("verdict", found.verdict.status),
         *(("log", f"{log.path} {log.sha256}") for log in found.logs[:1]),
-        ("sim2real", sim2real.__version__),
+        ("sim2real", metadata.version("sim2real")),
     ]
     if found.verdict.status != "accepted":
         note(f"verdict: {found.verdict.status}; the file says so too")
-    write(config.to, out, found, robot, table, about)
-    wrote(out)
-    return out
+    write(to, out, found, robot, table, about)
 
 
 def write(
@@ -103,7 +138,7 @@ def write(
         content = source(
             terms, f"Actuators and randomisation of {found.pipeline!r}, as sim2real identified them.", about
         )
-    out.write_text(content)
+    out.write_text(content, encoding="utf-8")
 
 
 def find_parameters(config: ExportConfig) -> Path:
@@ -124,9 +159,9 @@ def find_parameters(config: ExportConfig) -> Path:
     if (path / PARAMETERS).is_file():
         return path / PARAMETERS
     if source in available():
-        return newest(config.runs, source, "identify").output("parameters")
+        return warn_of_stale(newest(config.runs, source, "identify")).output("parameters")
     run_dir = find_run(config.runs, source)
-    return newest(config.runs, pipeline_of(run_dir), "identify", run_dir).output("parameters")
+    return warn_of_stale(newest(config.runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")
 
 
 def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:

@@ -46,7 +46,7 @@ class DemoFlags:
     runs: Folder = Path("runs")
     """Folder of all runs."""
     resume: OptionalFolder = None
-    """Run folder to go on with: stages that are finished there are skipped."""
+    """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
     cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
     """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
 
@@ -56,7 +56,7 @@ class RunFlags(DemoFlags):
     """Flags of all four stages."""
 
     iterations: int = 1
-    """How often to go around at most: the verdict on a deployment says what is done again, from its own log."""
+    """How often a run goes around at most, in all: the verdict on a deployment says what is done again."""
     until: Annotated[str | None, tyro.conf.arg(metavar="QUANTITY=VALUE")] = None
     """Go around until a quantity of the gap report is at least so large on the robot, such as success=0.95; default:
     until the verdict is 'fine'."""

@@ -32,6 +32,7 @@ from sim2real.identify.prediction import position_of
 from sim2real.identify.problem import Problem
 from sim2real.identify.round_trip import RoundTrip, round_trip
 from sim2real.identify.verdict import Position, Score, judge, scores
+from sim2real.log.schema import unit_of
 from sim2real.stages import left_out
 from sim2real.stages.console import note, table
 
@@ -170,7 +171,8 @@ def judged(
 def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
     """Return the measured positions, which the verdict judges one by one."""
     return [
-        Position(position_of(c), c.name, units.get(c.position, ""), c.position_sigma) for c in problem.model.channels
+        Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma)
+        for c in problem.model.channels
     ]
 
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import PARAMETERS, FreeRun, Identification, Quantity
+from sim2real.artifacts.identification import PARAMETERS, FreeRun, Identification
 from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.quantity import Quantity
 from sim2real.artifacts.run_folder import Source, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
@@ -33,12 +33,13 @@ from sim2real.identify.verdict import NO_DELAY
 from sim2real.robots.base import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages import advice, identified, left_out
+from sim2real.stages.arguments import AnyRecording, config_of, recordings_of, robot_first
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress
 from sim2real.stages.cutting import reach, spans, split_of
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
-from sim2real.stages.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording, require_units
 from sim2real.stages.truth import true_values
 
@@ -49,19 +50,20 @@ _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 
 
 def identify(
-    recording: Recording | Sequence[Recording],
-    robot: RecordedRobot | Pipeline,
-    config: IdentifyConfig | None = None,
-    hold_out: Sequence[Recording] = (),
+    robot: RecordedRobot | Pipeline | str,
+    recording: AnyRecording | Sequence[AnyRecording],
+    config: IdentifyConfig | Mapping[str, Any] | None = None,
+    hold_out: AnyRecording | Sequence[AnyRecording] = (),
     best: Best | None = None,
     begin: Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a robot's parameters.
 
     Args:
-        recording: What is fitted: one recording, or several.
-        robot: The robot, or its pipeline.
-        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
+        robot: The robot, its pipeline, or the pipeline's name.
+        recording: What is fitted: one recording, or several; or the paths of their logs.
+        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it. The
+            files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
         begin: Values at which the search begins; default: the pipeline's.
@@ -73,10 +75,10 @@ def identify(
         UsageError: When the recordings are too short, or the model does not fit them.
         Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
     """
-    pipeline = pipeline_of(robot)
-    config = config or pipeline.identify
-    fitted = [recording] if isinstance(recording, Recording) else list(recording)
-    logs = [*fitted, *hold_out]
+    pipeline, recording = robot_first(robot, recording)
+    config = config_of(config, pipeline.identify)
+    fitted = recordings_of(recording, pipeline)
+    logs = [*fitted, *(recordings_of(hold_out, pipeline, "hold_out") if hold_out else ())]
     episodes = [log.episode for log in logs]
     robot = left_out.offering(in_world(pipeline.load(), config.world), config.terms)
     for log in logs:
@@ -90,16 +92,20 @@ def identify(
     started = time.monotonic()
     every, found, choice = _with_terms(model, episodes, windows, config, table, names, best)
     best.fitted(found.z, found.loss)
-    with progress(None, "identify: errors, predictions and baselines"):
+    with progress(None, "identify: left-out parts") as bar:
         judged = config.folds and found.converged  # errors of other fits promise nothing of this one
         without = patiently(lambda: left_out.examined(every, config, names)) if judged else ()
+        bar.set_description_str("identify: intervals")
         findings = patiently(lambda: identified.Findings.of(found, without))
         found = findings.fit
         terms = found.problem.table.terms if every.problem.table.terms else None
         truth = true_values(logs[0], robot.roles) if config.reveal else {}
+        bar.set_description_str("identify: posterior")
         posterior = patiently(lambda: ensemble.posterior(found, findings.at, findings.spread, every, choice))
         document = identified.document(pipeline.name, findings, posterior, truth, time.monotonic() - started)
+        bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, model, episodes, len(fitted), config, found))
+        bar.set_description_str("identify: each recording, distribution of delays")
         each = patiently(lambda: _each(found)) if config.each and len(fitted) > 1 else ()
         own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
         document = replace(document, left_out=without, terms=terms, links=own)
@@ -172,7 +178,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         open_stage(root, pipeline.name, "identify", config, inputs, run_dir) as stage,
         left_behind(stage, pipeline.name, paths, lambda file: advice.onward(pipeline, config, root, file)) as best,
     ):
-        found = identify(logs[:fitted], pipeline, config, logs[fitted:], best, begin)
+        found = identify(pipeline, logs[:fitted], config, logs[fitted:], best, begin)
         again = advice.again(pipeline, config, root, found.verdict.next)
         if found.verdict.status == "not converged":
             again = advice.onward(pipeline, config, root, stage.folder / PARAMETERS)
@@ -182,9 +188,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         for name, path in found.save(stage.folder).items():
             stage.output(name, path)
         for name, text in pipeline.texts().items():
-            stage.output(Path(name).stem + "_" + Path(name).suffix[1:], name).write_text(text)
+            stage.output(Path(name).stem + "_" + Path(name).suffix[1:], name).write_text(text, encoding="utf-8")
         if (mjcf := robot.identified_mjcf(found.values)) is not None:
-            stage.output("mjcf", "identified.xml").write_text(mjcf)
+            stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
         from sim2real.view.page import identify_page  # matplotlib and jinja2 take 0.5 s to import
 
         stage.output("page", identify_page(stage.folder).name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,26 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log import evidence, importer
 from sim2real.log.foreign import ForeignFile, joined, open_foreign
-from sim2real.log.mapping import ImportMapping, load_mapping, to_toml
+from sim2real.log.mapping import FieldMapping, ImportMapping, load_mapping, to_toml
 from sim2real.log.names import meaning
 from sim2real.log.proposal import pipeline_name, propose
 from sim2real.log.quantities import Asked
-from sim2real.robots.mjcf import joints_of, read_model
+from sim2real.robots.mjcf import joints_of, read_model, slides_of, unit_for
 from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.roles import ROLES
 from sim2real.stages import console, pipeline
 from sim2real.stages.config import ImportConfig
+
+
+@dataclass(frozen=True)
+class AskedOfModel(Asked):
+    """What a robot's model says of files without a mapping.
+
+    Attributes:
+        slides: Those of the joints that are slides.
+    """
+
+    slides: tuple[str, ...] = ()
 
 
 def run(config: ImportConfig) -> None:
@@ -50,14 +61,14 @@ def run(config: ImportConfig) -> None:
             with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
                 importer.write_log(log := stage.output("log", "session.mcap"), episode, mapping)
                 if text:
-                    (written := stage.output("mapping", "import.toml")).write_text(text)
+                    (written := stage.output("mapping", "import.toml")).write_text(text, encoding="utf-8")
                 for name, path in Timing.of(episode).save(stage.folder).items():
                     stage.output(name, path)
                 stage.summary(facts)
         else:
             importer.write_log(log, episode, mapping)
             if text:
-                (written := log.with_suffix(".import.toml")).write_text(text)
+                (written := log.with_suffix(".import.toml")).write_text(text, encoding="utf-8")
         print(console.pairs(facts))
         console.wrote(log)
         if written is not None:
@@ -110,7 +121,7 @@ def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz:
     if unknown := [j for j in joints if j not in own]:
         raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
     ranges = np.array([model.joint(j).range for j in joints or own])
-    return Asked(name, rate_hz, joints or own, ranges)
+    return AskedOfModel(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
 
 
 def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
@@ -127,12 +138,43 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
             console.note(line)
         raise
     console.note(f"proposed from {file.path.name}, as nobody said what is what:")
-    for line in found.evidence:
+    lines, mapping = list(found.evidence), found.mapping
+    if isinstance(told, AskedOfModel) and told.slides:
+        mapping, line = in_lengths(mapping, told, file.path)
+        lines = [e for e in lines if "is in radians" not in e or len(told.slides) < len(told.joints)] + [line]
+    for line in lines:
         console.note(f"  {line}")
     names = f"Joints: {', '.join(found.joints)}"
-    return found.mapping, to_toml(
-        found.mapping, [f"Proposed by `sim2real import {file.path.name}`:", *found.evidence, names]
-    )
+    return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
+
+
+def in_lengths(mapping: ImportMapping, told: AskedOfModel, path: Path) -> tuple[ImportMapping, str]:
+    """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
+
+    Args:
+        mapping: As it was proposed.
+        told: What the model says.
+        path: The file.
+
+    Raises:
+        UsageError: The positions were taken for degrees.
+    """
+    mixed, names = len(told.slides) < len(told.joints), ", ".join(told.slides)
+
+    def field(how: FieldMapping) -> FieldMapping:
+        if unit_for(how.unit, True) == how.unit:
+            return how
+        if how.unit.startswith("rad") and not np.allclose(np.abs(how.scale), 1.0):
+            raise UsageError(
+                f"{path}: {', '.join(how.source)} was taken for degrees, but {names} slides: its positions are lengths",
+                hint="write a mapping with the scales to m and to rad: 0.001 for mm, 0.0174533 for degrees",
+            )
+        return replace(how, unit="" if mixed else unit_for(how.unit, True))
+
+    nodes = {
+        n: replace(node, fields={f: field(h) for f, h in node.fields.items()}) for n, node in mapping.nodes.items()
+    }
+    return replace(mapping, nodes=nodes), f"{names} slides, by the model: in m, m/s and N"
 
 
 def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from sim2real.artifacts.manifest import plain, versions
 from sim2real.artifacts.run_folder import STAGES, attempts, run_folders
+from sim2real.artifacts.standing import standing
 from sim2real.hardware import entries
 from sim2real.runtime import compilation_cache
 from sim2real.stages.console import pairs, shown, table
@@ -62,21 +63,22 @@ def pipeline(name: str, root: Path) -> str:
 def run(run_dir: Path) -> str:
     """Return the stages of a run, their inputs and outputs."""
     rows, files = [], []
+    stale = {s.newest.folder.name: s.stale for s in standing(run_dir).values() if s.stale}
     for stage in STAGES:
         for attempt in attempts(run_dir, stage):
-            manifest = attempt.manifest
+            manifest, name = attempt.manifest, attempt.folder.name
+            status = "out of date" if name in stale else manifest["status"]
             started, sha = manifest["started"][:19], (manifest.get("git") or {}).get("sha") or "-"
             duration = manifest.get("duration_s")
-            rows.append(
-                [attempt.folder.name, manifest["status"], manifest.get("exit_code"), started, duration, sha[:10]]
-            )
+            rows.append([name, status, manifest.get("exit_code"), started, duration, sha[:10]])
             for kind in ("inputs", "outputs"):
                 entries = manifest[kind].items()
-                files += [[attempt.folder.name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]
+                files += [[name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]
     return "\n\n".join(
         [
             f"run  {shown(run_dir)}",
             table(rows, ["stage", "status", "exit", "started (UTC)", "duration [s]", "git"]),
+            *(["\n".join(f"out of date: {why}" for why in stale.values())] if stale else []),
             table(files, ["stage", "", "name", "path", "sha256"]),
         ]
     )

@@ -81,7 +81,7 @@ class SignalHandling:
         threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
 
 
-def patiently(work: Callable[[], Result]) -> Result:
+def patiently(work: Callable[[], Result], look: Callable[[], None] | None = None) -> Result:
     """Run a long computation in another thread, so that a signal is handled at once.
 
     Python handles signals between bytecode instructions of the main thread, and a single call into XLA may compile for
@@ -90,6 +90,7 @@ def patiently(work: Callable[[], Result]) -> Result:
 
     Args:
         work: The computation; an exception in it is raised here.
+        look: Called every 0.25 s while it runs; an exception in it ends the wait.
 
     Returns:
         What ``work`` returned.
@@ -108,7 +109,8 @@ def patiently(work: Callable[[], Result]) -> Result:
 
     threading.Thread(target=run, name="sim2real:work", daemon=True).start()
     while not done.wait(_LOOK_S):  # polls: a signal that another thread receives does not wake this one
-        pass
+        if look is not None:
+            look()
     if failure:
         raise failure[0]
     return outcome[0]

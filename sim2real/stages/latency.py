@@ -38,9 +38,10 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
         stage.output("log", LOG)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        recording, summary = record(pipeline, stage.folder, config)
+        recording = record(pipeline, stage.folder, config)
+        summary = recording.summary
         warn(summary)
-        found = None if config.dry_run else identify(recording, pipeline, config.identify)
+        found = None if config.dry_run else identify(pipeline, recording, config.identify)
         if config.dry_run:
             show_withheld([summary])
         chain = chain_of(robot)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sim2real.errors import UsageError
 from sim2real.log.mapping import to_toml
-from sim2real.robots.mjcf import driven, joints_of, read_model
+from sim2real.robots.mjcf import joints_of, read_model
 from sim2real.robots.mjcf_parameters import ParameterPattern, expand
 from sim2real.robots.mjcf_robot import RobotConfig, usual_terms
 from sim2real.stages import described
@@ -67,10 +67,9 @@ def run(config: NewConfig) -> None:
         raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
     description, mapping = _described(config)
     # What cannot run is refused before anything is written.
-    model = driven(
-        description.model, description.joints, description.step_s, description.fix_base, description.contacts
-    )
-    expand(description.terms, description.joints, model, read_model(description.model))
+    expand(description.terms, description.joints, description.driven(), read_model(description.model))
+    if config.log is None:
+        described.note_held(description)
     default = described.MODEL_IDENTIFY
     summary = f"recorded robot of {len(description.joints)} joints, identified from its model"
     texts = {
@@ -108,5 +107,6 @@ def _described(config: NewConfig) -> tuple[RobotConfig, str]:
         step_s=flags.step_s or RobotConfig.step_s,
         fix_base=flags.fix_base,
         contacts=flags.contacts,
+        hold=flags.hold,
         terms=terms,
     ), ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import reprlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 ENTRY_POINT_GROUP = "sim2real.pipelines"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pipeline:
     """One robot, from its bus to its task.
 
@@ -53,6 +54,9 @@ class Pipeline:
     train: TrainConfig = TrainConfig()
     deploy: DeployConfig = DeployConfig()
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__.lstrip('_')}({self.name!r})"
+
     @property
     def folder(self) -> Path:
         """The folder of the pipeline's files."""
@@ -72,6 +76,11 @@ class Pipeline:
     def words(self) -> tuple[str, ...]:
         """How a command names the robot."""
         return (self.name,)
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether a command finds it by its words."""
+        return True
 
     def mapping_of(self, path: Path) -> ImportMapping | None:
         """Return the mapping with which a file of another recorder is read; None: it is a log, or there is none."""
@@ -112,30 +121,37 @@ _LOADED: WeakKeyDictionary[RecordedRobot, Pipeline] = WeakKeyDictionary()
 """Robot -> the pipeline that has loaded it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _OfRobot(Pipeline):
     """A robot that no pipeline has loaded, such as one made in a notebook, with the stages' own defaults."""
 
     made: Any = None
 
+    @property
+    def has_commands(self) -> bool:
+        """Whether a command finds it by its words: it does not."""
+        return False
+
     def load(self, module: str | None = None) -> Any:
         return super().load(module) if module else self.made
 
 
-def pipeline_of(robot: RecordedRobot | Pipeline) -> Pipeline:
-    """Return the pipeline that has loaded a robot; one with its class's name and the stages' defaults if none has.
+def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
+    """Return the pipeline of a name, or that has loaded a robot; else one with its class's name and stages' defaults.
 
     Raises:
         UsageError: It is neither a robot nor a pipeline, or not a complete robot.
     """
     if isinstance(robot, Pipeline):
         return robot
+    if isinstance(robot, str):
+        return load_pipeline(robot)
     from sim2real.robots.base import RecordedRobot, checked  # imports JAX
 
     if not isinstance(robot, RecordedRobot):
         raise UsageError(
-            f"{robot!r} is neither a robot nor a pipeline",
-            hint="sim2real.load_pipeline(NAME) is a pipeline, and its load() a robot",
+            f"{reprlib.repr(robot)} is neither a robot nor a pipeline",
+            hint="sim2real.load_pipeline(NAME), or NAME alone, is a pipeline, and its load() a robot",
         )
     kind = type(robot)
     return _LOADED.get(robot) or _OfRobot(kind.__name__, "", kind.__module__, made=checked(robot, kind.__module__))

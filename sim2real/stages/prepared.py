@@ -27,6 +27,7 @@ from sim2real.stages.disturbed import with_disturbances
 from sim2real.stages.parameters import check_parameters
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.robot import moving_robot
+from sim2real.stages.targets import warn_of_stale
 from sim2real.stages.train_config import TrainConfig
 from sim2real.train.draws import draw_robots
 from sim2real.train.env import GraphEnvironment, TrainingTask
@@ -279,7 +280,7 @@ def find_parameters(
         return None, run_dir
     if config.parameters is not None:
         return Path(config.parameters), run_dir
-    found = newest(root, pipeline.name, "identify", run_dir)
+    found = warn_of_stale(newest(root, pipeline.name, "identify", run_dir))
     return found.output("parameters"), run_dir or found.run_dir
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
 from sim2real.robots.base import Robot
+from sim2real.stages.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.console import note, table
 from sim2real.stages.excitation import excitation
@@ -19,23 +21,23 @@ from sim2real.stages.session import check_deadlines, run_episode, timing_rows
 
 
 def record(
-    robot: Robot | Pipeline, folder: Path, config: RecordConfig | None = None
-) -> tuple[Recording, dict[str, Any]]:
+    robot: Robot | Pipeline | str, folder: AnyPath, config: RecordConfig | Mapping[str, Any] | None = None
+) -> Recording:
     """Play the excitation on the robot and record it.
 
     Args:
-        robot: The robot, or its pipeline.
-        folder: Takes the log.
-        config: How; default: that of the pipeline that loaded the robot.
+        robot: The robot, its pipeline, or the pipeline's name.
+        folder: Takes the log; a log is never overwritten.
+        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it.
 
     Returns:
-        The recording, and the summary of its session.
+        The recording; its ``summary`` is that of the session.
 
     Raises:
         Sim2RealError: What stopped the robot; the log holds everything up to then.
     """
-    pipeline = pipeline_of(robot)
-    config = config or pipeline.record
+    pipeline, folder = pipeline_of(robot), folder_of(folder)
+    config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
     signal = excitation(config, robot.rate_hz, len(robot.action))
     seconds = config.duration_s if config.excitation != "designed" else len(signal) / robot.rate_hz
@@ -43,8 +45,8 @@ def record(
     log, truth = folder / LOG, folder / TRUTH
     with opened(robot, config, truth) as session:
         nodes = robot.recording_nodes(session, signal)
-        summary = run_episode(pipeline, robot, session, nodes, {}, log, seconds, config, "record")
-    return Recording.load(log, truth), summary
+        run_episode(pipeline, robot, session, nodes, {}, log, seconds, config, "record")
+    return Recording.load(log, truth)
 
 
 def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -65,7 +67,8 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         stage.output("log", LOG)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        recording, summary = record(pipeline, stage.folder, config)
+        recording = record(pipeline, stage.folder, config)
+        summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
         print(table(*timing_rows(summary)))

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sim2real.artifacts.manifest import plain, read_manifest, sha256
+from sim2real.artifacts.manifest import RUNNING, plain, read_manifest, sha256
 from sim2real.artifacts.run_folder import StageFolder, attempts, run_folders
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.config import TrainConfig
@@ -90,6 +90,13 @@ def _named(pipeline: str, target: str, root: Path) -> StageFolder | None:
         runs = run_folders(root, pipeline) if target == NEWEST else [find_run(root, target, pipeline)]
         own = [attempt for run in runs for attempt in attempts(run, "train")]
     unfinished = [attempt for attempt in own if not attempt.finished]
+    busy = [a.folder for a in unfinished if a.manifest["status"] == RUNNING]
+    if busy and len(busy) == len(unfinished):
+        raise UsageError(
+            f"the training in {busy[0]} is still running: two processes would write the same policy",
+            hint="wait until it has ended, or end it by Ctrl-C, and resume it then",
+        )
+    unfinished = [attempt for attempt in unfinished if attempt.folder not in busy]
     return max(unfinished, key=lambda a: str(a.manifest.get("started", "")), default=None)
 
 

@@ -21,7 +21,7 @@ from sim2real.log.writer import McapRecorder
 from sim2real.robots.base import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
-from sim2real.stages.console import progress
+from sim2real.stages.console import note, progress
 from sim2real.stages.interruption import interruptible
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.resting import come_to_rest
@@ -106,7 +106,7 @@ def run_episode(
     graph.recorder = watch
     try:
         try:
-            _drive(graph, state, duration_s, label)
+            _drive(graph, state, duration_s, label, recorder)
         except (KeyboardInterrupt, SystemExit):
             with interruptible():  # a second signal stops at once
                 come_to_rest(graph, session.rig, hold)
@@ -119,7 +119,7 @@ def run_episode(
         _end(error, graph, recorder, lambda: _summary(robot, graph, session, watch))
         raise
     summary = _summary(robot, graph, session, watch)
-    recorder.close("finished", OK, summary)
+    recorder.close("finished", OK, summary, note)
     return summary
 
 
@@ -131,7 +131,7 @@ def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summar
     with noted(error):
         recorder.write_event("stop", status)
     with noted(error):
-        recorder.close(status, _exit_code(error), summary())
+        recorder.close(status, _exit_code(error), summary(), note)
 
 
 def check_deadlines(summary: Mapping[str, Any]) -> None:
@@ -165,15 +165,18 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
     return [*rows, *answer_rows(summary)], [*headers, "overruns"]
 
 
-def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str) -> None:
+def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder) -> None:
+    """Run the graph; print a warning where the log's writer falls behind, and again when it is twice as far behind."""
     graph.start(state)
-    with progress(None, label) as bar:
-        bar.total = round(duration_s, 1)
-        begin = time.monotonic()
+    with progress(round(duration_s, 1), label) as bar:
+        begin, warn_s = time.monotonic(), 0.0
         while (left := duration_s - (time.monotonic() - begin)) > 0:
             graph.run_for(min(_POLL_S, left))
             bar.n = round(min(duration_s, time.monotonic() - begin), 1)
             bar.refresh()
+            if (left := recorder.backlog()).late and left.behind_s > warn_s:
+                note(f"warning: {left}")
+                warn_s = 2.0 * left.behind_s
 
 
 def _recorder(

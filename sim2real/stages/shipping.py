@@ -14,7 +14,7 @@ from sim2real.policy.network import NetworkSpec
 from sim2real.stages.config import ShipConfig
 from sim2real.stages.console import note, wrote
 from sim2real.stages.pipeline import available
-from sim2real.stages.targets import find_run
+from sim2real.stages.targets import find_run, warn_of_stale
 
 EXAMPLE = "run_policy.py"
 
@@ -66,6 +66,6 @@ def find_bundle(config: ShipConfig) -> Path:
         if (folder / CONTRACT).is_file():
             return folder
     if source in available():
-        return newest(config.runs, source, "train").output("bundle")
+        return warn_of_stale(newest(config.runs, source, "train")).output("bundle")
     run_dir = find_run(config.runs, source)
-    return newest(config.runs, pipeline_of(run_dir), "train", run_dir).output("bundle")
+    return warn_of_stale(newest(config.runs, pipeline_of(run_dir), "train", run_dir)).output("bundle")

@@ -6,8 +6,10 @@ import difflib
 from pathlib import Path
 
 from sim2real.artifacts.manifest import read_manifest
-from sim2real.artifacts.run_folder import STAGES, attempts, finished, run_folders
+from sim2real.artifacts.run_folder import STAGES, StageFolder, attempts, finished, run_folders
+from sim2real.artifacts.standing import standing, why_stale
 from sim2real.errors import UsageError
+from sim2real.stages.console import note
 from sim2real.stages.pipeline import available
 
 
@@ -37,6 +39,13 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     if pipeline is None and (known := run_folders(root, str(target))):
         return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
     raise _nothing_there(root, str(target))
+
+
+def warn_of_stale(found: StageFolder) -> StageFolder:
+    """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
+    if why := why_stale(found, standing(found.run_dir)):
+        note(f"warning: {why}; `sim2real run {found.manifest['pipeline']} --resume {found.run_dir}` makes it again")
+    return found
 
 
 def _nothing_there(root: Path, target: str) -> UsageError:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -15,13 +15,23 @@ from sim2real.artifacts.bundle import Bundle, History
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import OpenStage, StageFolder, open_stage
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.policy.bundle import make_runner
 from sim2real.robots.base import Robot
 from sim2real.robots.loop_robot import LoopRobot
+from sim2real.stages import arguments
+from sim2real.stages.arguments import (
+    AnyBundle,
+    AnyIdentification,
+    AnyPath,
+    AnyRecording,
+    bundle_of,
+    config_of,
+    identification_of,
+    recording_of,
+)
 from sim2real.stages.config import TrainConfig
 from sim2real.stages.console import note, progress, table
 from sim2real.stages.distilling import as_taught, find_teacher, teacher_of
@@ -40,27 +50,28 @@ from sim2real.train.networks import Policy
 from sim2real.train.onnx_export import export_graph
 from sim2real.train.ppo import Progress, TrainResult
 from sim2real.train.ppo import train as learn
-from sim2real.train.processes import in_words, join, leads, wait_for_all
+from sim2real.train.processes import in_words, join, leads, require_neighbours, wait_for_all
 from sim2real.train.sweep import Sweep, named
 
 
 def train(
-    robot: Robot | Pipeline,
-    config: TrainConfig | None = None,
-    identification: Identification | None = None,
-    timing: Timing | None = None,
-    checkpoint: Path | None = None,
-    resume: Path | None = None,
+    robot: Robot | Pipeline | str,
+    identification: AnyIdentification | None = None,
+    config: TrainConfig | Mapping[str, Any] | None = None,
+    timing: Timing | AnyPath | None = None,
+    checkpoint: AnyPath | None = None,
+    resume: AnyPath | None = None,
     watch: Callable[[Progress], None] | None = None,
-    teacher: Bundle | None = None,
-    log: Recording | None = None,
-) -> tuple[Bundle, dict[str, Any]]:
+    teacher: AnyBundle | None = None,
+    log: AnyRecording | None = None,
+) -> Bundle:
     """Train a policy.
 
     Args:
-        robot: The robot, or its pipeline.
-        config: How; default: that of the pipeline that loaded the robot. The files that it may name are not read.
-        identification: What identify found; the nominal model needs none.
+        robot: The robot, its pipeline, or the pipeline's name.
+        identification: What identify found, or its folder; the nominal model needs none.
+        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it. The
+            files that it may name are not read.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
             nominal model has no delays.
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
@@ -70,16 +81,24 @@ def train(
         log: A recording: on what a policy would have seen there, what will run is compared with what was trained.
 
     Returns:
-        The policy with what it expects and promises, and numbers about the training.
+        The policy with what it expects and promises; its ``summary`` has numbers about the training.
 
     Raises:
         UsageError: When the identified model is asked for without an identification, or in another world.
         Sim2RealError: When the identification is of another robot or was not accepted, or its timing cannot be trained
             with.
     """
+    if isinstance(identification, TrainConfig):  # the order of earlier versions
+        identification, config = cast(Any, config), identification
     pipeline = pipeline_of(robot)
-    config = config or pipeline.train
-    made = prepare(pipeline, config, identification, timing)
+    config = config_of(config, pipeline.train)
+    identification = None if identification is None else identification_of(identification)
+    timing = None if timing is None else arguments.timing_of(timing)
+    teacher = None if teacher is None else bundle_of(teacher, "teacher")
+    log = None if log is None else recording_of(log, pipeline, "log")
+    checkpoint, resume = (None if path is None else Path(path) for path in (checkpoint, resume))
+    with progress(None, "train: draw episodes", leads()):
+        made = prepare(pipeline, config, identification, timing)
     ppo = replace(config.ppo, eval_steps=made.env.length + 1)
     own = contract_of(made.robot, made.env.task, made.values, made.episodes)
     master = None if teacher is None else teacher_of(teacher, own)
@@ -88,20 +107,22 @@ def train(
         result = patiently(
             lambda: learn(
                 made.env, ppo, key, lambda p: _report(bar, p, watch), checkpoint, resume, sweep, teacher=master
-            )
+            ),
+            require_neighbours,
         )
     weak = None
     if config.sensitivity and leads():
-        weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
+        with progress(None, "train: what breaks the policy"):
+            weak = _sensitivity(pipeline, config, identification, timing, made.robot, result.best)
     policy, weights = result.best, result.best.to_weights()
     contract, graph = as_taught(own, policy), export_graph(policy)
     seen = {} if policy.spec.privileged else {"training": result.observations[:MOST]}
     if seen and log is not None and isinstance(made.robot, LoopRobot):
         seen["log"] = observations_of(made.robot, log, make_runner(weights, contract, None, policy.spec, graph))
     references = {name: reference_of(policy, observations) for name, observations in seen.items()}
-    bundle = Bundle(contract, weights, _history(result), made.episodes, None, weak, policy.spec, graph, references)
     about = {"model": config.model} | _told(result, ppo, sweep, made.episodes)
-    return bundle, about if weak is None else {**about, "what breaks it": weak.said}
+    about |= {} if weak is None else {"what breaks it": weak.said}
+    return Bundle(contract, weights, _history(result), made.episodes, None, weak, policy.spec, graph, references, about)
 
 
 def _told(result: TrainResult, ppo: PPOConfig, sweep: Sweep, episodes: Episodes) -> dict[str, Any]:
@@ -175,12 +196,12 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     with in_words():
         wait_for_all("all have read what they need")  # what the first one writes now is not taken for that
     if not leads():
-        train(pipeline, config, identification, checkpoint=Path(CHECKPOINT), resume=resume)
+        train(pipeline, identification, config, checkpoint=Path(CHECKPOINT), resume=resume)
         return None
     with open_stage(root, pipeline.name, "train", config, inputs, run_dir) as stage:
         with resumable(stage.folder) as checkpoint, _watching(stage, config) as watch:
             kept, log = checkpoint if config.checkpoint else None, logged(identification, stage.run_dir)
-            bundle, about = train(pipeline, config, identification, None, kept, resume, watch, teacher, log)
+            bundle = train(pipeline, identification, config, None, kept, resume, watch, teacher, log)
         hashes = {name: sha256(file) for name, file in inputs.items()}
         if identification is not None and identification.logs:
             hashes["log"] = identification.logs[0].sha256
@@ -193,7 +214,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
                 print(table(*terms))
             if bundle.history.settings:
                 print(table(*_tried(bundle.history)))
-        stage.summary(about)
+        stage.summary(bundle.summary)
     return stage.result
 
 

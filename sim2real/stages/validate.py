@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import plain
+from sim2real.artifacts.summary import Rows, Shown
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify import prediction
@@ -21,7 +22,9 @@ from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span, check_log
 from sim2real.identify.verdict import Score, scores
 from sim2real.log.mapping import load_mapping
-from sim2real.stages import described, identified, left_out
+from sim2real.robots.base import RecordedRobot
+from sim2real.stages import arguments, described, identified, left_out
+from sim2real.stages.arguments import AnyIdentification, AnyRecording, config_of, identification_of, recordings_of
 from sim2real.stages.config import IdentifyConfig, ValidateConfig
 from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.cutting import reach
@@ -57,6 +60,64 @@ def run(config: ValidateConfig) -> bool:
     result = {"parameters": shown(config.parameters), "logs": list(config.log), **result}
     print(json.dumps(plain(result), indent=1)) if config.json else show(result)
     return bool(result["better"])
+
+
+@dataclass(frozen=True, repr=False)
+class Validation(Shown):
+    """Errors on logs that nothing was fitted to.
+
+    Attributes:
+        pipeline: The robot.
+        horizon_s: How far ahead is predicted [s].
+        positions: Position -> its errors, the baselines that beat it, what was promised.
+        better: Whether every position is predicted better than by every baseline.
+        promise_kept: Whether the promised errors were kept; None where none was made.
+        rmse: Root mean square error of all positions at the horizon.
+        free_run_rmse: The same in free runs.
+    """
+
+    pipeline: str
+    horizon_s: float
+    positions: dict[str, dict[str, Any]]
+    better: bool
+    promise_kept: bool | None
+    rmse: float
+    free_run_rmse: float
+
+    def about(self) -> dict[str, Any]:
+        """Return what to say about it: name -> value."""
+        kept = {None: "none was made", True: "yes", False: "no"}[self.promise_kept]
+        found = {"pipeline": self.pipeline, "better than baselines": "yes" if self.better else "no"}
+        return found | {"promise kept": kept, f"rmse {self.horizon_s:g} s ahead": self.rmse}
+
+    def rows(self) -> Rows:
+        """Return a row for each position."""
+        own = [
+            [name, row["rmse"]["identified"], row["promised"], row[_FREE], row["unit"]]
+            for name, row in self.positions.items()
+        ]
+        return ("position", "off", "promised", _FREE, "unit"), own
+
+
+def validate(
+    robot: RecordedRobot | Pipeline | str,
+    identification: AnyIdentification,
+    recording: AnyRecording | Sequence[AnyRecording],
+    config: ValidateConfig | Mapping[str, Any] | None = None,
+) -> Validation:
+    """Score what was identified on later recordings.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        identification: What was identified, or its folder.
+        recording: One recording that nothing was fitted to, or several; or the paths of their logs.
+        config: How far ahead. A dict has what is different from the default.
+    """
+    pipeline, found = arguments.pipeline_of(robot), identification_of(identification)
+    if found.pipeline != pipeline.name:
+        raise UsageError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}")
+    logs = recordings_of(recording, pipeline)
+    return Validation(**score(found, pipeline, [log.episode for log in logs], config_of(config, ValidateConfig())))
 
 
 def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pipeline:

@@ -122,9 +122,10 @@ def save_checkpoint(path: Path, identity: TrainingIdentity, training: Checkpoint
     for name in log[0].values:
         arrays[f"history/{name}"] = np.stack([progress.values[name] for progress in log])
     times = {"env_steps": [p.env_steps for p in log], "elapsed_s": [p.elapsed_s for p in log]}
-    about = json.dumps(dataclasses.asdict(identity) | times)
+    about = dataclasses.asdict(identity) | times
+    about["sha256"] = _digest(arrays, about)
     draft = path.with_name(f".{path.name}.tmp")
-    save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, draft, {_ABOUT: about})
+    save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, draft, {_ABOUT: json.dumps(about)})
     os.replace(draft, path)
 
 
@@ -145,7 +146,9 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
         with safe_open(path, "np") as file:
             about = json.loads((file.metadata() or {})[_ABOUT])
             arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        if about.pop("sha256", None) != _digest(arrays, about):
+            raise ValueError("it is not what was saved: its content does not have the hash in it")
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise Sim2RealError(
             f"cannot go on from {path}: {error}", hint="train again, or name another interrupted training"
         ) from error
@@ -160,6 +163,15 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
         for i, (steps, seconds) in enumerate(zip(about["env_steps"], about["elapsed_s"], strict=True))
     ]
     return Checkpoint(of_state, of_policies, of_best, log)
+
+
+def _digest(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> str:
+    """Return the hash of all that a checkpoint holds: a file of tensors has no check of its own."""
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype} {array.shape}\0".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:

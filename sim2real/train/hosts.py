@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from dataclasses import dataclass
 
 from sim2real.errors import UsageError
@@ -50,4 +51,24 @@ class HostsConfig:
         who = "one of the processes that the launcher started"
         if self.process is not None:
             who = f"process {self.process} of {self.processes}, which meet at {self.coordinator}"
-        return f"{who}; when one does not come, or answer, within {self.timeout_s} s, all end"
+        end = f"when one does not come, or answer, within {self.timeout_s} s, all end"
+        where = "the coordinator's interfaces" if self.found else self.coordinator
+        trust = f"whoever reaches {where} can join or end the training: use a network that you trust"
+        return "; ".join([who, end, *([] if self.process else [trust]), *self._about_loopback()])
+
+    def _about_loopback(self) -> list[str]:
+        """Return a warning where process 0 listens on the loopback alone, though its address names a host (Debian)."""
+        host = (self.coordinator or "").rpartition(":")[0].strip("[]")
+        if self.process != 0 or host == "localhost" or _is_loopback(host):
+            return []
+        try:
+            found = sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
+        except OSError:
+            return []  # the others do not find it either: joining says so
+        if not all(map(_is_loopback, found)):
+            return []
+        return [f"warning: {host} is {', '.join(found)} here, which no other host reaches: name a network address"]
+
+
+def _is_loopback(address: str) -> bool:
+    return address.startswith("127.") or address == "::1"

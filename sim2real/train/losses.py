@@ -158,4 +158,4 @@ def _outputs(network: Network, params: Any, carry: Any, x: jax.Array, batch: Bat
 
 def _flat(leaf: jax.Array) -> jax.Array:
     """Return an array with its two leading axes as one."""
-    return leaf.reshape(-1, *leaf.shape[2:])
+    return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])

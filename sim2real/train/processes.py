@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.train.aborts import aborted, catch_aborts
 from sim2real.train.hosts import HostsConfig
 
 _AFTERWARDS_S = 7 * 86400
@@ -44,17 +46,35 @@ def join(hosts: HostsConfig) -> None:
             initialization_timeout=hosts.timeout_s,
             heartbeat_timeout_seconds=hosts.timeout_s,
             shutdown_timeout_seconds=_AFTERWARDS_S,
+            # JAX itself would listen on all interfaces.
+            coordinator_bind_address=os.environ.get("JAX_COORDINATOR_BIND_ADDRESS", hosts.coordinator),
         )
     except (ValueError, RuntimeError) as error:
         if isinstance(error, jax.errors.JaxRuntimeError):
             raise Sim2RealError(
                 f"the processes of this training did not meet within {hosts.timeout_s} s: {_first_line(error)}",
-                hint="start all of them; process 0 must be reachable at that address and port, proxies apart",
+                hint="start all of them; process 0 must be reachable at that address and port, proxies apart; where it "
+                "is not its own address, as behind a NAT, JAX_COORDINATOR_BIND_ADDRESS=HOST:PORT says where it listens",
             ) from error
         raise UsageError(
             f"the processes cannot be joined: {_first_line(error)}",
             hint="start them by srun, mpirun or as a Kubernetes job, or say who they are: --hosts.coordinator ...",
         ) from error
+    catch_aborts(_lost("JAX ended it, and says why above"), _WHY, Sim2RealError.exit_code)
+
+
+def require_neighbours() -> None:
+    """Raise where JAX has ended this process because another one was lost; asked while it waits for a computation.
+
+    Raises:
+        Sim2RealError: In words; the process must end soon.
+    """
+    if words := aborted():
+        raise Sim2RealError(words, hint=_WHY)
+
+
+def _lost(why: str) -> str:
+    return f"process {jax.process_index()} of {jax.process_count()} lost another one of this training: {why}"
 
 
 def leads() -> bool:
@@ -104,10 +124,7 @@ def in_words() -> Iterator[None]:
     except (ValueError, jax.errors.JaxRuntimeError) as error:
         if isinstance(error, Sim2RealError) or jax.process_count() == 1 or not _LOST.search(str(error)):
             raise
-        number, count = jax.process_index(), jax.process_count()
-        raise Sim2RealError(
-            f"process {number} of {count} lost another one of this training: {_first_line(error)}", hint=_WHY
-        ) from error
+        raise Sim2RealError(_lost(_first_line(error)), hint=_WHY) from error
 
 
 def _first_line(error: Exception) -> str:

@@ -13,7 +13,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
 from sim2real.log.schema import unit_of
-from sim2real.view.signals import Series, Signals, signals_of, simulated_series
+from sim2real.view.signals import Series, Signals, signals_of, simulated_beside
 
 IDLE = "idle"
 
@@ -84,7 +84,8 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
         deployed = Deployment.load(artifacts["deploy"].folder)
         for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
             log = signals_of(recording)
-            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, simulated_series(simulated)))
+            beside = simulated_beside(simulated, log, deployed.units)
+            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, beside))
     return [tab for tab in tabs if tab.plots]
 
 

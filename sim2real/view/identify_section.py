@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sim2real.artifacts.identification import Estimate, Identification, Quantity
+from sim2real.artifacts.identification import Estimate, Identification
 from sim2real.artifacts.posterior import from_scale
+from sim2real.artifacts.quantity import Quantity
 from sim2real.artifacts.run_folder import StageFolder
 from sim2real.log.schema import unit_of
 from sim2real.view import identify_figures, intervals, residuals

@@ -9,6 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sim2real.artifacts.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
+from sim2real.artifacts.standing import standing
 from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.iterations import iterations_sections
 from sim2real.view.sections import SECTIONS, headline
@@ -89,7 +90,7 @@ def _write(
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
-    """Return notes about newer attempts that did not finish: the page shows an older one instead, or none."""
+    """Return notes about newer attempts that did not finish, whose place an older one takes, and about stale stages."""
     notes = []
     for stage in STAGES:
         tried = attempts(run_dir, stage)
@@ -101,4 +102,6 @@ def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[Note
             notes.append(
                 NoteBlock(f"The newest attempt at {stage} is {status}{f' ({error})' if error else ''}: {shown}.")
             )
+    stale = {stage: s.stale for stage, s in standing(run_dir).items() if s.stale}
+    notes += [NoteBlock(f"Out of date: {why}. `sim2real run --resume` makes it again.") for why in stale.values()]
     return notes

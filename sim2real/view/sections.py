@@ -35,7 +35,7 @@ from sim2real.view.episodes import episodes_svg
 from sim2real.view.identify_section import identify_section
 from sim2real.view.sensitivity import sensitivity_blocks
 from sim2real.view.servos import DRY, servo_blocks
-from sim2real.view.signals import Signals, signals_of, simulated_series
+from sim2real.view.signals import Signals, signals_of, simulated_beside
 
 
 def record_section(artifact: StageFolder) -> PageSection:
@@ -140,7 +140,8 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     blocks += judging.tables(deployed)
     for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
         caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
-        figure = figures.deployment(log, simulated_series(columns), deployed.units, index, f"deploy-{index}")
+        beside = simulated_beside(columns, log, deployed.units)
+        figure = figures.deployment(log, beside, deployed.units, index, f"deploy-{index}")
         blocks.append(FigureBlock(figure, caption))
     for index, log in enumerate(logs):
         blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import TICKS_PER_S, Episode
+from sim2real.log.schema import unit_of
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,30 @@ def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
             # Commands have a rate of their own: evenly over the same time, if nothing says when they were sent.
             t_s = np.arange(len(values)) * (float(columns["t"][-1]) / len(values))
         found += components(name, "simulation", t_s, values)
+    return found
+
+
+def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Mapping[str, str]) -> list[Series]:
+    """Return the series of a simulated episode, with angles on the turn on which the robot's begin.
+
+    A joint that turns freely may begin whole turns away from where the simulation does, which is the same place.
+
+    Args:
+        columns: See ``simulated_series``.
+        log: The robot's session.
+        units: Field -> unit, beside those of the log.
+    """
+    units = {**log.units, **units}
+    real, last = {s.name: s for s in log.measured}, log.last_command()
+    real |= {f"command[{i}]": s for i, s in enumerate(last)}
+    real |= {"command": last[0]} if len(last) == 1 else {}
+    found = []
+    for series in simulated_series(columns):
+        robot = real.get(series.name)
+        turns = 0.0
+        if robot is not None and unit_of(robot.name, units) == "rad" and len(robot.values) and len(series.values):
+            turns = np.round((robot.values[0] - series.values[0]) / (2 * np.pi))
+        found.append(replace(series, values=series.values + 2 * np.pi * turns) if np.isfinite(turns) else series)
     return found
 
 

@@ -72,14 +72,16 @@ class DriveLaw:
 
     Args:
         qpos_at: Shape ``(joints,)``: where the joints' positions are.
-        qvel_at: Shape ``(joints,)``: where their velocities are; all that the model has.
+        qvel_at: Shape ``(joints,)``: where their velocities are.
+        others: Where the velocities of joints without a drive are; qvel_at and others are all that the model has.
     """
 
     fields: tuple[str, ...] = ("dof_damping", "dof_frictionloss")
     """What it sets of the model, ``(nv,)`` each."""
 
-    def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray) -> None:
-        self._qpos_at, self._qvel_at, self._joints = qpos_at, qvel_at, np.argsort(qvel_at)
+    def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray, others: np.ndarray) -> None:
+        self._qpos_at, self._qvel_at = qpos_at, qvel_at
+        self._order = np.argsort(np.concatenate([qvel_at, others]))
 
     def __call__(
         self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
@@ -88,12 +90,13 @@ class DriveLaw:
 
         Args:
             xp: ``numpy`` or ``jax.numpy``.
-            values: Coefficients and the model's own ``damping``, ``frictionloss`` and ``limit``, ``(..., joints)``.
+            values: Coefficients and the model's own ``damping``, ``frictionloss`` and ``limit``, ``(..., joints)``;
+                ``other_damping`` and ``other_frictionloss`` of the joints without a drive, ``(..., others)``.
             control: Forces, stiffnesses, dampings, 1 with torque on, goals: ``(..., 5 * joints)``.
             qpos: Positions ``(..., nq)`` [rad].
             qvel: Velocities ``(..., nv)`` [rad/s].
         """
-        v, count = values, len(self._joints)
+        v, count = values, len(self._qvel_at)
         force, kp, kd, on, goal = (control[..., i * count : (i + 1) * count] for i in range(5))
         angle, speed = qpos[..., self._qpos_at], qvel[..., self._qvel_at]
         fast = xp.abs(speed)
@@ -109,6 +112,11 @@ class DriveLaw:
         cogging = v["cogging_cos"] * xp.cos(phase) + v["cogging_sin"] * xp.sin(phase)
         # Friction that differs by direction is a mean one and a constant torque: it sticks in the same band.
         applied = -v["bias"] - cogging
-        rows = damping[..., self._joints], friction[..., self._joints]
+        still = 0.0 * applied[..., :1]
+        beside = (v["other_damping"] + still, v["other_frictionloss"] + still, 0.0 * v["other_damping"] + still)
+        rows = [
+            xp.concatenate(pair, axis=-1)[..., self._order]
+            for pair in zip((damping, friction, applied), beside, strict=True)
+        ]
         told = xp.concatenate([force, kp, kd], axis=-1)
-        return told, applied[..., self._joints], dict(zip(self.fields, rows, strict=True))
+        return told, rows[2], dict(zip(self.fields, rows, strict=False))

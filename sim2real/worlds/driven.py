@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.worlds.closing import Closing
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 from sim2real.worlds.mjx import MjxParams, MjxWorld
 from sim2real.worlds.recorded import command_delay
@@ -96,7 +97,9 @@ class DrivenWorld(MjxWorld):
         self.units = units
         self.joints = np.array(model.actuator_trnid[: model.nu // 3, 0])
         self.qpos_at, self.qvel_at = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
-        self.law = DriveLaw(self.qpos_at, self.qvel_at) if terms else None
+        self._others = np.setdiff1d(np.arange(model.nv), self.qvel_at)
+        self.law = DriveLaw(self.qpos_at, self.qvel_at, self._others) if terms else None
+        self._closing = Closing(model, self.qpos_at, self.qvel_at) if len(self._others) else None
         self.lead_s = 0.5 * float(model.opt.timestep)
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DriveParams:
@@ -116,7 +119,25 @@ class DrivenWorld(MjxWorld):
             "limit": jnp.asarray(model.jnt_actfrcrange)[self.joints, 1],
         }
         coefficients = {f.name: getattr(params.terms, f.name) for f in fields(DriveTerms)}
-        return {n: still + v for n, v in (own | coefficients).items()}
+        others = {
+            "other_damping": jnp.asarray(model.dof_damping)[self._others],
+            "other_frictionloss": jnp.asarray(model.dof_frictionloss)[self._others],
+        }
+        return {n: still + v for n, v in (own | coefficients).items()} | others
+
+    def started(self, params: DriveParams, angle: jax.Array, speed: jax.Array) -> DriveParams:
+        """Return parameters with an initial state; joints that were not recorded stand as the model's loops have them.
+
+        Args:
+            params: The parameters.
+            angle: Shape ``(joints,)``: of the recorded joints, from the model's zero [rad or m].
+            speed: Shape ``(joints,)`` [rad/s or m/s].
+        """
+        if self._closing:
+            qpos, qvel = self._closing(angle, speed)
+        else:
+            qpos, qvel = params.qpos.at[self.qpos_at].set(angle), params.qvel.at[self.qvel_at].set(speed)
+        return params.replace(qpos=qpos, qvel=qvel)
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, where the actuator's parameters set one.

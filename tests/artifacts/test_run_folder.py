@@ -4,16 +4,20 @@ import errno
 import json
 import os
 import subprocess
+import sys
+import threading
 from dataclasses import dataclass
+from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts import run_folder
+from sim2real.artifacts import locks, run_folder
 from sim2real.artifacts.manifest import git_state, plain, read_manifest, sha256, write_manifest
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.stages import info
 from sim2real.stages.config import RecordConfig, TrainConfig
 
 
@@ -46,6 +50,73 @@ def test_manifest_is_there_from_the_start_and_complete_at_the_end(tmp_path):
     assert set(done) >= {"started", "git", "command", "versions"}
     assert stage.result.output("bundle") == stage.folder / "bundle"
     assert [p.name for p in stage.folder.iterdir() if p.name.startswith(".")] == []
+
+
+class Clock:
+    """A wall clock that stands still at an hour."""
+
+    def __init__(self, hour):
+        self._hour = hour
+
+    def now(self, zone):
+        return datetime(2026, 1, 1, self._hour, tzinfo=zone)
+
+
+DIES = """
+import os, signal, sys, time
+from pathlib import Path
+from sim2real.artifacts.run_folder import open_stage
+with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
+    if sys.argv[2] == "forked" and os.fork() == 0:
+        os.execvp("sleep", ["sleep", "30"])  # what a stage has started may outlive it
+    print(stage.folder, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("child", ["alone", "forked"])
+def test_every_reader_says_of_a_stage_that_was_killed_that_it_died(tmp_path, child):
+    process = subprocess.Popen([sys.executable, "-c", DIES, str(tmp_path), child], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    folder = Path(process.stdout.readline().strip())
+
+    def status():
+        (attempt,) = run_folder.attempts(folder.parent, "train")
+        return attempt.manifest["status"], *(word for word in ("running", "died") if word in info.run(folder.parent))
+
+    assert status() == ("running", "running")
+    process.kill()
+    process.wait()
+    assert status() == ("died", "died")
+    assert not run_folder.finished(folder.parent, "train")
+    with run_folder.open_stage(tmp_path, "pendulum", "train", None, run_dir=folder.parent) as again:
+        assert [a.manifest["status"] for a in run_folder.attempts(folder.parent, "train")] == ["running", "died"]
+    assert again.result.manifest["status"] == "finished"
+
+
+def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
+    """Its writer replaces the manifest before it releases the lock."""
+    stop, seen = threading.Event(), set[str]()
+
+    def read():
+        while not stop.is_set():
+            for folder in tmp_path.glob("pendulum/*/record"):
+                seen.add((read_manifest(folder) or {"status": "running"})["status"])
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(20):
+        record(tmp_path)
+    stop.set()
+    reader.join()
+    assert seen <= {"running", "finished"}
+
+
+def test_without_locks_a_stage_counts_as_running(tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "fcntl", None)
+    with run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage:
+        (attempt,) = run_folder.attempts(stage.run_dir, "record")
+        assert attempt.manifest["status"] == "running"
 
 
 @pytest.mark.parametrize(
@@ -279,3 +350,34 @@ def test_a_repository_from_elsewhere_runs_no_programs(tmp_path, key):
     assert not (tmp_path / "ran").exists()
     assert state is not None
     assert state["dirty"]
+
+
+def test_a_clock_that_is_set_back_does_not_hide_the_newest_attempt(tmp_path, monkeypatch):
+    first = record(tmp_path, text="1")
+    for hour in (9, 7):  # the second one starts before the first one, says the clock
+        monkeypatch.setattr(run_folder, "datetime", Clock(hour))
+        latest = record(tmp_path, first.run_dir, text=f"at {hour}")
+    for number in range(4, 12):
+        latest = record(tmp_path, first.run_dir, text=f"at 7, {number}")
+    assert [a.folder.name for a in run_folder.attempts(first.run_dir, "record")][:3] == [
+        "record.11", "record.10", "record.9",
+    ]  # fmt: skip
+    found = run_folder.finished(first.run_dir, "record")
+    assert found is not None
+    assert found.folder == latest.folder
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.EPERM])
+def test_a_folder_that_is_read_only_is_named_before_anything_moves(tmp_path, monkeypatch, number):
+    """A process of root writes in spite of permissions, so the error is that of a file system."""
+    first = record(tmp_path)
+
+    def refuse(path, *_, **__):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    for run_dir in (None, first.run_dir):
+        with pytest.raises(
+            Sim2RealError, match=rf"cannot write the run folder .*{os.strerror(number)}[\s\S]*--runs DIR"
+        ):
+            record(tmp_path, run_dir)

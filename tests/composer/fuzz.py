@@ -1,9 +1,10 @@
 """Plays random tasks on dm_control, on C and on MJX in double precision, and says where their streams differ.
 
-``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C;
-with ``--engine mjx`` on C and on MJX, from the same random numbers; with ``--engine bare`` on MJX and with ``mjx.step``
-alone, where hooks only set the controls. ``--contacts same`` has contacts that MJX finds as C does, ``--contacts all``
-any; ``--jobs`` is how many processes there are.
+``python tests/composer/fuzz.py 0 200`` plays the tasks of seeds 0 to 199, two episodes of each, on dm_control and on C,
+with tendons, pairs, equalities, actuators and sensors across models, whose elements change their names afterwards. With
+``--engine mjx`` it plays them on C and on MJX, from the same random numbers; with ``--engine bare`` on MJX and with
+``mjx.step`` alone, where hooks only set the controls. ``--contacts same`` has contacts that MJX finds as C does,
+``--contacts all`` any; ``--jobs`` is how many processes there are.
 """
 
 import argparse
@@ -57,9 +58,9 @@ def _actions(seed, size):
     return np.random.RandomState(seed).uniform(-1, 1, (STEPS, size))
 
 
-def play(kit, seed, contacts=None, varied=False, key=0, episodes=1, numbers=0):
+def play(kit, seed, contacts=None, varied=False, key=0, episodes=1, numbers=0, linked=False):
     """Return the streams of a task on the C engine: observations, rewards, discounts; whether it is unstable."""
-    task, options = make(kit, seed, contacts, varied, numbers)
+    task, options = make(kit, seed, contacts, varied, numbers, linked=linked)
     if kit.name == "dm_control":
         _as_ours(kit, task)
     env = kit.composer.Environment(task, random_state=Numbers(key), **options)
@@ -195,7 +196,7 @@ def compare(seed, contacts=None, engine="dm_control"):
     if engine == "mjx":
         mine = play_on_mjx(seed, contacts, True, (0, 1))
         return max(differ(play(ours, seed, contacts, True, key), m) for key, m in enumerate(mine))
-    return differ(*(play(kit(name), seed, contacts, episodes=2) for name in ("dm_control", "sim2real")))
+    return differ(*(play(kit(name), seed, contacts, episodes=2, linked=True) for name in ("dm_control", "sim2real")))
 
 
 def _compare(given):

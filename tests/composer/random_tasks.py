@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import mujoco
 import numpy as np
+import random_links
 
 JOINTS = {"hinge": [-0.4, 0.4], "slide": [-0.1, 0.1], "ball": [0, 0.8]}
 SHAPES = {"sphere": [0.05], "capsule": [0.03, 0.08], "box": [0.05, 0.06, 0.04]}
@@ -305,7 +306,7 @@ def _entity(kit, model, operator, operations):
     return Robot(model)
 
 
-def _world(kit, draw, contacts, operator):
+def _world(kit, draw, contacts, operator, seed=None):
     arena, models, entities = kit.composer.Arena(), [], []
     option = arena.mjcf_model.option
     option.noslip_iterations, option.tolerance, option.cone = 0, 1e-14, "pyramidal"
@@ -327,14 +328,18 @@ def _world(kit, draw, contacts, operator):
     for geom in [g for m in models for g in m.find_all("geom")]:
         if contacts == "same" and option.cone == "elliptic" and geom.condim == 1:  # which MJX has no contacts for
             geom.condim = 3
+    if seed is not None:
+        random_links.link(kit, seed, arena.mjcf_model, models, contacts, option.integrator != "implicitfast")
     kinds = ("joint", "site", "geom", "actuator", "sensor", "body", "tendon")
     found = {kind: [e for m in models for e in m.find_all(kind)] for kind in kinds}
+    for kind in ("actuator", "sensor", "tendon"):
+        found[kind] += arena.mjcf_model.find_all(kind, exclude_attachments=True)
     found["body"] = [b for b in found["body"] if b.name and not b.name.endswith("/")]
     found["joint"] += [j for j in map(kit.mjcf.get_frame_freejoint, models) if j is not None]
     return arena, entities, {**found, "mocap": mocap}, operations
 
 
-def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True):
+def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True, linked=False):
     """Return the task of a seed and options of its environment.
 
     Args:
@@ -345,9 +350,10 @@ def make(kit, seed, contacts=None, varied=False, numbers=0, busy=True):
             and nothing is varied that is also set otherwise, which MJX starts from another value.
         numbers: Seed of the numbers in the model.
         busy: Whether hooks do more than set the controls.
+        linked: Whether there are elements that name elements of other models.
     """
     draw, operator = Draw(seed, numbers), Operator(kit)
-    arena, entities, found, operations = _world(kit, draw, contacts, operator)
+    arena, entities, found, operations = _world(kit, draw, contacts, operator, seed if linked else None)
     for own in operations[: len(entities)]:
         own.update(_operations(draw, found, 1 if busy else 0))
     observables = {f"o{i}": _observable(kit, draw, found, varied) for i in range(draw.kinds.randint(2, 6))}

@@ -1,7 +1,5 @@
 """The same tasks on MuJoCo Warp: against C and against MJX's JAX, on the CPU; what Warp cannot run."""
 
-from types import SimpleNamespace
-
 import composer_parts
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ from flax import struct
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.mjx import constants, warp
+from sim2real.composer.mjx import constants
 from sim2real.composer.observation.observable import Generic, MJCFFeature
 from sim2real.composer.variation import PhysicsVariator, distributions, noises
 from sim2real.errors import UsageError
@@ -19,6 +17,7 @@ from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compiled import CompiledGraph
 
+pytestmark = pytest.mark.full  # compiles kernels; starting without them is tested in test_warp_start.py
 STEPS, SUBSTEPS = 50, 2
 MISSING = 'Warp is not installed: pip install "sim2real[warp]"'
 
@@ -361,26 +360,3 @@ def test_models_that_warp_cannot_run_are_refused_by_name(installed):
     task = Throw()
     task.root_entity.mjcf_model.option.solver = "PGS"
     refused("MJX-Warp cannot run this model: .*PGS", task)
-
-
-@pytest.mark.parametrize("name", ["nconmax", "njmax"])
-def test_no_room_at_all_is_refused(name):
-    refused(f"{name} is a number of at least 1, got 0", **{name: 0})
-
-
-def test_a_device_that_warp_does_not_know_is_refused(installed, monkeypatch):
-    monkeypatch.setattr(warp.jax, "devices", lambda kind=None: [SimpleNamespace(platform="tpu")] if not kind else [])
-    with pytest.raises(UsageError, match="Warp runs on CUDA devices and on the CPU"):
-        warp.find_device()
-
-
-def test_without_the_package_the_hint_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("mujoco.mjx.warp.WARP_INSTALLED", False)
-    refused(r'pip install "sim2real\[warp\]"')
-
-
-def test_other_implementations_and_misplaced_options_are_refused():
-    with pytest.raises(UsageError, match="no implementation 'cpp'"):
-        composer.MjxEnvironment(Throw(), impl="cpp")
-    with pytest.raises(UsageError, match="nconmax and njmax are Warp's"):
-        composer.MjxEnvironment(Throw(), nconmax=10)

@@ -36,6 +36,7 @@ class TestSimulatedClock(RuntimeConformance):
 
 class TestTables(RuntimeConformance):
     seeds = range(200, 230)
+    trainable = False
 
     def play(self, nodes, supervisor, timeline, episode):
         gs, outputs = defaults(nodes, supervisor)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SAFETY_STOP, SafetyStop
-from sim2real.hardware import emulator, guardian_process
+from sim2real.hardware import emulator, guardian, guardian_process
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.plant import OperatingMode
@@ -172,6 +172,33 @@ def test_an_answer_that_the_guardian_has_read_is_no_lost_bus(start_robot, open_b
         bus.read(1, reg.TORQUE_ENABLE)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux continues a stopped process whose parent has died")
+@pytest.mark.parametrize("after_s", [0.0, 0.01])
+def test_torque_is_off_though_the_guardian_was_stopped_before_the_host_died(start_host, after_s):
+    robot, host, pid = start_host()
+    since_ns = time.monotonic_ns()
+    os.kill(int(pid), signal.SIGSTOP)
+    time.sleep(after_s)
+    host.kill()
+    time.sleep(0.4)
+    assert_off_soon(robot, since_ns)
+    assert "sim2real guardian: the control process is gone: torque is off" in host.communicate()[1]
+
+
+def test_a_guardian_that_does_not_answer_is_not_trusted(start_robot, open_bus, monkeypatch):
+    """As under a debugger, which the kernel does not report."""
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.4)
+    monkeypatch.setattr(guardian.os, "waitid", lambda *_: None)
+    os.kill(bus.guardian_pid, signal.SIGSTOP)
+    begin = time.monotonic()
+    with pytest.raises(SafetyStop, match="has died or was stopped"):  # noqa: PT012 - it takes its time
+        while time.monotonic() < begin + 10.0:
+            bus.write_goal_pwm({1: 0.5})
+            time.sleep(0.002)
+    assert 0.4 < time.monotonic() - begin < 1.0
+
+
 def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
     robot, host, pid = start_host()
     assert os.getsid(int(pid)) != os.getsid(host.pid)
@@ -184,13 +211,13 @@ def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
     assert_off_soon(robot, since_ns)
 
 
-@pytest.mark.parametrize("way", ["it acted", "it died"])
+@pytest.mark.parametrize("way", ["it acted", "it died", "it was stopped"])
 def test_torque_is_taken_off_in_order_whatever_became_of_it(start_robot, open_bus, way):
     robot = start_robot()
     bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
     bus.write_goal_pwm({1: 0.5})
-    if way == "it died":
-        os.kill(bus.guardian_pid, signal.SIGKILL)
+    if way != "it acted":
+        os.kill(bus.guardian_pid, signal.SIGKILL if way == "it died" else signal.SIGSTOP)
     time.sleep(0.3)
     bus.torque(False)
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
@@ -205,11 +232,13 @@ def test_without_it_the_control_process_stops(start_robot, open_bus, number):
     bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.4)
     bus.write_goal_pwm({1: 0.5})
     os.kill(bus.guardian_pid, number)
-    end = time.monotonic() + 10.0
+    begin = time.monotonic()
     with pytest.raises(SafetyStop, match="the guardian has died"):  # noqa: PT012 - it takes its time
-        while time.monotonic() < end:
+        while time.monotonic() < begin + 10.0:
             bus.write_goal_pwm({1: 0.5})
             time.sleep(0.002)
+    noticed_s = time.monotonic() - begin
+    assert noticed_s < 0.2, "signs of life are 40 ms apart"
     bus.close()
     robot.stop()
     assert robot.truth().of(Kind.EFFECT)["values"][-1, 0] == OperatingMode.OFF

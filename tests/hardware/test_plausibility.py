@@ -156,6 +156,40 @@ def test_limits_that_make_no_sense():
             GateConfig(**limits)
 
 
+def swinging(freeze_s, hz, push, drive):
+    """Return positions and efforts (N, 2) of a joint that swings, and whose encoder freezes."""
+    t = PERIOD_S * np.arange(round((freeze_s + 4.0 / hz) / PERIOD_S))
+    rotor = np.sin(2 * np.pi * hz * t)  # turns at 1/4, 3/4 ... of a period
+    read = np.where(t < freeze_s, rotor, np.sin(2 * np.pi * hz * PERIOD_S * np.floor(freeze_s / PERIOD_S)))
+    # A voltage goes on as planned; a position drive pushes the more, the farther the reading is from the goal.
+    effort = push * np.sin(2 * np.pi * hz * t + 0.4) if drive == "volts" else np.clip(3.0 * (rotor - read), -push, push)
+    return np.stack([np.zeros_like(t), read], axis=1), np.stack([np.zeros_like(t), effort], axis=1)
+
+
+@pytest.mark.parametrize("drive", ["volts", "angles"])
+@pytest.mark.parametrize("hz", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("turn", [0.25, 0.75, 1.25])
+def test_an_encoder_that_freezes_at_a_turning_point_is_seen(turn, hz, drive):
+    """There the joint stands still anyway, so that no speed tells of it; how it is pushed does."""
+    freeze_s = turn / hz
+    read, effort = swinging(freeze_s, hz, 0.5, drive)
+    config = GateConfig(max_speed_rad_s=20.0, joints=("pan", "tilt"), freeze_rad_s=2.0)
+    judge = Plausibility(config)
+    said, i = "", 0
+    try:
+        for i, (position, push) in enumerate(zip(read, effort, strict=True)):
+            judge.check(position, i * PERIOD_S, 0.0, push)
+            if judge.suspects and drive == "angles":
+                break
+    except SafetyStop as stop:
+        said = str(stop)
+    assert i * PERIOD_S - freeze_s < 1.25 / hz, "within a period and a quarter"
+    if drive == "volts":
+        assert "though it was pushed both ways" in said
+    else:  # from an extreme it is pushed one way alone, as a joint that lies on something: it may be right
+        assert "though what pushes it changed by" in judge.suspects[0]
+
+
 @pytest.fixture
 def open_rig(start_robot):
     rigs = []

@@ -14,7 +14,9 @@ from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.dynamixel.protocol import PROTOCOL
 from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.packets import Instruction
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.rig import Rig
 from sim2real.hardware.truth import Kind
@@ -279,3 +281,21 @@ def test_an_unplugged_bus_is_lost_at_once_and_its_servo_stops_itself(open_rig):
     t_ns, modes, goals = effects(robot)
     assert (modes[-1] == OperatingMode.OFF) | (goals[-1] == 0.0)
     assert (t_ns[-1] - began_ns) * 1e-9 < 0.3
+
+
+@pytest.mark.parametrize("value", [3.0, -3.0])
+def test_a_servo_that_resets_in_motion_stops_the_robot_within_a_second(open_rig, value):
+    """As after a moment without supply: it has lost torque, mode and watchdog, and still answers every question."""
+    rig, robot = open_rig()
+    rig.start()
+    run(rig, value, 0.3)
+    link = rig.device.link
+    with link.hold():
+        os.write(link.fd, PROTOCOL.build(1, Instruction.REBOOT))
+    begin_s = time.monotonic()
+    with pytest.raises(SafetyStop, match=r"servo 1 has lost its settings|moved at .* or more just before"):
+        run(rig, value, 5.0)
+    assert time.monotonic() - begin_s < 1.2
+    rig.stop_quietly()
+    _, modes, _ = effects(robot)
+    assert modes[-1] == OperatingMode.OFF

@@ -9,6 +9,7 @@ import serial
 from shared_run import copied
 
 from sim2real import cli, errors
+from sim2real.policy.bundle import sealed
 from sim2real.stages.parameters import open_identification
 from sim2real.stages.pipeline import load_pipeline
 
@@ -213,7 +214,7 @@ def test_bundles_of_another_robot(fails, tmp_path, finished_run_dir, what):
         about["rate_hz"] = 100.0
     else:
         about[what][0]["name"] = "something else"
-    (bundle / "policy.json").write_text(json.dumps(about))
+    (bundle / "policy.json").write_text(json.dumps(sealed(about)))
     said = fails(errors.ERROR, "deploy", "pendulum", "--bundle", bundle, "--runs", tmp_path)
     assert "this robot" in said
     assert not (tmp_path / "pendulum").exists()

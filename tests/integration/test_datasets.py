@@ -39,7 +39,7 @@ def test_identification_finds_the_true_parameters(name):
     recording = Recording.load(DATASETS / entry["pipeline"] / name)
     # Estimates are what is looked at; a third of the usual search finds where the descents begin.
     config = replace(pipeline.identify, seed=1, folds=0, free_run_s=0.0, generations=25)
-    rows = {p.name: p for p in identify(recording, pipeline, config).parameters}
+    rows = {p.name: p for p in identify(pipeline, recording, config).parameters}
     for parameter, truth in entry["truth"].items():
         error = rows[parameter].estimate - truth
         scale = 1.0 if parameter == "round_trip_delay" else truth

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor, wait_until_running
 
+from sim2real.artifacts.manifest import read_manifest
 from sim2real.errors import SAFETY_STOP
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.truth import Kind, read_truth
@@ -73,7 +74,10 @@ def test_kill_9_of_record(tmp_path, lone_robot, start_cli):
     process.kill()
     time.sleep(0.5)
     check_death(log, killed_ns, end_robot())
-    assert manifest_of(log.parent)["status"] == "running"
+    assert manifest_of(log.parent)["status"] == "running", "nobody wrote that it ended"
+    manifest = read_manifest(log.parent)
+    assert manifest is not None
+    assert manifest["status"] == "died"
 
 
 def test_kill_9_of_deploy(tmp_path, lone_robot, start_cli, finished_run_dir):

@@ -145,15 +145,32 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
     recorded = manifest_of(finished_run_dir / "record")["outputs"]["log"]
     assert [vars(log) for log in found.logs] == [{"path": "session.mcap", "sha256": recorded["sha256"]}]
     assert had["bundle"].contract.delays_s.keys() == {"sensor_delay", "actuator_delay"}
-    assert len(had["deployment"].recordings) == len(had["summaries"]) == 1
+    assert len(had["deployment"].recordings) == len(had["deployment"].summary) == 1
     ppo = replace(had["small"], total_steps=256)
     config = replace(pendulum.train, episode_s=2.0, timelines=4, ppo=ppo)
-    nominal, about = sim2real.train(pendulum, replace(config, model="nominal"))
-    assert (nominal.contract.delays_s, about["timelines drawn again"]) == ({}, 0)
+    nominal = sim2real.train(pendulum, config=replace(config, model="nominal"))
+    assert (nominal.contract.delays_s, nominal.summary["timelines drawn again"]) == ({}, 0)
     with pytest.raises(UsageError, match="needs an identification"):
-        sim2real.train(had["robot"], config)
+        sim2real.train(had["robot"], config=config)
     with pytest.raises(UsageError, match="another world, the robot's own, than 'moon'"):
-        sim2real.train(had["robot"], replace(config, world="moon"), found)
+        sim2real.train(had["robot"], found, replace(config, world="moon"))
+
+
+def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
+    run = sim2real.run("pendulum", run_copy.parent.parent, resume=str(run_copy))
+    assert run.folder == run_copy
+    assert "record, identify, train, deploy" in repr(run)
+    assert run.bundle.contract.rate_hz == 50.0
+    assert run.deployment.recordings
+    assert sim2real.report(run).is_file()
+    assert sim2real.report(str(run_copy)).is_file()
+    file = sim2real.export("pendulum", run.identification, tmp_path / "identified.json", "json")
+    assert "friction" in json.dumps(strict_json(file))
+    checked = sim2real.check("pendulum", run.recording)
+    assert {p["name"] for p in checked.parameters} >= {"gain", "friction", "round_trip_delay"}
+    assert "friction" in checked._repr_html_()
+    scored = sim2real.validate("pendulum", run_copy / "identify", run.recording)
+    assert scored.positions["th"]["rmse"]["identified"] > 0.0
 
 
 def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):

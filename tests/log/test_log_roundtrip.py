@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 import warnings
 
 import fake_sessions
@@ -160,3 +161,23 @@ def test_data_before_the_start_is_an_error(tmp_path):
     log.step(StepRecord("a", 0, 0, 0, 0, -1, 1, 0), {"x": 1.0})
     with pytest.raises(Sim2RealError, match="call start"):
         log.close()
+
+
+@pytest.mark.parametrize("leap_s", [-3600, 3600])
+def test_a_wall_clock_that_is_set_in_the_middle_changes_nothing(tmp_path, monkeypatch, leap_s):
+    """It is read once, at the start: all times are of the monotonic clock."""
+    episodes = []
+    for leap in (0, leap_s):
+        log = McapRecorder(tmp_path / f"{leap}.mcap", *fake_sessions.arguments())
+        log.start(fake_sessions.EPOCH_NS, time.monotonic_ns())
+        fake_sessions.feed(range(100), log)
+        monkeypatch.setattr(time, "time_ns", lambda leap=leap: fake_sessions.EPOCH_NS + leap * 10**9)
+        monkeypatch.setattr(time, "time", lambda leap=leap: fake_sessions.EPOCH_NS / 1e9 + leap)
+        log.write_event("watchdog", "in the middle")
+        fake_sessions.feed(range(100, 200), log)
+        log.close()
+        episodes.append(read_log(log.path))
+        monkeypatch.undo()
+    assert_same(*episodes)
+    times = [event["time_s"] for event in episodes[1].metadata["log"]["events"]]
+    assert abs(times[0]) < 60

@@ -1,6 +1,7 @@
 """A policy that leaves one machine and arrives on another."""
 
 import contextlib
+import functools
 import hashlib
 import json
 import subprocess
@@ -20,6 +21,7 @@ from sim2real.policy import (
     read_weights,
     save_bundle,
 )
+from sim2real.policy.bundle import sealed
 
 
 @pytest.fixture
@@ -235,6 +237,59 @@ def test_bytes_bent_at_random_are_refused_in_words(bundle):
         path.write_text(json.dumps(about))
         with contextlib.suppress(Sim2RealError):
             load_bundle(bundle).act(np.zeros(5))
+
+
+def places(value, path=()):
+    """Yield the path of each entry of a JSON document, of lists the first two."""
+    yield path
+    entries = value.items() if isinstance(value, dict) else enumerate(value[:2]) if isinstance(value, list) else ()
+    for key, entry in entries:
+        yield from places(entry, (*path, key))
+
+
+def changed(about, path, value):
+    about = json.loads(json.dumps(about))
+    place = functools.reduce(lambda entry, key: entry[key], path[:-1], about)
+    place[path[-1]] = value
+    return about
+
+
+def test_every_entry_is_covered_by_the_hash(bundle):
+    path = bundle / "policy.json"
+    whole = json.loads(path.read_text())
+    path.write_text(json.dumps(whole, indent=7, sort_keys=True))  # another layout is the same content
+    load_bundle(bundle)
+    for place in places(whole):
+        for value in (None, -1, 1e308, float("nan"), "x", [], {}, True, "../../etc/passwd", 10**400):
+            if place and changed(whole, place, value) != whole:
+                path.write_text(json.dumps(changed(whole, place, value)))
+                with pytest.raises(Sim2RealError):
+                    load_bundle(bundle)
+    for name in whole:
+        path.write_text(json.dumps({key: value for key, value in whole.items() if key != name}))
+        with contextlib.nullcontext() if name == "sha256" else pytest.raises(Sim2RealError):
+            load_bundle(bundle)  # bundles of older versions have no hash of their own
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("rate_hz",), 1e308), (("rate_hz",), 1e-9), (("rate_hz",), "50"), (("rate_hz",), True),
+        (("delays_s", "sensor -> agent"), 1e6), (("delays_s", "sensor -> agent"), "0.01"),
+        (("trained_s", "round_trip_delay"), [0.0, 1e9]), (("trained_s", "round_trip_delay"), "12"),
+        (("limits", "thdot_rad_s"), 1e300), (("limits", "thdot_rad_s"), float("inf")),
+        (("limits", "thdot_rad_s"), None),
+        (("action", 0, "low"), -1e300), (("action", 0, "unit"), 5), (("action", 0, "name"), ""),
+        (("observation", 0, "history"), 1.5), (("observation", 0, "history"), 10**9),
+        (("observation", 0, "units"), "rad"),
+        (("hashes", "log"), 7),
+    ],
+)  # fmt: skip
+def test_values_that_no_policy_has_are_refused_though_the_hash_is_right(bundle, path, value):
+    file = bundle / "policy.json"
+    file.write_text(json.dumps(sealed(changed(json.loads(file.read_text()), path, value))))
+    with pytest.raises(Sim2RealError, match=r"hint: |must be|is no"):
+        load_bundle(bundle)
 
 
 def test_an_unknown_backend_is_refused(bundle):

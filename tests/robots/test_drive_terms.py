@@ -84,10 +84,11 @@ def by_hand(terms, goals, on, start):
 
 def in_c(model_file, terms, goals, on, start):
     model = driven(model_file, ("servo",), STEP_S, False, False)
-    law = DriveLaw(np.array([0]), np.array([0]))
+    law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
     kp = OWN["kp"] * on
     control = np.stack([kp * goals, kp, OWN["kd"] * on, on, goals], axis=1)[:, None]
     values = {n: np.array([v]) for n, v in {**OWN, **terms}.items()}
+    values |= {"other_damping": np.zeros(0), "other_frictionloss": np.zeros(0)}  # no joint is without a drive
     state = Start(np.array([start[0]]), np.array([start[1]]), np.zeros(1))
     tilt = expand([ParameterPattern("tilt_x"), ParameterPattern("tilt_y")], ["servo"], model, model)
     fields = {"opt.gravity": np.asarray(tilted(tilt, terms, model.opt.gravity))}

@@ -262,7 +262,7 @@ def test_a_record_says_when_messages_arrived_at_the_delay_that_they_had(skip):
 def test_options_that_do_not_fit_are_refused():
     nodes = chain()
     with pytest.raises(UsageError, match="duration_s or a timeline"):
-        AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED)
+        AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1.0, timeline=draw(nodes, 1.0))
     with pytest.raises(UsageError, match="simulated clock"):
         AsyncGraph(nodes, nodes["agent"], duration_s=1.0)
     with pytest.raises(UsageError, match="lacks world"):

@@ -215,6 +215,57 @@ def test_nothing_changes_behind_the_last_row(compiled):
     assert equal(row(end), end)
 
 
+EPISODES = np.array([1, -1, 2, 99, -(2**31), 2**31 - 1], np.int32)
+"""Episodes of a timeline that has two: the first one exists."""
+
+
+def rolls(graph, gs):
+    return graph.rollout(gs, tuple(graph.nodes))
+
+
+def rolls_in_parts(graph, gs):
+    return graph.rollout(graph.rollout(gs, rows=2)[0], tuple(graph.nodes), rows=2)
+
+
+def runs_a_row(graph, gs):
+    gs, made = graph.run_row(gs)
+    return gs, {n: steps[0] for n, steps in made.items()}
+
+
+def steps(graph, gs):
+    gs, first = graph.reset(gs)
+    gs, second = graph.step(gs, first, Value(x=jnp.uint32(3)))
+    return graph.run(gs).replace(seq={}), {"policy": jax.tree.map(lambda *x: jnp.stack(x), first, second)}
+
+
+def observes(graph, gs):
+    gs, ss, _ = graph.observe(gs)
+    return graph.advance(gs, ss, Value(x=jnp.uint32(3))), {"policy": ss}
+
+
+@pytest.mark.parametrize(
+    ("way", "topology"),
+    [(w, topologies.robot) for w in (rolls, rolls_in_parts, runs_a_row, steps, observes)]
+    + [(rolls, topologies.three_in_ten)],
+    ids=lambda x: x.__name__,
+)
+def test_an_episode_that_does_not_exist_has_no_steps(way, topology, compiled):
+    """Traced, it cannot be an error; XLA would look up the last episode instead."""
+    graph = compiled(topology)
+
+    def run(eps):
+        begin = graph.init(KEY, eps=eps)
+        return begin, *way(graph, begin)
+
+    begins, ends, records = jax.jit(jax.vmap(run))(EPISODES)
+    for i, eps in enumerate(EPISODES):
+        begin, end, made = jax.tree.map(lambda x, i=i: x[i], (begins, ends, records))
+        assert all((np.asarray(r.seq) >= 0).any() == (eps == 1) for r in made.values())
+        assert equal(end.replace(step=begin.step), begin) == (eps != 1)
+    with pytest.raises(UsageError, match="no episode 2: the timeline has 2"):
+        way(graph, graph.init(KEY).replace(eps=jnp.int32(2)))
+
+
 def equal(a, b):
     return jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), a, b))
 
@@ -227,6 +278,35 @@ def test_a_rollout_in_parts_is_a_rollout(compiled):
     np.testing.assert_array_equal(np.concatenate([first["world"].output.x, second["world"].output.x]), whole)
     with pytest.raises(UsageError, match=f"row {graph.rows} of {graph.rows}"):
         graph.rollout(gs)
+
+
+@pytest.mark.parametrize("trainable", [False, True])
+def test_a_leaf_of_size_zero(trainable):
+    """A message may have a list that is empty for this robot."""
+
+    class Sender(BaseWorld):
+        def init_output(self, rng=None, graph_state=None):
+            return {"x": jnp.float32(0.0), "none": jnp.zeros((0, 3))}
+
+        def init_state(self, rng=None, graph_state=None):
+            return jnp.zeros((2, 0))
+
+        def step(self, step_state):
+            return step_state, {"x": jnp.float32(step_state.seq), "none": jnp.zeros((0, 3))}
+
+    class Reader(Sender):
+        def step(self, step_state):
+            return step_state, step_state.inputs["sender"][-1].data
+
+    sender, reader = Sender("sender", 50), Reader("reader", 25)
+    delay = TrainableDist.create(0.02, 0.0, 0.05, "linear") if trainable else 0.0
+    reader.connect(sender, delay_dist=delay, delay=0.0, window=2)
+    nodes = {"sender": sender, "reader": reader}
+    graph = CompiledGraph(nodes, "reader", draw(nodes, 0.2))
+    records = jax.vmap(lambda key: graph.rollout(graph.init(key), ("reader",))[1])(jax.random.split(KEY, 3))
+    output = records["reader"].output
+    assert output["none"].shape == (*output["x"].shape, 0, 3)
+    assert output["x"].shape[0] == 3
 
 
 def test_errors_instead_of_silence(compiled):

@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "graph.md"
 def names():
     """Run every block of the page in one namespace; return it."""
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 8
+    assert len(blocks) == 9
     found = {"__name__": "page"}
     for number, block in enumerate(blocks, start=1):
         exec(compile(block, f"{PAGE.name}, block {number}", "exec"), found)
@@ -30,6 +30,12 @@ def test_the_page_says_what_is_so(names):
     assert names["Actuator"].sent[-1] == "torque off"
     assert len(names["Actuator"].sent) > 5
     assert len(names["log"].outputs["sensor"]["th"]) > 60
+
+
+def test_a_loss_of_ones_own_finds_the_mass_of_the_recorded_world(names):
+    """The recorded episode was made with the world's own mass, and sensors that saw it 5 ms later."""
+    assert float(names["found_mass"].parameters["mass"]) == pytest.approx(0.0509, rel=0.1)
+    assert names["found_mass"].loss < 0.1 * names["found_mass"].start
 
 
 def test_pushing_in_the_direction_of_motion_swings_the_pendulum_up(names):

@@ -12,6 +12,7 @@ from sim2real.graph.testing import Value
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.data import Format
 from sim2real.runtime.match import matched
 
 FLOAT, INT = jnp.float32(1.0), jnp.int32(1)
@@ -104,3 +105,11 @@ def test_what_a_caller_puts_in_is_checked_too():
     ):
         with pytest.raises(UsageError, match=f"'agent': the output of step differs .*: .*{words}"):
             jax.eval_shape(lambda s, o=output: compiled.step(s, output=o), start)
+
+
+def test_an_integer_that_does_not_fit_is_an_error_on_a_clock():
+    """A step in plain Python returns numbers of 64 bits: 300 would become 44 in 8 bits."""
+    form = Format("node", {"count": np.int8(0)})
+    assert form.pack({"count": 100})[0].dtype == np.int8
+    with pytest.raises(UsageError, match="300, which does not fit into int8"):
+        form.pack({"count": 300})

@@ -147,7 +147,7 @@ def test_compose(run, traced):
     assert "compose/cpu/mjx_env_over_bare" in found
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_compose_on_warp(run):
     pytest.importorskip("warp", reason='Warp is not installed: pip install "sim2real[warp]"')
     name = f"compose/{jax.default_backend()}/warp/2"

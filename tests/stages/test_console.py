@@ -1,5 +1,9 @@
 """What is printed, and where."""
 
+import io
+import threading
+import time
+
 import pytest
 
 from sim2real.stages import console
@@ -54,11 +58,41 @@ def test_progress_is_plain_lines_without_a_terminal(capsys, monkeypatch):
         "train (compiling): started",
         "train (compiling): finished after 57.0 s",
         "train: started",
+        "train: 1 of 3, return -245, 10 s so far",
         "train: 2 of 3, return -245, 20 s so far",
+        "train: 3 of 3, return -245, 30 s so far",
         "train: finished after 30.0 s (return -245)",
         "record: started",
         "record: ended after 0.0 s",
     ]
+
+
+def test_the_time_goes_on_while_one_step_takes_long(capsys, monkeypatch):
+    monkeypatch.setattr(console, "_TICK_S", 0.01)
+    monkeypatch.setattr(console, "_LINES_S", (0.03, 0.06, 0.1))
+    with console.progress(None, "identify: errors"):
+        time.sleep(0.5)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "identify: errors: started"
+    assert {"identify: errors: 0 s so far"} <= set(lines[1:-1])
+    assert 4 <= len(lines) <= 9
+    before = threading.active_count()
+    with pytest.raises(KeyError), console.progress(None, "record"):
+        raise KeyError
+    assert threading.active_count() == before
+
+
+def test_a_terminal_is_drawn_again_while_one_step_takes_long(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr(console, "_TICK_S", 0.05)
+    with console.progress(None, "identify: errors"):
+        time.sleep(0.4)
+    assert 3 <= screen.getvalue().count("identify: errors: 00:0") <= 12
 
 
 def test_what_a_terminal_would_obey_is_shown_instead(capsys):

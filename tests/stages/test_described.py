@@ -64,6 +64,11 @@ def test_the_next_command_describes_the_robot_again(workplace):
     assert (program, stage) == ("sim2real", "identify")
     again = described_flags.parse_identify(rest, "")
     assert (again.robot, again.config) == (told, asked)
+    asked = replace(asked, refine_steps=3)
+    _, _, *rest = shlex.split(advice.onward(found, asked, Path("all runs"), Path("all runs/robot/partial.json")))
+    onward = described_flags.parse_identify(rest, "")
+    assert (onward.robot, onward.runs) == (told, Path("all runs"))
+    assert (onward.config.begin, onward.config.log) == ("all runs/robot/partial.json", ("run.npz",))
 
 
 def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsys, recorded):

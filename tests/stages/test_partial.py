@@ -84,7 +84,7 @@ def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
     quick = ["--generations", "10", "--refine", "1"]
     with subprocess.Popen([*own, *quick], stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
         for line in running.stderr:
-            if "errors, predictions and baselines" in line:
+            if "identify: left-out parts: started" in line:
                 running.kill()
                 break
     (path,) = tmp_path.rglob("partial.json")

@@ -97,6 +97,7 @@ def test_a_robot_stands_for_the_pipeline_that_has_loaded_it():
     disk = load_pipeline("disk")
     assert pipeline_of(disk) is disk
     assert pipeline_of(disk.load()) is disk
+    assert pipeline_of("disk").name == "disk"
 
 
 def test_a_robot_of_ones_own_goes_by_the_name_of_its_class():
@@ -105,7 +106,7 @@ def test_a_robot_of_ones_own_goes_by_the_name_of_its_class():
     assert (found.name, found.load(), found.identify) == ("Spare", own, IdentifyConfig())
 
 
-@pytest.mark.parametrize("robot", ["disk", None, 3])
+@pytest.mark.parametrize("robot", [None, 3])
 def test_what_is_no_robot_is_refused(robot):
     with pytest.raises(UsageError, match=rf"{robot!r} is neither a robot nor a pipeline(.|\n)*load_pipeline\(NAME\)"):
         pipeline_of(robot)

@@ -2,15 +2,18 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.run_folder import open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages import train as stage
-from sim2real.stages.resuming import CHECKPOINT
+from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.resuming import CHECKPOINT, find_interrupted
 
 TINY = [
     *("train", "pendulum", "--model", "nominal", "--episode-s", "0.5", "--timelines", "2", "--seed", "1"),
@@ -124,3 +127,10 @@ def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_
 def test_what_cannot_be_swept_is_refused_at_once(capsys):
     assert cli.main([*TINY, "--sweep", "hidden=3,4"]) == 2
     assert "hidden cannot be swept" in capsys.readouterr().err
+
+
+def test_a_training_that_still_runs_is_not_gone_on_with(tmp_path):
+    config = load_pipeline("pendulum").train
+    said = r"is still running[\s\S]*hint: wait until it has ended"
+    with open_stage(tmp_path, "pendulum", "train", config) as opened, pytest.raises(UsageError, match=said):
+        find_interrupted("pendulum", replace(config, resume=str(opened.folder)), tmp_path)

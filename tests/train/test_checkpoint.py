@@ -8,6 +8,7 @@ import pytest
 from environments import Bandit, Constant
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.train.checkpoint import TrainingIdentity, load_checkpoint
 from sim2real.train.config import PPOConfig
 from sim2real.train.ppo import train
 
@@ -71,6 +72,23 @@ def test_another_training_is_refused(saved, change, message):
     asked = {"env": Bandit(), "config": CONFIG, "key": KEY} | change
     with pytest.raises(UsageError, match=rf"{message}[\s\S]*hint: "):
         train(**asked, resume=saved)
+
+
+def test_any_damage_is_noticed_before_training_goes_on(saved, tmp_path):
+    """A flipped bit of a weight, above all: the format of the file has no check of its own."""
+    whole, rng, file = saved.read_bytes(), np.random.default_rng(0), tmp_path / "bent"
+    begin = 8 + int.from_bytes(whole[:8], "little")
+    identity = TrainingIdentity({}, [], "")
+    for i in range(60):
+        bent = bytearray(whole)
+        if i % 3:
+            low, high = ((0, begin), (begin, len(whole)))[i % 3 - 1]
+            bent[rng.integers(low, high)] ^= int(rng.integers(1, 256))
+        else:
+            del bent[rng.integers(len(whole)) :]
+        file.write_bytes(bent)
+        with pytest.raises(Sim2RealError, match=r"cannot go on from .*bent[\s\S]*hint: train again"):
+            load_checkpoint(file, identity, None, None)
 
 
 def test_a_file_that_is_damaged_or_missing_is_named(saved, tmp_path):

@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -124,6 +125,66 @@ def test_processes_that_were_started_differently_say_in_what(told):
 def test_who_loses_another_process_says_so(told):
     assert told[0]["lost"].startswith("process 0 of 2 lost another one of this training: ")
     assert "--resume newest" in told[0]["lost"]
+
+
+ALONE = """
+import os, sys, time
+from sim2real.errors import Sim2RealError
+from sim2real.train import aborts
+from sim2real.train.hosts import HostsConfig
+from sim2real.train.processes import join, require_neighbours
+
+aborts.GRACE_S = 1.0
+number = int(sys.argv[1])
+join(HostsConfig(coordinator=sys.argv[2], processes=3, process=number, timeout_s=20))
+print("joined", flush=True)
+try:
+    for _ in range(240):
+        time.sleep(0.25)
+        if number == 1:  # the other one waits for something else, as a computation that does not come back
+            require_neighbours()
+except Sim2RealError as error:
+    print(error, flush=True)
+    os._exit(error.exit_code)
+"""
+
+
+@pytest.mark.slow
+def test_who_is_ended_by_jax_ends_in_words_and_the_coordinator_listens_where_it_was_told():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-c", ALONE]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    every = [subprocess.Popen([*command, str(i), f"127.0.0.1:{port}"], **pipes) for i in range(3)]
+    try:
+        for process in every:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "joined\n"
+        socket.create_connection(("127.0.0.1", port), 5).close()
+        if sys.platform == "linux":  # all of 127/8 is this host's
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(("127.0.0.2", port), 5)
+        every[0].kill()
+        ends = [process.communicate(timeout=60) for process in every]
+    finally:
+        for process in every:
+            process.kill()
+    assert [process.returncode for process in every[1:]] == [1, 1], "no SIGABRT"
+    for number, said in ((1, ends[1][0]), (2, ends[2][1])):
+        assert f"process {number} of 3 lost another one of this training: JAX ended it, and says why above" in said
+        assert "hint: the reason is in the output of the process that ended first; `--resume newest`" in said
+
+
+def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached(monkeypatch):
+    own = HostsConfig(coordinator="10.0.0.5:52700", processes=2, process=0)
+    assert "whoever reaches 10.0.0.5:52700 can join or end the training: use a network that you trust" in str(own)
+    assert "trust" not in str(replace(own, process=1))
+    assert "the coordinator's interfaces" in str(HostsConfig(found=True))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(0, 0, 0, "", ("127.0.1.1", 0))])
+    assert "warning: first is 127.0.1.1 here" in str(replace(own, coordinator="first:52700"))
+    assert "warning" not in str(replace(own, coordinator="localhost:52700"))
+    assert "warning" not in str(replace(own, coordinator="first:52700", process=1))
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from sketches import sketched, texts
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.identification import Identification, Quantity
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.quantity import Quantity
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run_folder import Source, finished_stages
 from sim2real.view import figures, identify_figures, intervals, residuals, style, timing

@@ -132,7 +132,8 @@ def find_device() -> Any:
 
     if not mjx_warp.WARP_INSTALLED or mjx_warp.mujoco_warp is None:
         raise UsageError('impl="warp": Warp is not installed', hint='pip install "sim2real[warp]"')
-    device: Any = jax.config.read("jax_default_device") or jax.devices()[0]
+    config: Any = jax.config  # read() refuses an option that a context may change
+    device: Any = config.jax_default_device or jax.devices()[0]
     device = jax.devices(device)[0] if isinstance(device, str) else device
     if device.platform != "cpu" and not _is_cuda(device, mjx_warp.warp):
         raise UsageError(

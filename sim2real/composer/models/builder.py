@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.models import files, given, schema, translate
+from sim2real.composer.models import files, given, paths, references, schema, translate
 from sim2real.composer.models.references import REFERENCES, refer
 from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS
@@ -65,9 +65,20 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
         remove(model, element)
         raise
     if kind == "joint" and body.is_frame:  # joints of a frame are called after it
-        native.name = body._native.name + (f"{name}/" if name else "")
+        _name_frame_joint(model, body, element, name)
     model.touch()
     return element
+
+
+def _name_frame_joint(model: Tree[H], frame: H, joint: H, name: str | None) -> None:
+    full = frame._native.name + (f"{name}/" if name else "")
+    if model._spec.joint(full) is not None:
+        remove(model, joint)
+        raise UsageError(
+            f"the attachment frame {frame.full_identifier!r} has a joint {full!r} already",
+            hint='give each of its joints a name: frame.add("joint", name="x", ...)',
+        )
+    joint._native.name = full
 
 
 def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -> H:
@@ -80,6 +91,8 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
     """
     model.check_name(kind, attrs.get("name"))
+    if kind in ("numeric", "text", "tuple") and not attrs.get("name"):
+        raise UsageError(f"a <{tag}> needs a name", hint=f'custom.add("{tag}", name=...)')
     defaults = _defaults(model, attrs)
     adder = getattr(model._spec, f"add_{kind}")
     native = adder() if defaults is None else adder(defaults)
@@ -103,8 +116,8 @@ def _lay_down(model: Tree[Handle], element: Handle) -> None:
         values = _inherited(element) | values
     if kind in files.KINDS:
         values = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in values.items()}
-    references = [k for k in REFERENCES.get(kind, ()) if k in values]
-    _fill(model, element, *translate.from_xml(kind, said.tag, values, references))
+    naming = [k for k in REFERENCES.get(kind, ()) if k in values]
+    _fill(model, element, *translate.from_xml(kind, said.tag, values, naming))
     for key in translate.ORIENTATIONS & values.keys():
         translate.assign(native, kind, key, values[key])
 
@@ -237,30 +250,65 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
         attrs: The attributes in MJCF; elements, or their names.
     """
+    path = paths.path_of(model, tendon._native)
+    part = paths.make_part(model, tag, attrs)
+
+    def name(kind: str, target: Handle | str) -> str:
+        if isinstance(target, str):
+            return target
+        return target._native.name if target.root is model else paths.ELSEWHERE
+
+    paths.wrap(tendon._native, part, name)
+    part.written = {k: v._native.name for k, v in part.values.items() if isinstance(v, Handle)}
+    path.append(part)
     model.touch()
-    names = {k: v.name if isinstance(v, Handle) else v for k, v in attrs.items()}
-    if tag == "joint":
-        tendon._native.wrap_joint(names["joint"], names["coef"])
-    elif tag == "site":
-        tendon._native.wrap_site(names["site"])
-    elif tag == "geom":
-        tendon._native.wrap_geom(names["geom"], names.get("sidesite") or "")
-    elif tag == "pulley":
-        tendon._native.wrap_pulley(names["divisor"])
-    else:
-        raise UsageError(f"a <{tag}> cannot stand in a tendon. Available: geom, joint, pulley, site")
     return tendon
 
 
+def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Any]) -> H:
+    """Add an element to those that a tuple names.
+
+    Args:
+        model: The model.
+        element: The tuple.
+        tag: ``element``.
+        attrs: ``objname``, an element or a name, with ``objtype``; ``prm``, a number.
+    """
+    native, target = element._native, attrs.get("objname")
+    word = attrs.get("objtype") or (target.kind if isinstance(target, Handle) else None)
+    kind = getattr(translate.mj.mjtObj, f"mjOBJ_{str(word).upper()}", None)
+    if tag != "element" or not target or kind is None or attrs.keys() - {"objtype", "objname", "prm"}:
+        raise UsageError(
+            f"a tuple holds <element objtype objname prm>, got <{tag}> with {attrs}",
+            hint='add("element", objtype="body", objname=body)',
+        )
+    native.objtype = [*native.objtype, int(kind)]
+    native.objprm = [*native.objprm, float(attrs.get("prm") or 0.0)]
+    native.objname = [*native.objname, ""]
+    references.refer(element, f"objname[{len(native.objname) - 1}]", target)
+    return element
+
+
 def remove(model: Tree[Handle], element: Handle) -> None:
-    """Delete an element with what stands in it and what refers to it; its handles are of no use afterwards."""
+    """Delete an element with what stands in it; its handles are of no use afterwards.
+
+    An element that names it stays: composing refuses it, unless it can do without, as a geom without its material.
+    """
     native = element._native
-    gone = [native]
+    if element.kind == "inertial":
+        native.explicitinertial = False
+        model.touch()
+        return
+    handles: list[Handle] = [element]
     if element.kind == "body":
-        gone += [child for kind in TREE_KINDS for child in native.find_all(kind)]
-    model.references = {
-        key: target for key, target in model.references.items() if key[0] not in gone and target._native not in gone
-    }
+        handles += [model.handle(kind, child) for kind in TREE_KINDS for child in native.find_all(kind)]
+    references.let_go(model, handles)
+    gone = [handle._native for handle in handles]
+    for number, one in enumerate(gone):  # MuJoCo deletes what names an element together with it
+        frame = one.name[:-1] if one.name.endswith("/") else ""
+        if translate.kind_of(one) == "body" and frame in model.attachments:
+            model.attachments.pop(frame).model.parent_model = None
+        one.name = f"//removed_{number}"
     model.strike(gone)
     model._spec.delete(native)
     model.touch()

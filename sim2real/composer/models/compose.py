@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from sim2real.composer.models import files, keyframes, layout, merge, translate
+from sim2real.composer.models import files, keyframes, merge, translate
+from sim2real.composer.models import late as late_elements
+from sim2real.composer.models.paths import ELSEWHERE, path_of, wrap
+from sim2real.composer.models.targets import SECTION_KINDS, point
 from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
@@ -21,8 +24,6 @@ NAMED_KINDS = (
     *("actuator", "sensor", "equality", "tendon", "pair", "exclude"),
     *("mesh", "material", "texture", "hfield", "numeric", "text", "tuple", "key"),
 )
-_MAY_DANGLE = ("actuator", "sensor", "equality", "pair", "exclude")
-"""Elements that name others; MuJoCo's copy drops them silently when what they name is in another model."""
 
 
 def compile_model(model: Tree[Handle]) -> MjModel:
@@ -35,26 +36,68 @@ def compile_model(model: Tree[Handle]) -> MjModel:
 
 
 def compose(model: Tree[Handle]) -> MjSpec:
-    """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options."""
+    """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options.
+
+    Raises:
+        UsageError: When an element names one that is not there, or would be lost.
+    """
     models = list(model.all_models())
     with files.renamed(model) if any(map(files.is_mixed, models)) else contextlib.nullcontext():
-        out = _compose(model)
+        out = _whole(model, models)
     merge.apply(out, merge.merged(models))
-    _point_aside(out, models)
     if len(models) > 1 and any(m._spec.keys for m in models):
         keyframes.restore(out, models)
     return out
 
 
-def _compose(model: Tree[Handle]) -> MjSpec:
+def _whole(model: Tree[Handle], models: list[Tree[Handle]]) -> MjSpec:
+    """Return a new ``MjSpec`` of a world with every element of its models.
+
+    MuJoCo's copies drop an element that names one of another model, where that is not in the copy; or they let it name
+    one of the same name that is. Such elements are made anew at the end: those that programs made are known, and those
+    whose names were read from text are found by counting.
+    """
+    late = late_elements.foreign_kinds(models)
+    wanted = _wanted(models)
+    while True:
+        out = _compose(model, late)
+        late_elements.add(out, model, models, late)
+        late_elements.point_aside(out, model, models, late)
+        found = late_elements.count(out)
+        lost = {kind for kind, number in wanted.items() if found[kind] != number}
+        if not lost:
+            return out
+        if lost & late or not lost <= set(SECTION_KINDS):
+            each = ", ".join(f"{found[k]} of {wanted[k]} of kind {k}" for k in sorted(lost))
+            raise UsageError(
+                f"model {model.model!r} loses elements when it is composed: {each} are left",
+                hint="an element that names another one by text names it as its own model does: arm/hand/finger",
+            )
+        late = late_elements.closed(late | lost)
+
+
+def _wanted(models: list[Tree[Handle]]) -> dict[str, int]:
+    """Return how many elements of each kind the world of some models has."""
+    counts = [late_elements.count_own(m) for m in models]
+    wanted = {kind: sum(c[kind] for c in counts) for kind in counts[0]}
+    # Where a model has a free joint of its own, its body takes the place of the frame.
+    wanted["body"] -= sum(free_body(a.model) is not None for m in models for a in m.attachments.values())
+    return wanted
+
+
+def _compose(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
     """Return a new ``MjSpec`` that holds copies of a model and of all that is attached to it, with default options.
 
     Names of attached elements are prefixed with ``model/``; each attached model stands in a body of that name.
     Bodies, joints, geoms, actuators and so on are in depth-first order, as PyMJCF writes them.
+
+    Args:
+        model: The model.
+        late: Kinds of elements that are left out.
     """
-    out = _copy(model)
+    out = _copy(model, late)
     for name, attachment in model.attachments.items():
-        child = _compose(attachment.model)
+        child = _compose(attachment.model, late)
         host = out.body(f"{name}/")
         if free_body(attachment.model) is None:
             out.attach(child, frame=host.add_frame(), prefix=f"{name}/")
@@ -78,28 +121,53 @@ def free_body(model: Tree[Handle]) -> Native | None:
     return None
 
 
-def copy_spec(model: Tree[Handle]) -> MjSpec:
-    """Return a copy of a model's own spec in which every element has a name and names what it should."""
+def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec:
+    """Return a copy of a model's own spec in which every element has a name, and names what it should in this model.
+
+    What an element names in another model has a name there that no element of this one has.
+
+    Args:
+        model: The model.
+        late: Kinds of elements that are left out.
+    """
     spec = model._spec
     unnamed = list(_unnamed(model))
+    left_out = [(native, native.name) for kind in late for native in getattr(spec, translate.plural(kind))]
     try:
         for native, name in unnamed:
             native.name = name
         for (native, key), target in model.references.items():
-            translate.point(native, key, _name_seen_from(model, target))
-        out = spec.copy()
-        lost = [kind for kind in _MAY_DANGLE if _count(out, kind) != _count(spec, kind)]
-        if lost:
-            out = _copy_all(model, lost)
-    finally:
-        for native, _ in unnamed:
+            own = target.root is model and not target.is_removed
+            point(native, key, target._native.name if own else ELSEWHERE)
+        for native, _ in left_out:  # the names of what a copy drops stay taken in it
             native.name = ""
+        out = spec.copy()
+    finally:
+        for native, name in (*left_out, *((native, "") for native, _ in unnamed)):
+            native.name = name
+    for kind in late:
+        for native in getattr(out, translate.plural(kind)):
+            out.delete(native)
     return out
 
 
-def _copy(model: Tree[Handle]) -> MjSpec:
-    """Return a copy of a model's own spec that can become a part of another one."""
-    out = copy_spec(model)
+def full_copy(model: Tree[Handle]) -> MjSpec:
+    """Return a copy of a model's own spec as ``copy_spec`` does, with what names elements of other models."""
+    wanted = late_elements.count(model._spec)
+    found = late_elements.count(copy_spec(model))
+    late = late_elements.closed(kind for kind, number in wanted.items() if found[kind] != number)
+    out = copy_spec(model, late)
+    for kind in late:
+        for native in getattr(model._spec, translate.plural(kind)):
+            new = late_elements.copied(out, kind, native, native.name)
+            for part in path_of(model, native) if kind == "tendon" else ():
+                wrap(new, part, lambda kind, target: target if isinstance(target, str) else target.full_identifier)
+    return out
+
+
+def _copy(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
+    """Return a copy of a model's own spec that can become a part of another one, without some kinds of elements."""
+    out = copy_spec(model, late)
     merge.clear(out, model.settings())
     out.compiler.degree = model.reads_degrees()
     merge.inherit_compiler(out, model)
@@ -124,118 +192,3 @@ def _unnamed(model: Tree[Handle]) -> Iterator[tuple[Native, str]]:
         for number, element in enumerate(model.find_all(kind, exclude_attachments=True)):
             if not element._native.name:
                 yield element._native, f"{lead}/unnamed_{kind}_{number}"
-
-
-def _name_seen_from(model: Tree[Handle], target: Handle) -> str:
-    if target.root is model:
-        return target._native.name
-    if _is_aside(model, target):  # any element of its kind does for now: what names nothing is dropped
-        own = model.find_all(target.kind, exclude_attachments=True)
-        if own:
-            return own[0]._native.name
-    return model_name(target, model)
-
-
-def _is_aside(model: Tree[Handle], target: Handle) -> bool:
-    """Return whether an element is in the same world as a model, but neither in it nor below it."""
-    above = _above(target.root)
-    return target.root is not model and model not in above and target.root.root_model is model.root_model
-
-
-def _point_aside(out: MjSpec, models: list[Tree[Handle]]) -> None:
-    """Let elements name what is beside or above their own model, now that all models are in one spec."""
-    for model in models:
-        for (native, key), target in model.references.items():
-            if _is_aside(model, target):
-                element = model.find_handle(native)
-                translate.point(getattr(out, element.kind)(element.full_identifier), key, target.full_identifier)
-
-
-def model_name(target: Handle, model: Tree[Handle]) -> str:
-    """Return an element's name as seen from a model above the element's own."""
-    if target.root is not model and model not in _above(target.root):
-        raise UsageError(
-            f"model {model.model!r} refers to {target.full_identifier!r}, which is not attached below it",
-            hint="attach it first, or add the referring element to a model above both",
-        )
-    return target.root.identify(target, relative_to=model)
-
-
-def _above(model: Tree[Handle]) -> list[Tree[Handle]]:
-    found, current = [], model.parent_model
-    while current is not None:
-        found.append(current)
-        current = current.parent_model
-    return found
-
-
-def _count(spec: MjSpec, kind: str) -> int:
-    return len(getattr(spec, translate.plural(kind)))
-
-
-def _copy_all(model: Tree[Handle], lost: list[str]) -> MjSpec:
-    """Return a copy of a spec with what a plain copy drops of some kinds: elements that name others elsewhere.
-
-    They are added anew, in the source's order; done before anything is attached, so that they resolve.
-
-    Raises:
-        UsageError: When one names an element that is not below the model either.
-    """
-    spec = model._spec
-    wanted = [(kind, native, native.name) for kind in lost for native in getattr(spec, translate.plural(kind))]
-    for kind, native, _ in wanted:
-        _check_targets(model, kind, native)
-    try:
-        for _, native, _ in wanted:  # the names of what a copy drops stay taken in it
-            native.name = ""
-        out = spec.copy()
-    finally:
-        for _, native, name in wanted:
-            native.name = name
-    for kind in lost:
-        for native in getattr(out, translate.plural(kind)):
-            out.delete(native)
-    for kind, native, name in wanted:
-        new = getattr(out, f"add_{kind}")()
-        new.name, new.info = name, native.info
-        for key in translate.attributes(native):
-            value = getattr(native, key)
-            if not callable(value) and value is not None:
-                setattr(new, key, value)
-    return out
-
-
-_OBJECTS = {**{k.object_type: name for name, k in layout.KINDS.items()}, mj.mjtObj.mjOBJ_XBODY: "body"}
-_TRANSMISSIONS = {
-    **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "joint" for name in ("JOINT", "JOINTINPARENT")},
-    **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "site" for name in ("SITE", "SLIDERCRANK")},
-    mj.mjtTrn.mjTRN_TENDON: "tendon",
-    mj.mjtTrn.mjTRN_BODY: "body",
-}
-
-
-def _targets(kind: str, native: Native) -> list[tuple[str | None, str]]:
-    """Return kind and name of the elements that one names."""
-    if kind == "actuator":
-        return [
-            (_TRANSMISSIONS.get(native.trntype), native.target),
-            ("site", native.refsite),
-            ("site", native.slidersite),
-        ]
-    if kind == "sensor":
-        return [(_OBJECTS.get(native.objtype), native.objname), (_OBJECTS.get(native.reftype), native.refname)]
-    if kind == "equality":
-        return [(_OBJECTS.get(native.objtype), name) for name in (native.name1, native.name2)]
-    names = ("geomname1", "geomname2") if kind == "pair" else ("bodyname1", "bodyname2")
-    return [("geom" if kind == "pair" else "body", getattr(native, name)) for name in names]
-
-
-def _check_targets(model: Tree[Handle], kind: str, native: Native) -> None:
-    for target, name in _targets(kind, native):
-        if target and name and model.find(target, name) is None:
-            known = ", ".join(filter(None, (e.name for e in model.find_all(target, exclude_attachments=True))))
-            raise UsageError(
-                f"{kind} {native.name!r} of model {model.model!r} names the {target} {name!r}, which is not there. "
-                f"Available: {known}",
-                hint="elements of attached models have the names of those in front: arm/hand/finger",
-            )

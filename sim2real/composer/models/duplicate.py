@@ -6,7 +6,10 @@ import itertools
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from sim2real.composer.models import compose, translate
+from sim2real.composer.models.given import PathPart
+from sim2real.composer.models.paths import path_of
 from sim2real.composer.models.tree import Tree
+from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Native
@@ -22,13 +25,33 @@ def duplicate(model: T) -> T:
     for old, new in twins.items():
         new.overrides = old.overrides.among(twins)
         for (native, key), target in old.references.items():
-            new.references[natives[native], key] = twins[target.root].handle(target.kind, natives[target._native])
+            new.references[natives[native], key] = _twin(old, target, twins, natives)
+        for native, path in old.paths.items():
+            new.paths[natives[native]] = [_part(old, part, twins, natives) for part in path]
     return made
 
 
+def _twin(model: Tree[Any], target: Any, twins: dict[T, T], natives: dict[Native, Native]) -> Any:
+    """Return the copy of what an element of a model names."""
+    if target.is_removed:
+        return target
+    if target.root not in twins:
+        raise UsageError(
+            f"model {model.model!r} cannot be copied: it refers to {target.full_identifier!r}, which is not below it",
+            hint="copy a model above both",
+        )
+    return twins[target.root].handle(target.kind, natives[target._native])
+
+
+def _part(model: Tree[Any], part: PathPart, twins: dict[T, T], natives: dict[Native, Native]) -> PathPart:
+    values = {k: _twin(model, v, twins, natives) if hasattr(v, "root") else v for k, v in part.values.items()}
+    return PathPart(part.tag, values, dict(part.written))
+
+
 def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
-    spec = compose.copy_spec(model)
+    spec = compose.full_copy(model)
     made = twins[model] = type(model).owning(spec)
+    made.shows_text = model.shows_text
     made.inherits_angle = model.inherits_angle
     natives[model._spec.worldbody] = spec.worldbody
     for kind in compose.NAMED_KINDS:
@@ -37,6 +60,8 @@ def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
             natives[old] = new
             if not old.name:  # which the copy was given
                 new.name = ""
+    for native in model._spec.tendons:
+        path_of(model, native)
     made.records = model.records.among(natives)
     made._order = {natives[old]: number for old, number in model._order.items() if old in natives}
     made._clock = itertools.count(max(made._order.values(), default=next(made._clock)) + 1)

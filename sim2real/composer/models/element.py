@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.models import attaching, builder, files, given, schema, translate
+from sim2real.composer.models import attaching, builder, files, given, schema, translate, xml
 from sim2real.composer.models.element_list import ElementList
-from sim2real.composer.models.references import REFERENCES, refer, referenced
+from sim2real.composer.models.references import REFERENCES, refer, referenced, rename
 from sim2real.composer.models.schema import KIND_OF_TAG
 from sim2real.composer.models.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Handle, Tree
@@ -37,7 +37,7 @@ class Element(Handle):
     root: Tree[Element]
 
     def add(self, tag: str, **attrs: Any) -> Element:
-        """Add an element to a body, or a path element to a tendon.
+        """Add an element to a body, a part of its path to a tendon, or to a tuple what it names.
 
         Args:
             tag: ``body``, ``geom``, ``joint``, ``freejoint``, ``site``, ``camera``, ``light`` or ``inertial``.
@@ -48,6 +48,8 @@ class Element(Handle):
         """
         if self.kind == "tendon":
             return builder.extend_tendon(self.root, self, tag, attrs)
+        if self.kind == "tuple":
+            return builder.extend_tuple(self.root, self, tag, attrs)
         if self.is_frame and tag not in ("joint", "freejoint", "inertial"):
             raise UsageError(
                 f"a <{tag}> cannot stand in the attachment frame {self.full_identifier!r}. "
@@ -106,6 +108,18 @@ class Element(Handle):
         for name, value in attrs.items():
             setattr(self, name, value)
 
+    def to_xml_string(
+        self, prefix_root: Tree[Element] | None = None, self_only: bool = False, pretty_print: bool = True
+    ) -> str:
+        """Return this element as MJCF: what was given of it, and what stands in it.
+
+        Args:
+            prefix_root: The model from which names are seen; default: the element's own.
+            self_only: Whether what stands in it is left out.
+            pretty_print: Whether every element has a line of its own.
+        """
+        return xml.to_xml_string(self, prefix_root, self_only, pretty_print)
+
     def remove(self) -> None:
         """Delete the element from its model, with what refers to it."""
         builder.remove(self.root, self)
@@ -148,7 +162,9 @@ class Element(Handle):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "name":
-            type(self).name.__set__(self, value)
+            self.root.check_name(self.kind, value)
+            rename(self, value or "")
+            self.root.touch()
             return
         kind, said = self.kind, self.recorded()
         value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value

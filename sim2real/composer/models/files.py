@@ -66,7 +66,11 @@ def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
     path = Path(file)
     for name in (file, str(Path(folder) / path), path.name):
         if name in spec.assets:
-            return Asset(spec.assets[name], path.suffix, path.stem)
+            found = Asset(spec.assets[name], path.suffix)
+            if found.get_vfs_filename() == path.name:  # so a program that gave its contents called it
+                return found
+            digest = found.get_vfs_filename().removesuffix(path.suffix)
+            return Asset(found.contents, path.suffix, path.stem.removesuffix(f"-{digest}"))
     full = Path(spec.modelfiledir or ".") / (folder or "") / path
     if not full.is_file():
         raise UsageError(f"model {model.model!r} has no file {file!r}: it is neither among its assets nor at {full}")

@@ -41,6 +41,26 @@ class Given:
             self.values[name] = value
 
 
+@dataclass
+class PathPart:
+    """A part of a tendon's path.
+
+    Attributes:
+        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
+        values: Attribute in MJCF -> element, its name where it is not there, or number.
+        written: Attribute -> the name that the ``MjSpec`` has.
+    """
+
+    tag: str
+    values: dict[str, Any]
+    written: dict[str, str]
+
+    def is_outdated(self, model: Any) -> bool:
+        """Return whether the ``MjSpec`` has other names than those by which the model's own elements are called now."""
+        named = [(self.values[key], text) for key, text in self.written.items()]
+        return any(e.root is not model or e.is_removed or e._native.name != text for e, text in named)
+
+
 class Document:
     """The text of a model, from which the tags and attributes of its elements are read when somebody asks.
 
@@ -147,6 +167,10 @@ class Records:
         """Return the classes of defaults directly below another one."""
         return [below for below, above in self._classes.items() if above == name]
 
+    def class_names(self) -> list[str]:
+        """Return all classes of defaults."""
+        return list(dict.fromkeys(["main", *self._classes]))
+
     def add_class(self, name: str, above: str) -> None:
         """Note a class of defaults."""
         self._classes[name] = above
@@ -187,8 +211,12 @@ class Records:
         return self._written(native, kind) or read(native, kind, defaults(native, kind))
 
     def _written(self, native: Native, kind: str) -> Given | None:
+        return None if kind == "inertial" else self.written(native)
+
+    def written(self, native: Native) -> Given | None:
+        """Return what the document has of an element, or of a part of a tendon's path; None without a document."""
         words = native.info.split()
-        if self._document is None or kind == "inertial" or len(words) != 2 or not words[1].isdigit():
+        if self._document is None or len(words) != 2 or not words[1].isdigit():
             return None
         return self._document.lines.get(int(words[1]))
 

@@ -62,7 +62,10 @@ KINDS = {
     "text": ElementKind(mj.mjtObj.mjOBJ_TEXT, ("ntext",), ("text",)),
     "key": ElementKind(mj.mjtObj.mjOBJ_KEY, ("nkey",), ("key",)),
 }
-OBJECT_TYPES = {**{name: kind.object_type for name, kind in KINDS.items()}, "pair": mj.mjtObj.mjOBJ_PAIR}
+OBJECT_TYPES = {
+    **{name: kind.object_type for name, kind in KINDS.items()},
+    **{name: getattr(mj.mjtObj, f"mjOBJ_{name.upper()}") for name in ("pair", "exclude", "tuple", "skin", "flex")},
+}
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.models import attaching, compose, duplicate, files, parse
+from sim2real.composer.models import attaching, compose, duplicate, files, parse, references, writing
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.given import Document
 from sim2real.composer.models.schema import SECTION_OF
@@ -36,23 +36,65 @@ class Model(Tree[Element]):
         self._sections = make_sections(self)
 
     @classmethod
-    def from_xml_string(cls, xml_string: str | bytes, assets: dict[str, bytes] | None = None) -> Model:
-        """Return a model from MJCF; ``assets`` are its files by name."""
-        return cls.owning(*parse.from_string(xml_string, assets))
+    def from_xml_string(
+        cls,
+        xml_string: str | bytes,
+        assets: dict[str, bytes] | None = None,
+        *,
+        model_dir: str | os.PathLike[str] = "",
+        resolve_references: bool = True,
+    ) -> Model:
+        """Return a model from MJCF.
+
+        Args:
+            xml_string: The document.
+            assets: Contents of files by name: they are looked for there first.
+            model_dir: Where relative paths of files begin; default: the working directory.
+            resolve_references: False: attributes that name elements read as text until ``resolve_references()``.
+        """
+        return cls._owning(*parse.from_string(xml_string, assets, model_dir), resolve_references)
 
     @classmethod
-    def from_path(cls, path: str | os.PathLike[str], assets: dict[str, bytes] | None = None) -> Model:
+    def from_path(
+        cls,
+        path: str | os.PathLike[str],
+        assets: dict[str, bytes] | None = None,
+        *,
+        resolve_references: bool = True,
+    ) -> Model:
         """Return a model from an MJCF file.
+
+        Args:
+            path: The file.
+            assets: Contents of files by name: they are looked for there first.
+            resolve_references: As in ``from_xml_string``.
 
         Raises:
             UsageError: When there is no such file.
         """
-        return cls.owning(*parse.from_path(path, assets))
+        return cls._owning(*parse.from_path(path, assets), resolve_references)
 
     @classmethod
-    def from_file(cls, file: IO[str] | IO[bytes], assets: dict[str, bytes] | None = None) -> Model:
-        """Return a model from an open MJCF file."""
-        return cls.from_xml_string(file.read(), assets)
+    def from_file(
+        cls,
+        file: IO[str] | IO[bytes],
+        assets: dict[str, bytes] | None = None,
+        *,
+        model_dir: str | os.PathLike[str] = "",
+        resolve_references: bool = True,
+    ) -> Model:
+        """Return a model from an open MJCF file; the arguments are those of ``from_xml_string``."""
+        return cls.from_xml_string(file.read(), assets, model_dir=model_dir, resolve_references=resolve_references)
+
+    @classmethod
+    def _owning(cls, spec: MjSpec, document: Document, resolve_references: bool) -> Model:
+        model = cls.owning(spec, document)
+        model.shows_text = not resolve_references
+        return model
+
+    def resolve_references(self) -> None:
+        """Let attributes that name elements read as elements."""
+        self.shows_text = False
 
     def __copy__(self) -> Model:
         return duplicate.duplicate(self)
@@ -86,6 +128,11 @@ class Model(Tree[Element]):
         """Return the model attached under a name such as ``arm/hand``, or None."""
         return self.find("attached_model", scope_identifier.rstrip("/"))
 
+    def rename_attachment(self, old: str, new: str) -> None:
+        """Rename an attached model's frame; what names the model's elements names them still."""
+        references.hold_below(self, f"{old}/")
+        super().rename_attachment(old, new)
+
     # -- attaching
 
     def attach(self, model: Model) -> Element:
@@ -103,12 +150,14 @@ class Model(Tree[Element]):
         return compose.compile_model(self)
 
     def to_xml_string(self) -> str:
-        """Return the composed model as MJCF; its files are called as ``get_assets`` calls them."""
+        """Return the composed model as MJCF; its files are called as ``get_assets`` calls them.
+
+        The model may be unfinished: moving bodies need no mass yet.
+        """
         with files.renamed(self):
             spec = compose.compose(self)
         files.flatten(spec)
-        spec.compile()
-        return spec.to_xml()
+        return writing.to_xml(spec)
 
     def get_assets(self) -> dict[str, bytes]:
         """Return the contents of the files that ``to_xml_string`` names: name -> bytes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +12,6 @@ from sim2real.composer.models.translate import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    import os
-
     from sim2real.composer.types import MjSpec
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
@@ -21,16 +20,32 @@ _ROOT = re.compile(r"<(mujoco\w*)[^>]*>(.*)</\1\s*>", re.DOTALL)
 _BETWEEN = re.compile(r">\s*<(?!!)")
 
 
-def from_string(text: str | bytes, assets: dict[str, bytes] | None = None) -> tuple[MjSpec, Document]:
-    """Return the ``MjSpec`` of an MJCF document, and the document as it was read.
+def from_string(
+    text: str | bytes, assets: dict[str, bytes] | None = None, folder: str | os.PathLike[str] = ""
+) -> tuple[MjSpec, Document]:
+    """Return the ``MjSpec`` of an MJCF document, and the document as it was read, with those that it includes.
 
     Every element is put on a line of its own: the line that MuJoCo notes then gives the order of the document, which
     decides what elements without a name are called.
 
+    Args:
+        text: The document.
+        assets: Contents of files by name: they are looked for there first.
+        folder: Where relative paths of files begin; default: the working directory.
+
     Raises:
         ValueError: MuJoCo's own message, when the document cannot be parsed.
+        UsageError: When a document that it includes is not there.
     """
     text = text.decode() if isinstance(text, bytes) else text
+    whole = _with_included(text, Path(folder), Path(folder), assets or {})
+    spec, document = _parse(whole, assets)
+    if os.fspath(folder):
+        spec.modelfiledir = str(Path(folder).resolve())
+    return spec, document
+
+
+def _parse(text: str, assets: dict[str, bytes] | None) -> tuple[MjSpec, Document]:
     spread = _BETWEEN.sub(">\n<", text)
     try:
         return _named(mj.MjSpec.from_string(spread, assets=assets or {}), text), Document(spread)
@@ -48,7 +63,7 @@ def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = No
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
-    spec, document = from_string(_read(path, path.parent, assets or {}), assets)
+    spec, document = _parse(_read(path, path.parent, assets or {}), assets)
     spec.modelfiledir = str(path.parent.resolve())
     return spec, document
 
@@ -57,12 +72,20 @@ def _read(path: Path, folder: Path, assets: dict[str, bytes]) -> str:
     """Return the text of a document with what it includes in its place."""
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
     text = assets[name].decode() if name in assets else path.read_text(encoding="utf-8")
+    return _with_included(text, path.parent, folder, assets)
+
+
+def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, bytes]) -> str:
+    """Return a document with what it includes in its place, looked for in two folders."""
 
     def included(match: re.Match[str]) -> str:
-        candidates = [folder / match[1], path.parent / match[1]]
+        candidates = [folder / match[1], beside / match[1]]
         found = next((c for c in candidates if c.is_file() or match[1] in assets), None)
         if found is None:
-            raise UsageError(f"{path} includes {match[1]!r}, which is not there", hint=f"looked for {candidates[0]}")
+            raise UsageError(
+                f"the document includes {match[1]!r}, which is not there",
+                hint=f"looked for {candidates[0]}; from_xml_string takes model_dir and assets",
+            )
         body = _ROOT.search(_read(found, folder, assets))
         return body[2] if body else ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,6 +85,17 @@ class Section:
     def all_children(self) -> list[Element]:
         """Return the elements of this section, without those of attached models."""
         return [e for kind in self._kinds for e in self._model.find_all(kind, exclude_attachments=True)]
+
+    def to_xml_string(self) -> str:
+        """Return the elements of this section as MJCF, without those of attached models.
+
+        Raises:
+            UsageError: When it holds no elements but options, which only whole models write.
+        """
+        if not self._kinds:
+            raise UsageError(f"<{self._name}> holds no elements", hint="model.to_xml_string() writes options too")
+        inner = "".join(f"{e.to_xml_string()}\n" for e in self.all_children())
+        return f"<{self.tag}>\n{textwrap.indent(inner, '  ')}</{self.tag}>" if inner else f"<{self.tag}/>"
 
     def set_attributes(self, **attrs: Any) -> None:
         """Set several attributes."""

@@ -39,6 +39,7 @@ _RENAMED = {
         "actuatorfrclimited": "actfrclimited",
         "actuatorgravcomp": "actgravcomp",
     },
+    "site": {"mesh": "meshname"},
     "camera": {"target": "targetbody"},
     "light": {"target": "targetbody"},
     "tendon": {
@@ -120,23 +121,6 @@ def read(native: Native, kind: str, key: str) -> Any:
     return value
 
 
-def point(native: Native, key: str, name: str) -> None:
-    """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
-
-    Args:
-        native: The element of the ``MjSpec``.
-        key: The attribute, in the spelling of ``MjSpec``.
-        name: The other element's name; '' for none.
-    """
-    key, _, number = key.partition("[")
-    if not number:
-        setattr(native, key, name)
-        return
-    names = list(getattr(native, key))
-    names[int(number[:-1])] = name
-    setattr(native, key, names)
-
-
 def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser.
 
@@ -160,7 +144,7 @@ def _is_plain(native: Native, kind: str, key: str) -> tuple[bool, bool]:
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return True, True
     name = native_name(kind, key)
-    if name in _SKIPPED or not hasattr(native, name):
+    if name in _SKIPPED or not hasattr(native, name) or (kind, key) == ("numeric", "data"):  # whose length is its size
         return False, False
     value = getattr(native, name)
     is_keyword = type(value).__module__.endswith("_enums") and not isinstance(value, mj.mjtLimited)
@@ -220,6 +204,8 @@ def assign(native: Native, kind: str, key: str, value: Any) -> None:
     name, size, dtype, choices = plan
     if size:
         numbers = np.array(value, dtype) if value.__class__ is not str else np.array(_numbers(value), dtype)
+        if numbers.size > size:
+            raise UsageError(f"{key} of a <{kind}> takes no more than {size} numbers, got {numbers.size}")
         if numbers.size < size:  # a part is given: the rest stays
             whole = getattr(native, name).copy()
             whole[: numbers.size] = numbers
@@ -312,6 +298,8 @@ def from_xml(
     Raises:
         ValueError: When the parser refuses the element.
     """
+    if kind == "tuple":  # which has no attributes; what it names is added later
+        return {}, {}
     plain = tuple([(k, v if v.__class__ is str else _text(v)) for k, v in attrs.items() if k not in references])
     fixed, named = _parsed(kind, tag, plain, tuple(references))
     return fixed, {
@@ -324,7 +312,8 @@ def from_xml(
 def _parsed(
     kind: str, tag: str, plain: tuple[tuple[str, str], ...], references: tuple[str, ...]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*plain, *((k, f"@{k}") for k in references)))
+    needed = (("name", "_"),) if kind in ("numeric", "text") else ()
+    words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*needed, *plain, *((k, f"@{k}") for k in references)))
     spec = mj.MjSpec()
     if kind in TREE_KINDS:
         text, owner = f"<worldbody><body><{tag} {words}/></body></worldbody>", spec.worldbody
@@ -341,6 +330,28 @@ def _parsed(
             value = _detached(value)
             (named if _is_reference(value) else fixed)[name] = value
     return fixed, named
+
+
+def key_of(kind: str, tag: str, name: str, references: tuple[str, ...], plain: Mapping[str, str]) -> str | None:
+    """Return the native attribute, such as ``objname`` or ``textures[1]``, that MuJoCo's parser puts a reference in.
+
+    Args:
+        kind: Namespace of the element, such as ``sensor``.
+        tag: Its tag.
+        name: The attribute in MJCF that names another element.
+        references: All its attributes that do so.
+        plain: Attributes that decide what is named.
+    """
+    try:
+        _, named = _parsed(kind, tag, tuple(plain.items()), references)
+    except ValueError:
+        return None
+    for key, value in named.items():
+        if value == f"@{name}":
+            return key
+        if isinstance(value, list) and f"@{name}" in value:
+            return f"{key}[{value.index(f'@{name}')}]"
+    return None
 
 
 def _is_reference(value: Any) -> bool:
@@ -370,10 +381,15 @@ def same(a: Any, b: Any) -> bool:
         return True
 
 
+def kind_of(native: Native) -> str:
+    """Return the kind of an element of an ``MjSpec``."""
+    return type(native).__name__.removeprefix("Mjs").lower()
+
+
 def plural(kind: str) -> str:
     """Return the name of the list in an ``MjSpec`` that holds elements of a kind."""
     if kind == "body":
         return "bodies"
     if kind == "equality":
         return "equalities"
-    return f"{kind}es" if kind == "mesh" else f"{kind}s"
+    return f"{kind}es" if kind in ("mesh", "flex") else f"{kind}s"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models import translate
-from sim2real.composer.models.given import Document, Given, Records
+from sim2real.composer.models.given import Document, Given, PathPart, Records
 from sim2real.composer.models.schema import KIND_OF_TAG, SECTION_OF
 from sim2real.composer.models.scope import Scope
 from sim2real.composer.models.translate import TREE_KINDS
@@ -118,6 +118,10 @@ class Tree(Scope, Generic[H]):
     Attributes:
         references: Native element and attribute -> the element that the attribute names, whatever that is called.
         records: What was given of every element.
+        shows_text: Whether attributes that name elements by text read as text.
+        removed: Deleted element that others name -> its name.
+        counted: How many elements of each kind there were, and at which revision.
+        paths: Native tendon -> what it runs over, as far as that was read.
     """
 
     handle_type: ClassVar[type[Handle]] = Handle
@@ -127,6 +131,10 @@ class Tree(Scope, Generic[H]):
         super().__init__(model, spec)
         self.records = Records(document, is_blank=spec is None)
         self.references: dict[tuple[Native, str], H] = {}
+        self.shows_text = False
+        self.removed: dict[Handle, str] = {}
+        self.counted: tuple[int | None, dict[str, int]] | None = None
+        self.paths: dict[Native, list[PathPart]] = {}
         self._handles: dict[Native | tuple[Native, str], H] = {}
         self._order: dict[Native, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
@@ -232,7 +240,7 @@ class Tree(Scope, Generic[H]):
             return self.worldbody
         getter = getattr(self._spec, KIND_OF_TAG.get(kind, kind), None)
         if getter is None:
-            raise UsageError(f"{kind!r} is not a kind of element")
+            raise UsageError(f"{kind!r} is not a valid namespace: there are no elements of that kind")
         native = getter(identifier)
         return None if native is None else self.handle(KIND_OF_TAG.get(kind, kind), native)
 
@@ -241,15 +249,18 @@ class Tree(Scope, Generic[H]):
 
         Args:
             kind: Of elements.
-            immediate_children_only: Only those that stand in the world itself.
+            immediate_children_only: Only those that stand directly in the model, which holds sections and its world.
             exclude_attachments: Only this model's own.
         """
         kind = KIND_OF_TAG.get(kind, kind)
         if kind in TREE_KINDS:
-            return list(self.walk(self._spec.worldbody, kind, immediate_children_only, exclude_attachments))
+            found = self.walk(self._spec.worldbody, kind, False, exclude_attachments)
+            return [] if immediate_children_only else list(found)
         natives = getattr(self._spec, translate.plural(kind), None)
         if natives is None:
-            raise UsageError(f"{kind!r} is not a kind of element")
+            raise UsageError(f"{kind!r} is not a valid namespace: there are no elements of that kind")
+        if immediate_children_only:
+            return []
         found = [self.handle(kind, n) for n in natives]
         if not exclude_attachments:
             for attachment in self.attachments.values():

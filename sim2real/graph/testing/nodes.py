@@ -11,12 +11,14 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.delays import EmpiricalDist
+from sim2real.graph.delays import EmpiricalDist, TrainableDist
 from sim2real.graph.node import BaseNode, BaseWorld, Jitter, Scheduling
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
 
+_BURST = 8
+"""Extra messages in the windows of trainable delays: senders with hiccups send in bursts."""
 _PRIME, _OFFSET, _MASK = 16777619, 12345, 2**32 - 1
 
 
@@ -30,6 +32,21 @@ class Value(Base):
 def mix(a: int, b: int) -> int:
     """Return a 32-bit hash of two 32-bit integers; it depends on their order."""
     return ((a ^ (b & _MASK)) * _PRIME + _OFFSET) & _MASK
+
+
+DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "bool", "float32", "float16")
+"""Dtypes of the messages of hash nodes in a random graph."""
+
+
+def as_message(out: int, dtype: str) -> int:
+    """Return the number that a message has which a hash node makes of its output; every dtype holds it exactly."""
+    if dtype == "bool":
+        return out & 1
+    if dtype.startswith("float"):
+        return out & 0x3FF
+    bits = 8 * np.dtype(dtype).itemsize
+    low = out & (2**bits - 1)
+    return low - 2**bits if dtype.startswith("int") and low >> (bits - 1) else low
 
 
 def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) -> tuple[int, int]:
@@ -48,9 +65,14 @@ def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) 
 
 
 class HashInPython(BaseNode):
-    """A hash node in Python: its state is a hash of every entry of every window of all its steps."""
+    """A hash node in Python: its state is a hash of every entry of every window of all its steps.
+
+    Attributes:
+        dtype: Dtype of its messages, one of ``DTYPES``.
+    """
 
     jittable = False
+    dtype = "uint32"
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return a hash of the node's name."""
@@ -60,7 +82,7 @@ class HashInPython(BaseNode):
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
         """Return a random number; all readers must get the same one."""
         del graph_state
-        return Value(x=jax.random.bits(rng, (), jnp.uint32))
+        return Value(x=self._message(jax.random.bits(rng, (), jnp.uint32)))
 
     def step(self, step_state: StepState) -> tuple[StepState, Value]:
         """Mix everything into the state."""
@@ -69,7 +91,13 @@ class HashInPython(BaseNode):
             for _, w in sorted(step_state.inputs.items())
         ]
         acc, out = hash_step(int(step_state.state), int(step_state.seq), windows)
-        return step_state.replace(state=np.uint32(acc)), Value(x=np.uint32(out))
+        return step_state.replace(state=np.uint32(acc)), Value(x=np.asarray(as_message(out, self.dtype), self.dtype))
+
+    def _message(self, out: jax.Array) -> jax.Array:
+        """Return ``as_message`` in JAX."""
+        if self.dtype == "bool":
+            return (out & 1).astype(bool)
+        return (out & 0x3FF).astype(self.dtype) if self.dtype.startswith("float") else out.astype(self.dtype)
 
 
 class HashInJax(HashInPython):
@@ -81,14 +109,16 @@ class HashInJax(HashInPython):
         """Mix everything into the state."""
 
         def mixed(a: jax.Array, b: ArrayLike) -> jax.Array:
-            return (a ^ jnp.asarray(b).astype(jnp.uint32)) * jnp.uint32(_PRIME) + jnp.uint32(_OFFSET)
+            b = jnp.asarray(b)
+            whole = b.astype(jnp.int32) if jnp.issubdtype(b.dtype, jnp.floating) else b
+            return (a ^ whole.astype(jnp.uint32)) * jnp.uint32(_PRIME) + jnp.uint32(_OFFSET)
 
         acc = mixed(jnp.asarray(step_state.state), step_state.seq)
         for name in sorted(step_state.inputs):
             window = step_state.inputs[name]
             for i in range(window.seq.shape[0]):
                 acc = mixed(mixed(acc, window.seq[i]), window.data.x[i])
-        return step_state.replace(state=acc), Value(x=mixed(acc, jnp.uint32(7)))
+        return step_state.replace(state=acc), Value(x=self._message(mixed(acc, jnp.uint32(7))))
 
 
 class HashWorldInPython(HashInPython, BaseWorld):
@@ -176,7 +206,11 @@ def contracting_node(name: str, rate: float, world: bool, **options: Any) -> Bas
 
 
 def random_graph(
-    seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node
+    seed: int,
+    size: int | None = None,
+    worlds: int | None = None,
+    make: MakeNode = hash_node,
+    trainable: bool = False,
 ) -> dict[str, BaseNode]:
     """Return nodes by name with random rates, delays and connections; the first one can be the supervisor.
 
@@ -188,6 +222,7 @@ def random_graph(
         size: Number of nodes that are not worlds, 1 to 6; default: random.
         worlds: Number of worlds, 0 to 2; default: random.
         make: Makes the nodes.
+        trainable: Whether hash nodes have messages of random dtypes, and some connections a trainable delay.
     """
     rng = np.random.default_rng(seed)
     size = int(rng.integers(2, 5)) if size is None else size
@@ -204,7 +239,30 @@ def random_graph(
                 connect_at_random(rng, reader, sender, skip=j > i)
         if any(c.blocking for c in reader.inputs.values()):
             reader.advance = bool(rng.random() < 0.4)
+    if trainable:
+        for sender in nodes:
+            sender.dtype = DTYPES[int(rng.integers(len(DTYPES)))]
+        for reader in nodes:
+            _make_trainable(rng, reader)
     return {n.name: n for n in nodes}
+
+
+def _make_trainable(rng: np.random.Generator, reader: BaseNode) -> None:
+    """Give most of a reader's connections that may have one a trainable delay, in whole milliseconds.
+
+    Floats are only read without interpolation: the hash of a number that is rounded differs from runtime to runtime.
+    """
+    for connection in reader.inputs.values():
+        sender = connection.output_node
+        free = not connection.blocking and connection.jitter is Jitter.LATEST
+        if not free or not isinstance(sender, HashInPython) or rng.random() < 0.2:
+            continue
+        kinds = ["zoh"] if sender.dtype.startswith("float") else ["zoh", "linear", "linear_real_only"]
+        low = int(rng.integers(0, 5))
+        high = low + int(rng.integers(1, 40))
+        delay = int(rng.integers(low, high + 1))
+        interp = str(rng.choice(kinds))
+        connection.delay_dist = TrainableDist.create(delay / 1000, low / 1000, high / 1000, interp, burst=_BURST)
 
 
 def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNode, skip: bool) -> None:

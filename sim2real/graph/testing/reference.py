@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import cached_property
 
+from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Connection, Jitter, Scheduling
-from sim2real.graph.testing.nodes import hash_step, mix
+from sim2real.graph.testing.nodes import as_message, hash_step, mix
 from sim2real.graph.timeline import Timeline
 
 
@@ -87,8 +88,30 @@ class Reference:
             k: Number of the step.
             width: Length of the window.
         """
-        seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k][-width:]
-        return [-1] * (width - len(seen)) + seen
+        seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
+        connection = self.nodes[node].inputs[name]
+        if isinstance(connection.delay_dist, TrainableDist):
+            return self._held(connection, connection.delay_dist, [-1] * width + seen, self.starts[node][k], width)
+        return ([-1] * width + seen)[-width:]
+
+    def _held(self, c: Connection, dist: TrainableDist, seen: list[int], start: int, width: int) -> list[int]:
+        """Return the messages that hold when a step starts, and at the earlier times of its window."""
+        delay, ends = round(float(dist.delay) * 1e6), self.ends[c.output_node.name]
+        before = 0 if dist.interp == "linear" else -(10**15)
+        arrival = {m: ends[m] + delay if m >= 0 else before for m in seen}
+
+        def last(t: int) -> int:
+            return max(i for i, m in enumerate(seen) if m < 0 or (arrival[m] < t if c.skip else arrival[m] <= t))
+
+        newest = max(last(start), width - 1)
+        entries = range(newest - width + 1, newest + 1)
+        if dist.interp == "zoh":
+            return [seen[i] for i in entries]
+        return [seen[last(start - arrival[seen[newest]] + arrival[seen[i]])] for i in entries]
+
+    def message(self, node: str, state: int) -> int:
+        """Return the number that a hash node sends in a state."""
+        return as_message(mix(state, 7), getattr(self.nodes[node], "dtype", "uint32"))
 
     def hashes(self, states: Mapping[str, int], outputs: Mapping[str, int]) -> dict[str, list[int]]:
         """Return the state of each hash node after each of its steps.
@@ -107,7 +130,9 @@ class Reference:
                     seqs, sender = self.window(n, i, k, c.window), c.output_node.name
                     if seqs[-1] >= len(made[sender]) or len(made[n]) < k:
                         break
-                    windows.append((seqs, [mix(made[sender][m], 7) if m >= 0 else outputs[sender] for m in seqs]))
+                    sent = (made[sender][m] if m >= 0 else None for m in seqs)
+                    values = [outputs[sender] if s is None else self.message(sender, s) for s in sent]
+                    windows.append((seqs, values))
                 else:
                     made[n].append(hash_step(made[n][-1] if k else states[n], k, windows)[0])
                     continue

@@ -160,8 +160,9 @@ class ServoBus(GuardedServos[BusLink]):
     def check(self) -> None:
         """Raise SafetyStop if a servo's watchdog has tripped, it has restarted, or it has a hardware error.
 
-        To be called every now and then when several servos are commanded at once: they do not confirm their goals, and
-        nothing else would show a tripped watchdog or a restart.
+        To be called every now and then: servos that are commanded at once do not confirm their goals, and one that has
+        restarted takes goals, with its torque off. Hardware errors need no look: every answer tells of them. For three
+        servos at 1 Mbaud it is 53 bytes, 0.53 ms; with the emulator it took 0.74 ms, a state 1.06 ms.
         """
         armed = self.armed
         counts, _ = self._read_each(self.ids, (reg.BUS_WATCHDOG,), "read of bus_watchdog")

@@ -69,15 +69,6 @@ class DynamixelServos(ServoBus, Device):
         """Return the share of full torque that the servos apply, from command and angles, all ``(n,)``."""
         return self.drive.effort(command, position_rad)
 
-    def check(self) -> None:
-        """Look for tripped watchdogs and lost settings; a single servo needs no look, as it refuses its next goal.
-
-        Hardware errors need none either: every answer that `measure` gets tells of them. For three servos at 1 Mbaud
-        it is 53 bytes, 0.53 ms; with the emulator it took 0.74 ms, a state 1.06 ms.
-        """
-        if len(self.ids) > 1:
-            super().check()
-
     def disable(self) -> None:
         """Switch the torque off, confirmed by every servo."""
         self.torque(False)

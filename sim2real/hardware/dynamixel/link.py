@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -53,13 +52,7 @@ class BusLink(ServoLink):
 
     def scan(self) -> list[int]:
         """Return the ids of all servos, which answer a ping of everyone; takes 0.8 s."""
-        found = []
-        with self.hold():
-            self._send(PROTOCOL.build(BROADCAST_ID, Instruction.PING))
-            end_ns = time.monotonic_ns() + round(1e9 * _SCAN_S)
-            while (answer := self._next_answer(end_ns)) is not None:
-                found.append(answer.servo_id)
-        return found
+        return self.answering(PROTOCOL.build(BROADCAST_ID, Instruction.PING), _SCAN_S)
 
     def require_fine(self, answer: Answer, what: str) -> None:
         """Raise the error that an answer reports: SafetyStop if the servo has stopped itself.

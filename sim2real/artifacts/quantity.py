@@ -1,0 +1,42 @@
+"""One quantity, identified from each of several recordings by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.artifacts.files import check
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity, estimated from each of R recordings by itself, and from all together.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        estimates: Shape ``(R,)``: one a recording.
+        standard_errors: Shape ``(R,)``.
+        mean: Their mean.
+        standard_error: Of the mean.
+        between: Deviation between recordings, beyond their standard errors.
+        low95: Lower end of the 95 % interval for a further recording.
+        high95: Its upper end.
+        agree: Whether their standard errors explain how much the estimates differ.
+    """
+
+    name: str
+    unit: str
+    estimates: np.ndarray
+    standard_errors: np.ndarray
+    mean: float
+    standard_error: float
+    between: float
+    low95: float
+    high95: float
+    agree: bool
+
+    def __post_init__(self) -> None:
+        """Check that every estimate has an error."""
+        check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")

@@ -1,0 +1,84 @@
+"""Files that a model names: where ROS packages lie, and which meshes a simulation without contacts can do without."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+_PACKAGE = "package://"
+_FROM_GEOMS = 1
+"""Value of the compiler's option inertiafromgeom with which geoms give every inertia."""
+
+
+def find_packages(spec: Any, path: Path) -> list[str]:
+    """Name the files of ROS packages by their places, where they are found; return where else was looked.
+
+    Args:
+        spec: ``mujoco.MjSpec``; it is changed.
+        path: The model's file.
+    """
+    looked: list[str] = []
+    for mesh in spec.meshes:
+        if not mesh.file.startswith(_PACKAGE):
+            continue
+        package, _, rest = mesh.file.removeprefix(_PACKAGE).partition("/")
+        places = _places(path, package)
+        found = next((place / rest for place in places if (place / rest).is_file()), None)
+        if found is not None:
+            mesh.file = str(found.resolve())
+        elif not looked:
+            looked = [f"{_PACKAGE}{package} was looked for in {', '.join(dict.fromkeys(map(str, places)))}"]
+    return looked
+
+
+def leave_out(spec: Any) -> list[str]:
+    """Take out files that only contacts and pictures need; return their names.
+
+    These are meshes and height fields of bodies whose inertia the file has, or which cannot move, and textures.
+
+    Args:
+        spec: ``mujoco.MjSpec``; it is changed.
+    """
+    gone = [g for g in spec.geoms if (g.meshname or g.hfieldname) and _spare(spec, g.parent)]
+    names = {g.name for g in gone if g.name}
+    pairs = [p for p in spec.pairs if {p.geomname1, p.geomname2} & names]
+    for element in (*pairs, *gone):
+        spec.delete(element)
+    meshes, fields = {g.meshname for g in spec.geoms}, {g.hfieldname for g in spec.geoms}
+    files = [m for m in spec.meshes if m.name not in meshes] + [h for h in spec.hfields if h.name not in fields]
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    files += [*spec.textures, *spec.skins]
+    found = [element.file for element in files if getattr(element, "file", "")]
+    for element in files:
+        spec.delete(element)
+    return found
+
+
+def needed_by(spec: Any) -> list[str]:
+    """Return the bodies whose inertia their meshes give."""
+    return sorted(
+        {g.parent.name or "one without a name" for g in spec.geoms if g.meshname and not _spare(spec, g.parent)}
+    )
+
+
+def _spare(spec: Any, body: Any) -> bool:
+    """Return whether a body's motion does not depend on its geoms."""
+    if body.explicitinertial and int(spec.compiler.inertiafromgeom) != _FROM_GEOMS:
+        return True
+    while body is not None and body.name != spec.worldbody.name:
+        if len(body.joints):
+            return False
+        body = body.parent
+    return True
+
+
+def _places(path: Path, package: str) -> list[Path]:
+    """Return the folders in which a ROS package may be."""
+    above = [folder / package for folder in path.resolve().parents]
+    above += [folder for folder in path.resolve().parents if folder.name == package]
+    told = [Path(p) / package for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
+    told += [Path(p) / "share" / package for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    own = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p and Path(p).name == package]
+    return [*told, *own, *above]

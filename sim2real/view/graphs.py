@@ -1,0 +1,164 @@
+"""Pictures of a graph of nodes, and of when its steps run, for a notebook."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import is_color_like
+from matplotlib.figure import Figure
+
+from sim2real.errors import UsageError
+from sim2real.graph.collection import by_name
+from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
+from sim2real.graph.schedule import topological
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Edge
+from sim2real.view.style import BLUE, GRID, INK, MUTED, ORANGE, new_figure, styled
+
+_BAR = 0.34
+_WIDE, _HIGH = 3.2, 1.9
+
+
+class Picture:
+    """A figure that a notebook shows.
+
+    Args:
+        figure: The figure of matplotlib.
+    """
+
+    def __init__(self, figure: Figure) -> None:
+        self.figure = figure
+
+    def save(self, path: Path | str) -> None:
+        """Write the picture, as SVG, PNG or PDF by the file's name."""
+        self.figure.savefig(path)
+
+    def _repr_svg_(self) -> str:
+        text = io.StringIO()
+        self.figure.savefig(text, format="svg")
+        return text.getvalue()
+
+    def __repr__(self) -> str:
+        return "Picture(save(FILE) writes it)"
+
+
+def plot_timeline(
+    timeline: Timeline, episode: int = 0, begin_s: float = 0.0, end_s: float = 0.2, order: Sequence[str] = ()
+) -> Picture:
+    """Draw when steps run, and which message is used by which step.
+
+    Args:
+        timeline: The timelines.
+        episode: Which of them.
+        begin_s: First time that is shown [s].
+        end_s: Last time that is shown [s].
+        order: The nodes from top to bottom; default: as in the timeline.
+
+    Returns:
+        A bar for each step, a line for each message from its sending to its arrival, and a dotted line on to the start
+        of the step that uses it.
+
+    Raises:
+        UsageError: When there is no such episode, node or stretch of time.
+    """
+    if not 0 <= episode < timeline.episodes:
+        raise UsageError(f"there is no episode {episode}: the timeline has {timeline.episodes}")
+    if not begin_s < end_s:
+        raise UsageError(f"nothing lies between {begin_s} and {end_s} s", hint="begin_s must be below end_s")
+    names = list(order or timeline.vertices)
+    if unknown := [n for n in names if n not in timeline.vertices]:
+        raise UsageError(f"the timeline has no node {', '.join(unknown)}. Nodes: {', '.join(timeline.vertices)}")
+    lanes = {name: float(len(names) - 1 - i) for i, name in enumerate(names)}
+    with styled():
+        figure = new_figure(0.6 + 0.55 * len(names))
+        axes = figure.subplots()
+        for name, y in lanes.items():
+            v = timeline.vertices[name]
+            start, end = (t[episode, : v.count[episode]] / TICKS_PER_S for t in (v.start, v.end))
+            seen = (end >= begin_s) & (start <= end_s)
+            # A step that takes no time is a line of its own.
+            spans = [(s, max(e - s, 1e-3 * (end_s - begin_s))) for s, e in zip(start[seen], end[seen], strict=True)]
+            axes.broken_barh(spans, (y - _BAR / 2, _BAR), facecolors=BLUE, edgecolors=INK, linewidth=0.4)
+        for (reader, _), edge in timeline.edges.items():
+            if reader in lanes and edge.sender in lanes:
+                _draw_messages(axes, timeline, episode, (reader, edge), lanes, (begin_s, end_s))
+        axes.set_yticks(list(lanes.values()), list(lanes))
+        axes.set_xlim(begin_s, end_s)
+        axes.set_ylim(-0.6, len(names) - 0.4)
+        axes.set_xlabel("time since the episode's start [s]")
+        axes.grid(axis="x", color=GRID)
+    return Picture(figure)
+
+
+def plot_graph(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> Picture:
+    """Draw the nodes of a graph with their rates, and the connections with what is special about them.
+
+    Nodes stand from left to right, senders before readers unless their ``order`` says another. A dashed arrow is a
+    connection that is skipped, a thick one blocks.
+    """
+    own = by_name(nodes)
+    names = topological(own)
+    names.sort(key=lambda n: (own[n].order is None, own[n].order or 0))
+    place = {name: _WIDE * i for i, name in enumerate(names)}
+    with styled():
+        figure = new_figure(3.2, max(4.0, 1.9 * len(names)))
+        axes = figure.subplots()
+        for name, x in place.items():
+            chosen = own[name].color
+            color = chosen if chosen is not None and is_color_like(chosen) else BLUE
+            box = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": color, "linewidth": 1.6}
+            axes.text(x, 0.0, f"{name}\n{own[name].rate:g} Hz", ha="center", va="center", color=INK, bbox=box)
+        for node in own.values():
+            for i, c in enumerate(node.inputs.values()):
+                _draw_connection(axes, place[c.output_node.name], place[node.name], i, c)
+        axes.set_xlim(-_WIDE / 2, _WIDE * (len(names) - 0.5))
+        axes.set_ylim(-_HIGH, _HIGH)
+        axes.axis("off")
+    return Picture(figure)
+
+
+def _draw_connection(axes: Axes, begin: float, end: float, number: int, connection: Connection) -> None:
+    """Draw an arc: to the right above the nodes, to the left below."""
+    ahead = end > begin
+    height = 0.25 + 0.07 * number
+    arrow = {
+        "arrowstyle": "->",
+        "color": ORANGE if connection.blocking else MUTED,
+        "linestyle": "--" if connection.skip else "-",
+        "linewidth": 1.8 if connection.blocking else 1.0,
+        "connectionstyle": f"arc3,rad={-height}",
+        "shrinkA": 26,
+        "shrinkB": 26,
+    }
+    axes.annotate("", xy=(end, 0.0), xytext=(begin, 0.0), arrowprops=arrow)
+    words = [f"{1e3 * connection.delay:.3g} ms"]
+    words += [f"window {connection.window}"] * (connection.window > 1)
+    words += [word for word in ("blocking", "skip", "trainable") if getattr(connection, word)]
+    away = 0.4 + height * abs(end - begin) / 4
+    at = ((begin + end) / 2, away if ahead else -away)
+    axes.text(*at, ", ".join(words), ha="center", va="bottom" if ahead else "top", color=MUTED)
+
+
+def _draw_messages(
+    axes: Axes,
+    timeline: Timeline,
+    episode: int,
+    connection: tuple[str, Edge],
+    lanes: Mapping[str, float],
+    shown_s: tuple[float, float],
+) -> None:
+    reader, edge = connection
+    starts, ends = timeline.vertices[reader].start[episode], timeline.vertices[edge.sender].end[episode]
+    top, bottom = lanes[edge.sender], lanes[reader]
+    side = _BAR / 2 if bottom > top else -_BAR / 2
+    for m in np.flatnonzero(edge.seq_in[episode] >= 0):
+        sent, received = ends[m] / TICKS_PER_S, edge.received[episode, m] / TICKS_PER_S
+        used = starts[edge.seq_in[episode, m]] / TICKS_PER_S
+        if used < shown_s[0] or sent > shown_s[1]:
+            continue
+        axes.plot([sent, received], [top + side, bottom - side], color=ORANGE, linewidth=0.8)
+        axes.plot([received, used], [bottom - side] * 2, color=ORANGE, linewidth=0.8, linestyle=":")

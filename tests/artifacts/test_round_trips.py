@@ -1,0 +1,214 @@
+"""What is written can be read: any text, NaN and infinite numbers in every kind of text file that stages write."""
+
+import dataclasses
+import math
+import random
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.design import Design
+from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.identification import Identification, Matrix
+from sim2real.artifacts.iterations import Iterations
+from sim2real.artifacts.latency import Latency
+from sim2real.artifacts.manifest import plain, read_manifest, write_manifest
+from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.sensitivity import Sensitivity
+from sim2real.artifacts.timing import Timing
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping, load_mapping, to_toml
+from sim2real.log.toml_text import toml_value
+from sim2real.robots.mjcf_parameters import ParameterPattern
+from sim2real.robots.mjcf_robot import RobotConfig
+
+FILES = (Design, Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
+ODD = [
+    "\U0001f600",
+    "\x7f",
+    "\x00",
+    '"""',
+    "a\n[[terms]]",
+    "\u2028",
+    "",
+    "\\",
+    "'",
+    "#",
+    "nan",
+    "inf",
+    "null",
+    "\ufffe",
+    "a.b",
+]
+BESIDE = ("recordings", "simulated", "probe", "samples", "free", "timing")
+"""Fields that lie in files of their own."""
+SQUARE = {History: ("returns", "success"), Matrix: ("matrix",)}
+TEXT = st.one_of(st.text(max_size=8), st.sampled_from(ODD))
+NUMBERS = (math.inf, -math.inf, math.nan, 1e308, -0.0, 5e-324, 0.1)
+
+
+def drawn(kind: typing.Any, rng: random.Random, tame: bool = False) -> typing.Any:
+    """Return any value of a field's type; two of each, so that sizes fit, and a tame one where a class refuses it."""
+    inner, origin = typing.get_args(kind), typing.get_origin(kind)
+    numbers = (0.5,) if tame else NUMBERS
+    if kind is float:
+        return rng.choice(numbers)
+    if kind is str:
+        return rng.choice(ODD) + chr(rng.choice([rng.randrange(0xD800), rng.randrange(0xE000, 0x110000)]))
+    if kind in (Posterior, typing.Any, object, type(None)):
+        return None
+    if kind is np.ndarray:
+        return np.array(rng.choices(numbers, k=2))
+    if kind in (bool, int):
+        return kind(rng.randrange(2))
+    if dataclasses.is_dataclass(kind):
+        return built(kind, rng, tame)
+    if origin is typing.Literal:
+        return rng.choice(inner)
+    if origin is tuple:
+        return tuple(drawn(k, rng, tame) for k in (inner if inner[-1] is not Ellipsis else inner[:1] * 2))
+    if origin in (dict, Mapping):
+        keys = ["identified" if tame and inner[0] is str else drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
+        return {key: drawn(inner[1], rng, tame) for key in keys}
+    if origin in (list, Sequence):
+        return [drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
+    return drawn(rng.choice(inner), rng, tame)  # a union
+
+
+def built(kind: typing.Any, rng: random.Random, tame: bool) -> typing.Any:
+    """Return an object of a class that may check its fields."""
+    hints = typing.get_type_hints(kind)
+    for strict in (tame, tame, True):
+        names = [f.name for f in dataclasses.fields(kind) if f.name not in BESIDE]
+        values = {name: drawn(hints[name], rng, strict) for name in names}
+        values |= {n: np.tile(values[n], (2, 1)) for n in SQUARE.get(kind, ())}
+        try:
+            return kind(**values)
+        except ValueError:
+            continue
+    return kind(**values)
+
+
+def plainly(value: typing.Any) -> typing.Any:
+    """Return a document as dicts and lists, with None for what JSON lacks."""
+    value = msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
+
+    def without_nan(v: typing.Any) -> typing.Any:
+        if isinstance(v, dict):
+            return {k: without_nan(x) for k, x in v.items()}
+        return (
+            [without_nan(x) for x in v]
+            if isinstance(v, list | tuple)
+            else None
+            if v in (math.inf, -math.inf) or v != v
+            else v
+        )
+
+    return without_nan(value)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_documents_of_stages(tmp_path, kind):
+    rng = random.Random(1)
+    for _ in range(20):
+        document = drawn(kind, rng)
+        write_json(tmp_path / "x.json", document)
+        assert plainly(read_json(tmp_path / "x.json", kind)) == plainly(document)
+
+
+@pytest.mark.parametrize("name", ["file", "a/b", "a.npy", "..", "/abs", "\u2028", *(o for o in ODD if "\0" not in o)])
+def test_arrays_of_any_name(tmp_path, name):
+    write_arrays(tmp_path / "x.npz", {name: np.array(NUMBERS), "other": np.zeros((0, 2))})
+    found = read_arrays(tmp_path / "x.npz")
+    np.testing.assert_array_equal(found[name], NUMBERS)
+    assert found["other"].shape == (0, 2)
+
+
+def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):
+    with pytest.raises(Sim2RealError, match="null character"):
+        write_arrays(tmp_path / "x.npz", {"a\0b": np.zeros(1)})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_manifests(tmp_path, seed):
+    rng = random.Random(seed)
+    entries = {drawn(str, rng): {"path": drawn(str, rng), "sha256": drawn(str, rng)}}
+    texts = {key: drawn(str, rng) for key in ("pipeline", "stage", "status", "started")}
+    written = {**texts, "inputs": entries, "outputs": {}, "summary": {drawn(str, rng): drawn(float, rng)}}
+    write_manifest(tmp_path, written)
+    assert read_manifest(tmp_path) == plain(written)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(TEXT, min_size=3, max_size=3), st.lists(st.floats(), min_size=6, max_size=6))
+def test_descriptions_of_robots(tmp_path_factory, texts, numbers):
+    """robot.toml: names of joints and models, and values, may be anything."""
+    path = tmp_path_factory.mktemp("robot") / "robot.toml"
+    term = ParameterPattern("damping", nominal=numbers[0], low=numbers[1], high=numbers[2], name=texts[2])
+    named = replace(term, joints=re.escape(texts[1]), each=True, free=False)
+    written = RobotConfig(Path(), tuple(texts[:2]), ("goal",), hold=(texts[0],), rate_hz=numbers[3], kp_unit=numbers[4],
+                          sigma_rad=numbers[5], fix_base=True, terms=(term, named))  # fmt: skip
+    path.write_text(written.to_toml("robot.xml"), encoding="utf-8")
+    assert repr(RobotConfig.load(path)) == repr(replace(written, model=path.with_name("robot.xml")))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(TEXT.filter(bool), min_size=6, max_size=6), st.floats(allow_nan=False, allow_infinity=False))
+def test_mappings_of_recorders(tmp_path_factory, texts, number):
+    """import.toml: names of nodes, fields and signals, and lines of comment, may be anything; a unit is printable."""
+    path = tmp_path_factory.mktemp("mapping") / "import.toml"
+    unit = texts[4] if texts[4].isprintable() else ""
+    field = FieldMapping(tuple(texts[:2]), unit, scale=(number, 2.0), offset=number, shape=(2,))
+    nodes = {texts[2]: NodeMapping({texts[3]: field, "other": FieldMapping((texts[0],))}, stamps=texts[5])}
+    path.write_text(to_toml(ImportMapping(texts[0], nodes), comments=texts), encoding="utf-8")
+    assert load_mapping(path) == ImportMapping(texts[0], nodes, path)
+
+
+@pytest.mark.parametrize("write", [toml_value, lambda text: write_json(Path("x.json"), {"name": text})])
+def test_bytes_that_are_no_text_are_refused_in_words(write):
+    with pytest.raises(Sim2RealError, match="bytes that are no text"):
+        write(b"robot\xff.xml".decode(errors="surrogateescape"))
+
+
+def test_a_document_without_infinity_reads_as_before(tmp_path):
+    (tmp_path / "x.json").write_text('{"parameter": null, "of": [1.0, null]}')
+    assert read_json(tmp_path / "x.json", Old) == Old(None, (1.0, None))
+
+
+@dataclasses.dataclass
+class Old:
+    """A file that was written before."""
+
+    parameter: float | None
+    of: tuple[float | None, ...]
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ('model = 5\njoints = ["a"]\ncommands = ["goal"]', "describes no robot"),
+        ('model = "x"\njoints = "abc"\ncommands = ["goal"]', "Expected `array`, got `str` - at `$.joints`"),
+        ('model = "x"\njoints = [1]\ncommands = ["goal"]', "joints"),
+        ('model = "x"\njoints = ["a"]\ncommands = ["goal"]\nrate_hz = "fast"', "Expected `float`, got `str`"),
+        ('model = "x"\njoints = ["a"]\ncommands = ["goal"]\nfast = true', "unknown key 'fast'"),
+        ('joints = ["a"]\ncommands = ["goal"]', "missing required field `model`"),
+        ('model = "x', "describes no robot"),
+        ('model = "\xe4"', "describes no robot"),
+    ],
+)
+def test_what_is_wrong_with_a_description_is_named(tmp_path, text, cause):
+    (tmp_path / "robot.toml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(UsageError) as raised:
+        RobotConfig.load(tmp_path / "robot.toml")
+    assert cause in str(raised.value)

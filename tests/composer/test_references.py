@@ -1,0 +1,230 @@
+"""What elements name: held as elements, across models, through renaming, copying, detaching and deleting."""
+
+import copy
+
+import pytest
+from test_oracle import differing_arrays, names
+
+from sim2real.composer import mjcf
+from sim2real.errors import UsageError
+
+ROBOT = """
+<mujoco model="r"><default><geom material="skin"/></default>
+  <asset><material name="skin" rgba="1 0 0 1"/></asset>
+  <worldbody><body name="b"><joint name="j"/><geom name="g" size=".1"/><site name="s"/>
+    <body name="c" pos="0 0 1"><joint name="k"/><geom name="h" size=".1"/><site name="u"/></body></body>
+    <camera name="cam" mode="targetbody" target="c"/></worldbody>
+  <contact><pair name="pair" geom1="g" geom2="h"/><exclude name="apart" body1="b" body2="c"/></contact>
+  <tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="2"/></fixed>
+    <spatial name="line"><site site="s"/><geom geom="g" sidesite="u"/><site site="u"/><pulley divisor="2"/>
+      <site site="s"/><site site="u"/></spatial></tendon>
+  <equality><joint name="same" joint1="j" joint2="k"/><weld name="weld" body1="b" body2="c"/></equality>
+  <actuator><motor name="m" joint="k"/><motor name="pull" tendon="t"/></actuator>
+  <sensor><jointpos name="angle" joint="k"/><actuatorfrc name="force" actuator="pull"/>
+    <framepos name="place" objtype="body" objname="b" reftype="site" refname="u"/></sensor>
+  <custom><tuple name="both"><element objtype="joint" objname="j"/><element objtype="body" objname="c"/></tuple>
+  </custom>
+</mujoco>
+"""
+
+
+def world(lib):
+    """Return a world of two equal robots and what names their elements in all directions."""
+    top = lib.RootElement(model="w")
+    left, right = lib.from_xml_string(ROBOT), lib.from_xml_string(ROBOT)
+    top.attach(left).pos = [1, 0, 0]
+    top.attach(right)
+    tie = top.tendon.add("spatial", name="tie", stiffness=3.0)
+    tie.add("site", site=left.find("site", "u"))
+    tie.add("site", site=right.find("site", "s"))
+    gear = left.tendon.add("fixed", name="gear")
+    gear.add("joint", joint=right.find("joint", "k"), coef=2.0)
+    gear.add("joint", joint=left.find("joint", "k"), coef=1.0)
+    right.actuator.add("motor", name="drive", tendon=gear)
+    right.sensor.add("tendonpos", name="length", tendon=tie)
+    right.equality.add("tendon", name="lock", tendon1=tie, tendon2=left.find("tendon", "line"))
+    return top, left, right
+
+
+def compiled(lib, top):
+    """Return the ``MjModel`` of a world."""
+    return lib.Physics.from_mjcf_model(top).model.ptr
+
+
+def assert_equal(mine, theirs):
+    assert names(mine) == names(theirs)
+    assert not differing_arrays(mine, theirs)
+
+
+CHANGES = {
+    "nothing": lambda top, left, right: None,
+    "renamed": lambda top, left, right: [
+        setattr(e, "name", f"{e.name}_new") for m in (left, right)
+        for kind in ("body", "joint", "geom", "site", "tendon", "actuator", "material")
+        for e in m.find_all(kind, exclude_attachments=True) if e.name
+    ],
+    "renamed to the other's names": lambda top, left, right: [
+        (setattr(m.find("site", "s"), "name", "x"), setattr(m.find("site", "u"), "name", "s"),
+         setattr(m.find("site", "x"), "name", "u")) for m in (left, right)
+    ],
+    "models renamed": lambda top, left, right: (setattr(right, "model", "x"), setattr(left, "model", "r_1")),
+    "tendon removed": lambda top, left, right: (
+        right.find("equality", "lock").remove(), right.find("sensor", "length").remove(),
+        top.find("tendon", "tie").remove(),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_changed_worlds_are_those_of_dm_control(oracle, change):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        models = world(lib)
+        CHANGES[change](*models)
+        found.append(compiled(lib, models[0]))
+    assert_equal(*found)
+
+
+def test_a_copy_names_its_own_elements():
+    top, *_ = world(mjcf)
+    twin = copy.deepcopy(top)
+    assert_equal(twin.compile(), top.compile())
+    twin.find("attached_model", "r").find("joint", "k").name = "x"
+    assert_equal(top.compile(), world(mjcf)[0].compile())
+    assert "r/x" in names(twin.compile())["joint"]
+
+
+def test_a_copy_of_a_part_that_names_what_is_outside_is_refused():
+    _, left, _ = world(mjcf)
+    with pytest.raises(UsageError, match="model 'r' cannot be copied: it refers to 'r_1/k'"):
+        copy.copy(left)
+
+
+def test_a_detached_model_is_refused_and_may_come_back():
+    top, left, right = world(mjcf)
+    left.detach()
+    with pytest.raises(UsageError, match=r"refers to '(line|gear|u)', which is not attached below it"):
+        top.compile()
+    left.model = "again"
+    top.attach(left)
+    assert right.find("actuator", "drive").tendon.full_identifier == "again/gear"
+    assert top.compile().ntendon == 6
+
+
+def test_text_names_elements_of_models_that_are_attached_later(oracle):
+    text = """<mujoco model="w"><actuator><motor name="m" joint="r/k"/></actuator>
+      <tendon><spatial name="t"><site site="r/s"/><site site="r/u"/></spatial></tendon></mujoco>"""
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        top, robot = lib.from_xml_string(text), lib.from_xml_string(ROBOT)
+        top.attach(robot)
+        found.append(compiled(lib, top))
+    assert_equal(*found)
+
+
+def test_text_follows_a_model_that_is_renamed_after_its_elements():
+    top = mjcf.from_xml_string('<mujoco><actuator><motor name="m" joint="r/k"/></actuator></mujoco>')
+    robot = mjcf.from_xml_string(ROBOT)
+    top.attach(robot)
+    robot.find("joint", "k").name = "kk"
+    robot.model = "x"
+    assert top.find("actuator", "m").joint.full_identifier == "x/kk"
+    assert top.compile().actuator("m").trnid[0] == top.compile().joint("x/kk").id
+
+
+def test_text_that_names_nothing_is_refused():
+    top = mjcf.from_xml_string('<mujoco><actuator><motor name="m" joint="r/k"/></actuator></mujoco>')
+    with pytest.raises(
+        UsageError, match="actuator 'm' of model 'unnamed_model' names the joint 'r/k', which is not there"
+    ):
+        top.compile()
+
+
+REMOVED = [
+    ("joint", "k", "joint 'k'"), ("geom", "h", "geom 'h'"), ("site", "u", "site 'u'"), ("tendon", "t", "tendon 't'"),
+    ("body", "c", "geom 'h'"), ("actuator", "pull", "actuator 'pull'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("attached", [False, True])
+@pytest.mark.parametrize(("kind", "name", "what"), REMOVED)
+def test_deleting_an_element_deletes_nothing_that_names_it(kind, name, what, attached):
+    robot = mjcf.from_xml_string(ROBOT)
+    top = robot
+    if attached:
+        top = mjcf.RootElement(model="w")
+        top.attach(robot)
+    kinds = ("tendon", "actuator", "sensor", "equality", "pair", "exclude", "tuple")
+    before = {k: len(robot.find_all(k)) for k in kinds}
+    robot.find(kind, name).remove()
+    after = {k: len(robot.find_all(k)) for k in kinds}
+    assert after == before | ({kind: before[kind] - 1} if kind in before else {})
+    with pytest.raises(UsageError, match=f"names the {what}, which was removed"):
+        top.compile()
+
+
+def test_what_an_element_can_do_without_is_no_error(oracle):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        robot = lib.from_xml_string(
+            ROBOT.replace('<geom material="skin"/>', "").replace('name="g"', 'name="g" material="skin"')
+        )
+        robot.find("material", "skin").remove()
+        assert robot.find("geom", "g").material is None
+        found.append(compiled(lib, robot))
+    assert_equal(*found)
+
+
+def test_references_read_as_the_elements_that_they_name():
+    robot = mjcf.from_xml_string(ROBOT)
+    k, pull, c = robot.find("joint", "k"), robot.find("actuator", "pull"), robot.find("body", "c")
+    for _ in range(2):
+        assert robot.find("actuator", "m").joint is k
+        assert robot.find("sensor", "force").actuator is pull
+        assert robot.find("sensor", "place").refname is robot.find_all("site")[1]
+        assert robot.find("equality", "same").joint2 is k
+        assert robot.find("exclude", "apart").body2 is c
+        assert robot.find("camera", "cam").target is c
+        k.name, pull.name, c.name, robot.find_all("site")[1].name = "k2", "pull2", "c2", "u2"
+    k.remove()
+    assert robot.find("actuator", "m").joint is None
+
+
+def test_deleting_a_body_detaches_what_is_attached_in_it():
+    top, robot = mjcf.from_xml_string(ROBOT), mjcf.from_xml_string(ROBOT)
+    top.find("site", "u").attach(robot)
+    with_arm = mjcf.from_xml_string(
+        '<mujoco><worldbody><body name="arm"><site name="tip"/></body></worldbody></mujoco>'
+    )
+    robot.detach()
+    with_arm.find("site", "tip").attach(robot)
+    with_arm.find("body", "arm").remove()
+    assert robot.parent_model is None
+    assert with_arm.compile().nbody == 1
+
+
+DOCUMENTS = {
+    "skin": """<asset><skin name="skin" face="0 1 2" vertex="0 0 0 1 0 0 0 1 0"><bone body="b" bindpos="0 0 0"
+        bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/></skin></asset>""",
+    "flex": """<deformable><flex name="flex" dim="1" body="b b" vertex="0 0 0 0 0 1" element="0 1"/></deformable>""",
+    "flexcomp": """<worldbody><body name="host"><flexcomp name="f" type="grid" count="2 2 1" spacing=".1 .1 .1" dim="2"
+        mass="1" rigid="true"/></body></worldbody>""",
+    "replicate": """<worldbody><replicate count="3" offset="1 0 0"><body name="n"><freejoint/><geom size=".1"/></body>
+        </replicate></worldbody>""",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", DOCUMENTS.values(), ids=DOCUMENTS)
+def test_elements_of_documents_only_come_along(text):
+    alone = mjcf.from_xml_string(ROBOT.replace("</mujoco>", text + "</mujoco>"))
+    alone.find("body", "b").name = "bb"
+    top = mjcf.RootElement(model="w")
+    top.attach(alone)
+    top.attach(mjcf.from_xml_string(ROBOT))
+    top.find("attached_model", "r_1").actuator.add("motor", name="other", joint=alone.find("joint", "j"))
+    one = mjcf.from_xml_string(ROBOT.replace("</mujoco>", text + "</mujoco>")).compile()
+    both = top.compile()
+    for count in ("nskin", "nflex", "nflexvert", "nskinbone"):
+        assert getattr(both, count) == getattr(one, count)
+    assert both.ngeom == one.ngeom + 2
+    assert both.neq == one.neq + 2

@@ -1,0 +1,81 @@
+"""Faults of buses in this process: two servos of one id, which both answer and both obey; alarms of DYNAMIXELs."""
+
+import pytest
+
+from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
+from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.plant import OperatingMode
+
+pytestmark = pytest.mark.realtime
+
+
+def answer_twice(robot, servo_id, place, join):
+    """Let the answers of one id come from two servos; ``place`` is where a packet has its id."""
+    send = robot.bus._send
+
+    def sent(answer):
+        return send(join(answer) if answer[place] == servo_id else answer)
+
+    robot.bus._send = sent
+
+
+def one_after_the_other(answer):
+    return answer + answer
+
+
+def at_once(answer):
+    """Of two answers on one line every bit is that of either."""
+    return answer[:4] + bytes(byte & (37 * i + 11) for i, byte in enumerate(answer[4:]))
+
+
+def test_two_answers_to_one_ping_are_refused(serve, connect):
+    robot = serve()
+    answer_twice(robot, 2, 2, one_after_the_other)
+    with pytest.raises(HardwareLost, match=r"have the id 2 \(joint 'joint2'\): both answer[\s\S]*hint: connect one"):
+        connect(robot)
+
+
+def test_answers_that_garble_each_other_are_explained(serve, connect):
+    robot = serve()
+    answer_twice(robot, 2, 2, at_once)
+    with pytest.raises(HardwareLost, match=r"servo 2 .* does not answer[\s\S]*two servos of one id garble"):
+        connect(robot, max_silence_s=0.1)
+
+
+def test_a_late_answer_is_no_second_servo(serve, connect):
+    for seed in range(3):
+        connect(serve(config=StsEmulation(return_delay_us=0, seed=seed, late=0.3, late_s=0.012))).close()
+
+
+def test_dynamixels_too(serve, monkeypatch):
+    monkeypatch.setattr("sts_bench.StsBus", EmulatedBus)
+    robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
+    answer_twice(robot, 1, 4, one_after_the_other)
+    with ServoBus(BusConfig(robot.port, max_silence_s=1.0)) as bus:
+        assert bus.handshake({2: None}) == {2: 1060}
+        with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1: both answer, and both would obey"):
+            bus.handshake({1: None})
+
+
+ALARMS = {"input voltage": 0, "overheating": 2, "motor encoder": 3, "electrical shock": 4, "overload": 5}
+
+
+@pytest.mark.parametrize("bit", ALARMS.values(), ids=ALARMS)
+def test_an_alarm_in_motion_is_named_and_torque_ends_off(serve, monkeypatch, bit):
+    """As when the supply breaks down under load."""
+    monkeypatch.setattr("sts_bench.StsBus", EmulatedBus)
+    robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
+    with ServoBus(BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)) as bus:
+        bus.handshake({1: None, 2: None})
+        bus.setup(OperatingMode.PWM)
+        bus.torque(True)
+        bus.write_goal_pwm({1: 0.5, 2: 0.5})
+        bus.read_state()
+        robot.bus.servos[2].put(reg.HARDWARE_ERROR_STATUS, 1 << bit)
+        (name,) = (name for name, number in ALARMS.items() if number == bit)
+        with pytest.raises(SafetyStop, match=f"servo 2 has stopped itself: {name}"):
+            bus.read_state()
+    assert [robot.bus.servos[i].get(reg.TORQUE_ENABLE) for i in (1, 2)] == [0, 0]

@@ -1,0 +1,134 @@
+"""What the functions for Python take: objects, names, files; and the error for anything else."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sim2real
+from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
+from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.timing import Timing
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode, Steps
+from sim2real.stages import arguments
+from sim2real.stages.config import DeployConfig, IdentifyConfig, TrainConfig
+
+FOUND = Identification(
+    "pendulum",
+    (),
+    Judgement("accepted", ("off by <0.01 rad",)),
+    (Estimate("gain", "1/s^2", "dynamics", "", 1.0, 21.0494, "accepted", 0.1, 20.9, 21.3),),
+)
+EPISODE = Episode({"sensor": Steps(*(np.arange(3) for _ in range(6)))}, {}, {"sensor": {"th": np.zeros(3)}})
+RECORDING = Recording(Path("session.mcap"), EPISODE)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return sim2real.load_pipeline("pendulum")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda p: sim2real.record(3, "folder"), "3 is neither a robot nor a pipeline"),
+        (lambda p: sim2real.record("pendulm", "folder"), "unknown pipeline 'pendulm'"),
+        (lambda p: sim2real.record(p, None), "folder must be the path of a folder; got NoneType"),
+        (lambda p: sim2real.record(p, "folder", DeployConfig()), "of type RecordConfig; got DeployConfig"),
+        (lambda p: sim2real.record(p, "folder", {"seconds": 3}), "config has no seconds. Available: "),
+        (lambda p: sim2real.identify(p, "nope.mcap"), "there is no log nope.mcap"),
+        (lambda p: sim2real.identify("nope.mcap", p), "there is no log nope.mcap"),
+        (lambda p: sim2real.identify(p, [Path("nope.mcap")]), "there is no log nope.mcap"),
+        (lambda p: sim2real.identify(p, []), "recording is empty"),
+        (lambda p: sim2real.identify(p, {"th": [0.0]}), "must be a Recording, or the path of its log; got dict"),
+        (lambda p: sim2real.identify(p, None), "recording must be a Recording"),
+        (lambda p: sim2real.identify(p, EPISODE), "got Episode"),
+        (lambda p: sim2real.identify(p, RECORDING, hold_out="no.mcap"), "there is no log no.mcap"),
+        (lambda p: sim2real.identify(p, RECORDING, TrainConfig()), "config must be of type IdentifyConfig"),
+        (lambda p: sim2real.train(p, {"gain": 21.0}), "identification must be an Identification, .*; got dict"),
+        (lambda p: sim2real.train(p, "nope"), "cannot read nope"),
+        (lambda p: sim2real.train(p, FOUND, IdentifyConfig()), "of type TrainConfig; got IdentifyConfig"),
+        (lambda p: sim2real.train(p, FOUND, {"ppo": {"steps": 1}}), "config.ppo has no steps"),
+        (lambda p: sim2real.train(p, FOUND, timing=3), "timing must be a Timing"),
+        (lambda p: sim2real.deploy(p, "nope", "folder"), "nope"),
+        (lambda p: sim2real.deploy("nope", p, "folder"), "nope"),
+        (lambda p: sim2real.deploy(p, FOUND, "folder"), "bundle must be a Bundle, or its folder; got Identification"),
+        (lambda p: sim2real.check(p, 7), "recording must be a Recording"),
+        (lambda p: sim2real.validate(p, {"gain": 1.0}, RECORDING), "identification must be an Identification"),
+        (lambda p: sim2real.validate("arm", FOUND, RECORDING), "of pipeline 'pendulum', not of 'arm'"),
+        (lambda p: sim2real.export("arm", FOUND, "out.json", "json"), "of pipeline 'pendulum', not of 'arm'"),
+        (lambda p: sim2real.export(p, FOUND, "out.json", "sdf"), "cannot export to 'sdf'. Available: mjcf"),
+        (lambda p: sim2real.report("no_such_run"), "no file, pipeline or run 'no_such_run'"),
+        (lambda p: sim2real.run(p, record=TrainConfig()), "record must be of type RecordConfig"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_before_anything_happens(pendulum, call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Sim2RealError, match=said):
+        call(pendulum)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
+    given = {"episode_s": 2.0, "ppo": {"num_envs": 64}}
+    own = replace(pendulum.train, episode_s=2.0, ppo=replace(pendulum.train.ppo, num_envs=64))
+    assert arguments.config_of(given, pendulum.train) == own
+    assert arguments.config_of(None, pendulum.train) is pendulum.train
+    with pytest.raises(UsageError):
+        arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.identify)
+
+
+def test_one_recording_is_as_good_as_several(pendulum):
+    assert arguments.recordings_of(RECORDING, pendulum) == [RECORDING]
+    assert arguments.recordings_of((RECORDING, RECORDING), pendulum) == [RECORDING] * 2
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
+    folder = kind(tmp_path / "new" / "folder")
+    FOUND.save(folder)
+    assert Identification.load(folder).values == {"gain": 21.0494}
+    assert arguments.identification_of(folder).values == {"gain": 21.0494}
+    with pytest.raises(Sim2RealError, match="there is no log"):
+        Recording.load(kind(tmp_path / "none.mcap"))
+    for load in (Bundle.load, Deployment.load, Timing.load):
+        with pytest.raises(Sim2RealError):
+            load(kind(tmp_path / "none"))
+
+
+DEPLOYED = Deployment((Scores({"success": 1.0}),), (Gap("success", 1.0, None, None),), advice=Advice("fine", ()))
+
+
+@pytest.mark.parametrize(
+    ("artifact", "short", "table"),
+    [
+        (FOUND, "Identification(pipeline: pendulum, verdict: accepted, why: off by <0.01 rad", "<td>21.05</td>"),
+        (RECORDING, "Recording(pipeline: -, log: ", "sensor 3"),
+        (DEPLOYED, "Deployment(episodes: 1, verdict: fine)", "<td>success</td><td>1</td><td>-</td>"),
+    ],
+)
+def test_a_notebook_shows_an_artifact_in_a_few_words(artifact, short, table):
+    assert repr(artifact).startswith(short)
+    assert len(repr(artifact)) < 300
+    shown = artifact._repr_html_()
+    assert table in shown
+    assert "<0.01" not in shown, "what comes from files is escaped"
+
+
+def test_long_things_have_short_names(pendulum):
+    assert repr(EPISODE) == "Episode(0.000 s, steps: sensor 3)"
+    assert repr(pendulum) == "Pipeline('pendulum')"
+
+
+def test_an_artifact_unpacks_into_itself_and_its_summary():
+    """As earlier versions returned them."""
+    deployment, sessions = replace(DEPLOYED, summary=({"lost_replies": 0},))
+    assert deployment.episodes
+    assert sessions == ({"lost_replies": 0},)
+    recording, summary = RECORDING
+    assert recording is RECORDING
+    assert summary == {}
