@@ -97,7 +97,7 @@ def align_turns(mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarr
         (name, field, how)
         for name, node in mapping.nodes.items()
         for field, how in node.fields.items()
-        if how.unit == "rad"
+        if how.unit in ("rad", "")  # without a unit where a robot has hinges and slides
     ]
     for name, field, how in angles:
         for other, goal, its in angles:

@@ -11,14 +11,14 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.log import evidence
 from sim2real.log.evidence import SURE
-from sim2real.log.following import following, on_grid
+from sim2real.log.following import Following, following, on_grid
 from sim2real.log.foreign import ForeignFile
 from sim2real.log.goals import follows, goal, refuse_copies
 from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping
 from sim2real.log.names import meaning, same_joint
-from sim2real.log.pairing import find_pair
+from sim2real.log.pairing import Pair, find_pair
 from sim2real.log.plausible import TURN_RAD
-from sim2real.log.positions import checked_positions, turned_commands
+from sim2real.log.positions import CheckedPositions, checked_positions, turned_commands
 from sim2real.log.quantities import Asked, clean, extras, field_of, matched, taken, velocity_of
 from sim2real.log.signals import Signal, Stamps, collect, find_stamps
 
@@ -57,69 +57,110 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     Raises:
         UsageError: When something is ambiguous: the candidates are named.
     """
-    path = str(file.path)
     signals, unread = collect(file)
+    pair, stamps, said = _streams(file, signals, unread, asked)
+    path, command = str(file.path), pair.command
+    places, labels, ordered = _joint_order(pair.measured, asked, path)
+    places, labels, empty = _with_numbers(pair.measured, places, labels, asked, path)
+    # Positions that no joint can have had are no evidence, and would be motion to an identification.
+    checked = checked_positions(file, taken(pair.measured, places), stamps[0].t_s, asked)
+    measured, said = checked.signal, [*said, *ordered, *empty, *checked.said]
+    command, turn = turned_commands(command, checked)
+    clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
+    rows = clean(clocks[0], measured), clean(clocks[1], command)
+    q, c = measured.values[rows[0]], command.values[rows[1]]
+    held, joined, period_s = _compared(
+        [own[r] for own, r in zip(clocks, rows, strict=True)],
+        c,
+        q,
+        _acting(signals, rows[1]),
+        [measured, command],
+        path,
+    )
+    circle = TURN_RAD * checked.to_rad if checked.hinges.any() else 0.0
+    found = replace(following(held, joined, period_s), turn=circle)
+    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
+    command, goals, more = _commanded(pair, command, checked, turn, found, (clocks, rows), places, path, asked)
+    velocity, on_velocity, lacking = velocity_of(signals, measured, clocks[0], checked.to_rad, places)
+    position = field_of(measured, "rad", [1 / checked.to_rad] * measured.width, checked.turn)
+    said += [*more, *shift]
+    nodes = {}
+    for name, fields, at, lacks, offset, leapt in (
+        ("actuator", goals | extra, stamps[1], ~command.finite, offset_s, np.zeros(len(command.values), bool)),
+        ("sensor", {"position": position} | velocity, stamps[0], ~(measured.finite | checked.leapt) | lacking, 0.0,
+         checked.leapt),
+    ):  # fmt: skip
+        nodes[name], policy = _node(name, fields, at, lacks, offset, leapt)
+        said += policy
+    said += [*on_velocity, *others, *unread, *file.notes]
+    return Proposal(ImportMapping(asked.pipeline, nodes), labels, tuple(said))
+
+
+def _streams(
+    file: ForeignFile, signals: Sequence[Signal], unread: Sequence[str], asked: Asked
+) -> tuple[Pair, list[Stamps], list[str]]:
+    """Return what was measured and what was commanded, the stamps of both, and what to say of them.
+
+    Raises:
+        UsageError: When there is none, or more than one.
+    """
+    path = str(file.path)
     try:
         pair = find_pair(signals, path, asked.rate_hz)
     except UsageError as error:
         raise UsageError("; ".join([error.args[0], *unread]), hint=error.hint) from None
-    said = list(pair.said)
-    measured, command = pair.measured, pair.command
+    sides = (pair.measured, "measured"), (pair.command, "command")
     try:
-        stamps = [find_stamps(signals, s, side, path, asked.rate_hz)
-                  for s, side in ((measured, "measured"), (command, "command"))]  # fmt: skip
+        stamps = [find_stamps(signals, signal, side, path, asked.rate_hz) for signal, side in sides]
     except UsageError:
         _require_readable_stamps(file)
         raise
-    said += _on_stamps(measured, stamps[0]) + (
-        _on_stamps(command, stamps[1]) if stamps[1].source != stamps[0].source else []
-    )
-    places, labels, ordered = _joint_order(measured, asked, path)
-    places, labels, empty = _with_numbers(measured, places, labels, asked, path)
-    measured, said = taken(measured, places), said + ordered + empty
-    # Positions that no joint can have had are no evidence, and would be motion to an identification.
-    checked = checked_positions(file, measured, stamps[0].t_s, asked)
-    measured, to_rad, said = checked.signal, checked.to_rad, said + checked.said
-    command, turn = turned_commands(command, checked)
-    clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
-    rows = clean(clocks[0], measured), clean(clocks[1], command)
-    t, q, c = (clocks[0][rows[0]], clocks[1][rows[1]]), measured.values[rows[0]], command.values[rows[1]]
-    held, joined, period_s = _compared(t, c, q, _acting(signals, rows[1]), [measured, command], path)
-    found = replace(following(held, joined, period_s), turn=TURN_RAD * to_rad)
-    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
-    fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
-    fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width, checked.turn)
+    said = [*pair.said, *_on_stamps(pair.measured, stamps[0])]
+    if stamps[1].source != stamps[0].source:
+        said += _on_stamps(pair.command, stamps[1])
+    return pair, stamps, said
+
+
+def _commanded(
+    pair: Pair,
+    command: Signal,
+    checked: CheckedPositions,
+    turn: float,
+    found: Following,
+    samples: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
+    places: np.ndarray,
+    path: str,
+    asked: Asked,
+) -> tuple[Signal, dict[str, FieldMapping], list[str]]:
+    """Return commands in the order of the joints, the field that they become, and what to say of them.
+
+    Args:
+        pair: What was measured and what was commanded.
+        command: The commands, with turns counted.
+        checked: The positions.
+        turn: A turn in the unit of the commands, where turns are counted; else 0.
+        found: How positions follow commands.
+        samples: Stamps [s] and rows that are compared, of positions and of commands.
+        places: Which column is which joint.
+        path: The file, for errors.
+        asked: What the user knows.
+    """
+    measured, (clocks, rows) = checked.signal, samples
     kind = pair.kind or (
         "position" if command.meaning.unit in ("rad", "deg") or follows(found, command, path) else "duty"
     )
-    if kind == "position":
-        command, scales, more = goal(measured, command, found, to_rad, path, asked.as_told)
-        in_rad = command.values[rows[1]] * scales, q / to_rad
-        turn, circle = _circle(command, turn, *in_rad, abs(scales[0]))
-        fields["actuator"]["goal"] = field_of(command, "rad", scales, turn)
-        copies = evidence.copied(t[1], t[0], *in_rad)
-        more += circle + refuse_copies(measured, command, copies, path, asked.as_told)
-    else:
+    if kind != "position":
         command = _other_command(command, measured, places)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
-        fields["actuator"][_FIELDS[kind]] = field_of(command, unit, [1.0] * command.width)
-        more = [f"{command.name!r} commands {kind}: it goes by its name, no position follows it (|r| at most "
-                f"{np.abs(found.r).max():.2f})"]  # fmt: skip
-    said += more + shift
-    velocity, more, lacking = velocity_of(signals, measured, clocks[0], to_rad, places)
-    fields["sensor"] |= velocity
-    fields["actuator"] |= extra
-    nodes = {}
-    for name, at, signal, offset, leapt in (
-        ("actuator", stamps[1], command, offset_s, np.zeros(len(command.values), bool)),
-        ("sensor", stamps[0], measured, 0.0, checked.leapt),
-    ):
-        lacks = ~(signal.finite | leapt)
-        lacks |= lacking if name == "sensor" else False
-        nodes[name], policy = _node(name, fields[name], at, lacks, offset, leapt)
-        said += policy
-    mapping = ImportMapping(asked.pipeline, nodes)
-    return Proposal(mapping, labels, tuple(said + more + others + unread + list(file.notes)))
+        said = f"it goes by its name, no position follows it (|r| at most {np.abs(found.r).max():.2f})"
+        fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}
+        return command, fields, [f"{command.name!r} commands {kind}: {said}"]
+    command, scales, more = goal(measured, command, found, checked.to_rad, path, asked.as_told)
+    in_rad = command.values[rows[1]] * scales, measured.values[rows[0]] / checked.to_rad
+    turn, circle = _circle(command, turn, *in_rad, abs(scales[0]), checked.hinges)
+    copies = evidence.copied(clocks[1][rows[1]], clocks[0][rows[0]], *in_rad)
+    said = circle + refuse_copies(measured, command, copies, path, asked.as_told)
+    return command, {"goal": field_of(command, "rad", scales, turn)}, [*more, *said]
 
 
 def _require_readable_stamps(file: ForeignFile) -> None:
@@ -138,13 +179,13 @@ def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
 
 
 def _circle(
-    command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float
+    command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float, hinges: np.ndarray
 ) -> tuple[float, list[str]]:
     """Return a turn in the unit of the goals, where turns are counted or differ, else 0, and what to say of it."""
     if turn:
         return turn, [f"{command.name!r} jumps at the end of a turn: turns are counted"]
     apart = (goal_rad.mean(axis=0) - q_rad.mean(axis=0)) / TURN_RAD
-    other = (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
+    other = hinges & (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
     if not other.any():
         return 0.0, []
     who = ", ".join(np.array(command.sources)[other])

@@ -34,6 +34,7 @@ class Asked:
         joints: Names of the robot's joints, in its order; empty: not known.
         ranges: Shape ``(joints, 2)``: from where to where they move [rad]; empty: not known.
         as_told: Keep names, order and signs as the file has them where the data leaves them open or contradicts them.
+        slides: Those of the joints that are slides, whose positions are lengths.
     """
 
     pipeline: str
@@ -41,6 +42,12 @@ class Asked:
     joints: tuple[str, ...] = ()
     ranges: np.ndarray | None = None
     as_told: bool = False
+    slides: tuple[str, ...] = ()
+
+    def hinges(self, width: int) -> np.ndarray:
+        """Return which of so many columns are joints that turn, ``(width,)``: all but those that are known to slide."""
+        known = len(self.joints) == width
+        return np.array([not (known and self.joints[i] in self.slides) for i in range(width)], bool)
 
 
 def taken(signal: Signal, places: np.ndarray) -> Signal:
