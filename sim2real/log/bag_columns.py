@@ -15,6 +15,8 @@ _COARSE = 0.1
 """A clock whose stamps repeat in a larger share of the messages is too coarse for them."""
 _JUMP_NS = 1e8
 """A clock that is ahead by more from one message to the next was set."""
+_UNNAMED = frozenset({""})
+"""The joints of a message that has numbers, but does not say of which joints."""
 _ALIKE = 0.01
 """Two clocks of one rate differ by less than this share."""
 
@@ -78,6 +80,7 @@ class Columns:
         count: Number of messages.
         broken: Why the messages after those cannot be decoded; empty where all are.
         clock: Which stamps are used where it is not the sender's: a sentence.
+        joints: The joints of each message; empty for those without names.
     """
 
     def __init__(self) -> None:
@@ -86,8 +89,10 @@ class Columns:
         self.count = 0
         self.broken = self.clock = ""
         self._columns: dict[str, _Column] = {}
+        self.joints: list[frozenset[str]] = []
         self._names: list[str] | None = None
         self._other = ""
+        self._sets: dict[frozenset[str], frozenset[str]] = {}
 
     @property
     def fields(self) -> list[str]:
@@ -104,6 +109,7 @@ class Columns:
         flat = _flat(message)
         names = flat.get("name") or flat.get("joint_names")
         own = [str(n) for n in names] if isinstance(names, list) else None
+        self.joints.append(self._joints(own or [], flat))
         self._names = self._names or own
         order = self._order(own) if own is not None and own != self._names else None
         for key, value in {**flat, LOG_TIME: log_ns}.items():
@@ -119,6 +125,21 @@ class Columns:
             else:
                 self._columns[key] = _Column(self.count, value)
         self.count += 1
+
+    def groups(self) -> list[frozenset[str]]:
+        """Return the groups of joints that messages are of, where several send on one topic; else nothing.
+
+        Only groups without a joint in common are told apart: each is then what one sender says.
+        """
+        found = list(dict.fromkeys(own for own in self.joints if own))
+        apart = len(frozenset().union(*found)) == sum(map(len, found))
+        return found if len(found) > 1 and apart and _UNNAMED not in found else []
+
+    def _joints(self, own: list[str], flat: Mapping[str, Any]) -> frozenset[str]:
+        vectors = any(isinstance(value, list) and not isinstance(value[0], str) for value in flat.values())
+        found = frozenset(own) if len(set(own)) == len(own) else _UNNAMED
+        found = _UNNAMED if vectors and not own else found
+        return self._sets.setdefault(found, found)
 
     def _order(self, own: list[str]) -> list[int] | None:
         """Return where the joints of the first message stand among others; None where they are other joints."""

@@ -73,8 +73,9 @@ def read_bag(paths: Sequence[Path]) -> RawSignals:
 
     Columns are ``/topic.field.field``; ``/topic.log_time`` is when the recorder got a message [ns], and a header's
     stamp is one number [ns]. Messages keep the order of the file, which no clock changes. Messages with names, such
-    as joint states, are sorted by those of the first message. Topics without joints, and those that cannot be decoded,
-    are left out, and the notes say so.
+    as joint states, are sorted by those of the first message. Senders on one topic, each with joints of its own, are
+    read as ``/topic#1``, ``/topic#2`` and so on. Topics without joints, and those that cannot be decoded, are left out,
+    and the notes say so.
 
     Raises:
         UsageError: When a file is no MCAP file, is a log of sim2real, is damaged, or has no message that can be read.
@@ -84,10 +85,11 @@ def read_bag(paths: Sequence[Path]) -> RawSignals:
     for topic in topics.values():
         if not topic.why:
             read = _decoded(topic)
-            if read.broken and not read.fields:
-                topic.leave_out(read.broken)
+            whole = next(iter(read.values()))
+            if len(read) == 1 and whole.broken and not whole.fields:
+                topic.leave_out(whole.broken)
             else:
-                columns[topic.name] = read
+                columns |= read
     reasons = [f"{t.name} ({t.kind}): {t.why}" for t in topics.values() if t.why and t.count]
     if not columns:
         listed = "; ".join(reasons) or "no messages"
@@ -101,11 +103,18 @@ def read_bag(paths: Sequence[Path]) -> RawSignals:
             # A mapping may name a topic that no mapping is proposed from.
             if name not in topics or topics[name].decode is None:
                 raise KeyError(key)
-            columns[name] = _decoded(_scan(paths, name)[0][name])
+            columns.update(_decoded(_scan(paths, name)[0][name]))
+            if name not in columns:
+                raise UsageError(
+                    f"several senders are on {name} in {paths[0]}, each with joints of its own",
+                    hint=f"name one of them: {name}#1.{rest}",
+                )
         return columns[name].column(rest, f"{name} in {paths[0]}")
 
     names = {f"{name}.{key}": own for name, read in columns.items() for key, own in read.names.items()}
     clocks = [f"{name}: {read.clock}" for name, read in columns.items() if read.clock]
+    clocks += [f"{name} are the messages of {', '.join(sorted(read.joints[0]))}" for name, read in columns.items()
+               if "#" in name]  # fmt: skip
     return RawSignals(keys, load, names, (*notes, *(f"left out: {reason}" for reason in reasons), *clocks))
 
 
@@ -280,10 +289,28 @@ def _topic(channel: Channel, schema: Schema | None) -> _Topic:
     return _Topic(channel.topic, kind, decode, "messages of this type hold no joints" if jointless else "")
 
 
-def _decoded(topic: _Topic) -> Columns:
-    """Return the columns of a topic; the messages are forgotten."""
+def _decoded(topic: _Topic) -> dict[str, Columns]:
+    """Return the columns of a topic by its name; the messages are forgotten.
+
+    Where several senders are on it, each with joints of its own, they are ``/topic#1``, ``/topic#2`` and so on.
+    """
+    whole = _columns(topic, topic.log_ns, topic.data)
+    found = {topic.name: whole}
+    if not whole.broken and (groups := whole.groups()):
+        found = {}
+        for number, joints in enumerate(groups, 1):
+            rows = [i for i, own in enumerate(whole.joints) if own == joints]
+            found[f"{topic.name}#{number}"] = _columns(
+                topic, [topic.log_ns[i] for i in rows], [topic.data[i] for i in rows]
+            )
+    topic.data, topic.log_ns = [], []
+    return found
+
+
+def _columns(topic: _Topic, logs_ns: Sequence[int], messages: Sequence[bytes]) -> Columns:
+    """Return the columns of some messages of a topic."""
     found = Columns()
-    for log_ns, data in zip(topic.log_ns, topic.data, strict=True):
+    for log_ns, data in zip(logs_ns, messages, strict=True):
         try:
             message = topic.decode(data) if topic.decode else None
             if not isinstance(message, Mapping):
@@ -292,6 +319,5 @@ def _decoded(topic: _Topic) -> Columns:
         except (*BROKEN, UnicodeDecodeError) as error:
             found.broken = f"message {found.count} cannot be decoded: {error}"
             break
-    topic.data, topic.log_ns = [], []
     found.finish()
     return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.following import following, on_grid
-from sim2real.log.names import Meaning
+from sim2real.log.names import Meaning, same_joint
 from sim2real.log.signals import Signal, find_stamps
 
 _SURE = 0.8
@@ -34,13 +34,14 @@ class Pair:
     said: tuple[str, ...]
 
 
-def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pair:
+def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joints: Sequence[str] = ()) -> Pair:
     """Return measured positions and their commands.
 
     Args:
         signals: All of the file.
         path: The file, for errors.
         rate_hz: Rate of samples without stamps [Hz].
+        joints: The joints that are asked for, where they are known.
 
     Raises:
         UsageError: When there is none, or more than one that may be it: all are named.
@@ -48,18 +49,19 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pa
     series = [
         s for s in signals if s.values.ndim == 2 and s.width and s.meaning.quantity != "stamp" and len(s.values) > 2
     ]
-    measured = _one(
-        [s for s in series if s.meaning.quantity == "position" and s.meaning.side != "command"]
-        or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity],
-        "measured position", path,
-    )  # fmt: skip
+    positions = [s for s in series if s.meaning.quantity == "position" and s.meaning.side != "command"]
+    positions = positions or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity]
     named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
     series = [s for s in series if _varies(s)] or series
     # A command that never changes is still the command, where there is no other: to say so is what `check` is for.
     commands = [s for s in named if any(s is other for other in series)] or named
     # A feed-forward beside a goal is no command of its own; a goal is what positions follow.
     goals = [s for s in commands if s.meaning.quantity in ("", "position")]
-    command = _one(goals or commands, "command", path)
+    if not joints and len(goals or commands) == 1:
+        joints = (goals or commands)[0].labels  # what was commanded was measured
+        joints = joints if all(joints) else ()
+    measured = _one(_of_joints(positions, joints), "measured position", path)
+    command = _one(_of_joints(goals or commands, joints), "command", path)
     if measured is not None and command is not None:
         names = f"{measured.name!r} was measured and {command.name!r} commanded, by their names"
         return Pair(measured, command, _kind(command), (names,))
@@ -104,8 +106,15 @@ def _one(fitting: Sequence[Signal], what: str, path: str) -> Signal | None:
         return None
     raise UsageError(
         f"which signal of {path} is the {what}? Candidates: {', '.join(repr(s.name) for s in fitting)}",
-        hint="write a mapping, or leave the others out of the file",
+        hint="say with --joints which joints are meant, write a mapping, or leave the others out of the file",
     )
+
+
+def _of_joints(signals: Sequence[Signal], joints: Sequence[str]) -> Sequence[Signal]:
+    """Return those signals whose names have all the joints; all signals where none has."""
+    if not joints or len(signals) < 2:
+        return signals
+    return [s for s in signals if all(any(same_joint(own, joint) for own in s.labels) for joint in joints)] or signals
 
 
 def _varies(signal: Signal) -> bool:

@@ -106,7 +106,7 @@ def _streams(
     """
     path = str(file.path)
     try:
-        pair = find_pair(signals, path, asked.rate_hz)
+        pair = find_pair(signals, path, asked.rate_hz, asked.joints)
     except UsageError as error:
         raise UsageError("; ".join([error.args[0], *unread]), hint=error.hint) from None
     sides = (pair.measured, "measured"), (pair.command, "command")

@@ -232,12 +232,63 @@ def test_joints_change_their_order_and_a_message_may_be_empty(tmp_path):
     assert any("1 of 600 samples lack a number" in line for line in found.evidence)
 
 
-def test_two_publishers_on_a_topic_are_named_with_their_joints(tmp_path):
-    rows = bags.rows()
-    rows.insert(7, ("/joint_states", STATE, bags.state([0.1], T0_NS, ("jaw",)), T0_NS + 1))
-    file = open_foreign(bags.write(tmp_path / "x.mcap", rows))
-    with pytest.raises(UsageError, match=r"message 3 is of other joints \(jaw\) than the first \(a, b\)"):
+def with_jaw(joints, every=1, first=False):
+    """Return the rows of a bag with a second sender of joint states, of these joints."""
+    found = []
+    for k, row in enumerate(bags.rows()):
+        own = ("/joint_states", STATE, bags.state([0.1] * len(joints), row[3] - 1000, joints), row[3] + 1000)
+        more = [own] if row[0] == "/joint_states" and k // 2 % every == 0 else []
+        found += [*more, row] if first else [row, *more]
+    return found
+
+
+@pytest.mark.parametrize("every", [1, 7, 600])
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("joints", [("a", "b"), ()])
+def test_two_senders_on_a_topic_each_with_joints_of_its_own(tmp_path, every, first, joints):
+    """Those of the commands are meant, or those that are asked for."""
+    file = open_foreign(bags.write(tmp_path / "x.mcap", with_jaw(("jaw",), every, first)))
+    found = propose(file, Asked("rig", joints=joints))
+    is_right(import_opened(file, found.mapping))
+    assert found.joints == ("a", "b")
+    said = f"/joint_states#{1 + first} are the messages of a, b", f"/joint_states#{2 - first} are the messages of jaw"
+    assert set(said) <= set(found.evidence)
+    with pytest.raises(UsageError, match=r"(?s)several senders are on /joint_states.*/joint_states#1.position"):
         file.signal("/joint_states.position")
+
+
+def test_two_senders_without_a_word_on_which_is_meant(tmp_path):
+    rows = [(t, k, {**m, "name": m["name"] if t != "/cmd" else []}, ns) for t, k, m, ns in with_jaw(("jaw",))]
+    file = open_foreign(bags.write(tmp_path / "x.mcap", rows))
+    with pytest.raises(UsageError, match=r"(?s)Candidates: '/joint_states#1.position'.*#2.position'.*--joints"):
+        propose(file, Asked("rig"))
+    is_right(import_opened(file, propose(file, Asked("rig", joints=("a", "b"))).mapping))
+
+
+@pytest.mark.parametrize(
+    ("joints", "named"),
+    [(("b", "c"), r"other joints \(b, c\) than the first \(a, b\)"), ((), "differ in their number")],
+)
+def test_two_senders_that_cannot_be_told_apart(tmp_path, joints, named):
+    rows = with_jaw(joints) if joints else with_jaw(("jaw",))
+    if not joints:
+        rows = [(t, k, {**m, "name": m["name"] if len(m["position"]) == 2 else []}, n) for t, k, m, n in rows]
+    file = open_foreign(bags.write(tmp_path / "x.mcap", rows))
+    with pytest.raises(UsageError, match=named):
+        propose(file, Asked("rig"))
+
+
+@pytest.mark.parametrize("empty", [("/joint_states",), ("/joint_states", "/cmd")])
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("names", [(), ("a", "b")])
+def test_the_first_messages_may_be_empty(tmp_path, empty, count, names):
+    rows = [
+        (topic, STATE, bags.state([], at, names), at)
+        for at in (T0_NS - 5_000_000 * np.arange(1, count + 1)[::-1]).tolist() for topic in empty
+    ]  # fmt: skip
+    episode, found = imported(bags.write(tmp_path / "x.mcap", rows + bags.rows()))
+    is_right(episode)
+    assert any(f"sensor: {count} of {600 + count} samples lack a number" in line for line in found.evidence)
 
 
 def test_commands_without_a_header_have_the_recorders_clock(tmp_path):
