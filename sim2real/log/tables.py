@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
@@ -23,6 +24,7 @@ from sim2real.log.raw import RawSignals
 _COMMENTS = ("#", "%", "//")
 _BLOCK = 4096
 _STAMP_UNITS = ("s", "ms", "us", "ns")
+_LIST = re.compile(r"\[[^a-zA-Z]*\d")
 _Cells = list[tuple[int, str]]
 
 
@@ -128,6 +130,9 @@ class _Table:
 
         rows = csv.reader(texts(), delimiter=self._delimiter, skipinitialspace=True)
         numbered = ((self._line, self._row(row)) for row in rows if any(cell.strip() for cell in row))
+        head_rows = list(islice(numbered, 2))
+        self._refuse_words(head_rows)
+        numbered = chain(head_rows, numbered)
         while block := list(islice(numbered, _BLOCK)):
             self._take(block)
         if self._point and self._comma:
@@ -152,11 +157,20 @@ class _Table:
         return [name.strip() for name in rows[0]] if rows else []
 
     def _row(self, row: list[str]) -> list[str]:
-        """Return a line's cells; empty ones at its end belong to no column, or to one without a name."""
+        """Return a line's cells; empty ones at its end belong to no column, or to one without a name.
+
+        Raises:
+            UsageError: When they are not as many as the names, or are the names again.
+        """
         width = len(self.header)
         named = max((i + 1 for i, name in enumerate(self.header) if name), default=0)
         while len(row) > named and not row[-1].strip():
             row.pop()
+        if [cell.strip() for cell in row[:named]] == self.header[:named]:
+            raise UsageError(
+                f"line {self._line} of {self._path} repeats the names of the columns: two recordings were joined",
+                hint="cut the file there, and import the parts one by one; or delete the line, if time goes on",
+            )
         if named <= len(row) <= width:
             row += [""] * (width - len(row))
         else:
@@ -166,6 +180,28 @@ class _Table:
                 hint="decimal commas need semicolons or tabs between the cells" if comma else WHOLE,
             )
         return row
+
+    def _refuse_words(self, rows: Sequence[tuple[int, list[str]]]) -> None:
+        """Refuse a line of words below the names, such as units.
+
+        Raises:
+            UsageError: When no cell of the first line may be a number, and the second has one below a word.
+        """
+        if len(rows) < 2:
+            return
+        (line, first), (_, second) = rows
+        words = [cell.strip() for cell in first]
+        plain = [i for i, word in enumerate(words) if word.lower() not in MISSING]
+        if any(is_number(words[i].replace(",", ".")) or _LIST.match(words[i]) for i in plain):
+            return
+        if any(dates.is_other(words[i]) or dates.are_dates([words[i]]) for i in plain):
+            return
+        if any(is_number(second[i].replace(",", ".")) for i in plain):
+            raise UsageError(
+                f"line {line} of {self._path} holds words below the names of the columns, no numbers: "
+                f"{', '.join(words[:6])}",
+                hint="delete the line; a unit belongs into the name, as in q_rad or t_ms",
+            )
 
     def _take(self, block: list[tuple[int, list[str]]]) -> None:
         """Convert the cells of some lines, column by column."""

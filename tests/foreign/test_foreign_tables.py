@@ -76,6 +76,14 @@ def test_forms_of_one_table(tmp_path, text):
         ("time,q\n2024-05-01 12:00:00,1\n17.5,2\n", r"line 3 .*'17.5' is no date"),
         ("time,q\n01.05.2024 12:00:00,1\n", r"line 2 .*'01.05.2024 12:00:00', no number.*write dates as"),
         (",".join(f"c{i}" for i in range(10_001)) + "\n", "has 10001 signals; at most 10000"),
+        ("t,q\ns,rad\n0,1\n1,2\n", r"line 2 .* holds words below the names .*: s, rad.*delete the line"),
+        ("t,q,\n# units\ns,rad,\n0,1,\n", r"line 3 .* holds words below the names"),
+        ("t;q\n[s];[rad]\n0,5;1,5\n", r"line 2 .* holds words below the names"),
+        ("t,q,phase\n,rad,-\n0,1,warm\n", r"line 2 .* holds words below the names"),
+        ("t q\ns rad\n0 1\n", r"line 2 .* holds words below the names"),
+        ("t,q\n0,1\nt,q\n0,1\n", r"line 3 .* repeats the names .*: two recordings were joined.*cut the file there"),
+        ("t,q,\n0,1,\n t , q ,\n", r"line 3 .* repeats the names"),
+        ("t;q\n0,5;1\nt;q\n", r"line 3 .* repeats the names"),
         ("t,q\n0,[1 2]\n1,[1 b]\n", r"line 3 .*no list of numbers"),
         ("t,q\n0,[" + " ".join("1" * 1001) + "]\n", r"line 2 .*1001 numbers"),
     ],
@@ -83,6 +91,22 @@ def test_forms_of_one_table(tmp_path, text):
 def test_tables_that_are_refused_with_the_reason(tmp_path, text, named):
     with pytest.raises(UsageError, match=f"(?s){named}"):
         all_signals(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("t,q,phase\n0,1,warm\n1,2,cold\n", [1, 2]),
+        ("t,q,phase\n,,warm\n1,2,cold\n", [math.nan, 2]),
+        ("phase,q\nwarm,\ncold,2\n", [math.nan, 2]),
+        ("t,q\nnull,null\n1,2\n", [math.nan, 2]),
+        ("t,q\n2024-05-01 12:00:00,\n2024-05-01 12:00:01,2\n", [math.nan, 2]),
+        ("t,q\n0,1\n", [1]),
+        (",t,q\n0,0,1\n1,1,2\n", [1, 2]),  # as pandas writes it
+    ],
+)
+def test_tables_with_words_that_are_no_units(tmp_path, text, values):
+    np.testing.assert_array_equal(opened(tmp_path, text).signal("q"), values)
 
 
 def test_a_table_that_is_no_utf_8_is_read_as_latin_1_and_says_so(tmp_path):
