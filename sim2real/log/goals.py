@@ -76,6 +76,12 @@ def goal(
             hint="write a mapping with the scale that its maker gives",
         )
     unit = to_rad / (ratio or to_rad / (told or 1.0))
+    if not np.isclose(unit, (1.0, DEGREES)).any():
+        raise UsageError(
+            f"{measured.name!r} in {path}, in {'degrees' if to_rad != 1 else 'radians'}, follows {command.name!r} with "
+            f"slopes of {slopes[:3].round(4)}: then that is neither in radians nor in degrees",
+            hint="end both names with their units, as in q_rad and goal_deg, or write a mapping with the scales",
+        )
     if told is not None and ratio is not None and not np.isclose(told, unit):
         raise UsageError(
             f"{command.name!r} in {path} is in {command.meaning.unit} by its name, but {measured.name!r}, in "

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log import evidence, plausible
+from sim2real.log.companions import told_units
 from sim2real.log.evidence import DEGREES
 from sim2real.log.foreign import ForeignFile
 from sim2real.log.lerobot import are_degrees
+from sim2real.log.pairing import Pair
 from sim2real.log.quantities import Asked, clean
-from sim2real.log.signals import Signal
+from sim2real.log.signals import Signal, Stamps
 
 _MOST_RAD = 2.2 * np.pi
 """What reaches farther is not taken for radians, nor for metres, without evidence."""
@@ -41,19 +44,22 @@ class CheckedPositions:
     said: list[str]
 
 
-def checked_positions(file: ForeignFile, measured: Signal, t_s: np.ndarray, asked: Asked) -> CheckedPositions:
+def checked_positions(
+    file: ForeignFile, signals: Sequence[Signal], pair: Pair, stamps: Sequence[Stamps], asked: Asked
+) -> CheckedPositions:
     """Return measured positions with their turns counted and without leaps.
 
     Args:
         file: The file.
-        measured: Positions, in the order of the joints.
-        t_s: Shape ``(N,)``: their stamps [s].
+        signals: All of the file.
+        pair: Positions, in the order of the joints, and what was commanded.
+        stamps: Of both.
         asked: What the user knows.
 
     Raises:
         UsageError: When the unit is not clear, or positions change by more than a joint can move.
     """
-    path = str(file.path)
+    path, measured, t_s = str(file.path), pair.measured, stamps[0].t_s
     rows = np.flatnonzero(clean(t_s, measured))
     q, t = measured.values[rows], t_s[rows]
     if len(rows) < 3:
@@ -69,7 +75,11 @@ def checked_positions(file: ForeignFile, measured: Signal, t_s: np.ndarray, aske
     leaps = plausible.glitches(t, _counted(q, guess, hinges), guess)
     kept = ~leaps.any(axis=1)
     _refuse_no_metres(measured, q[kept], hinges, asked, path)
-    to_rad, why = _radian(file, measured, (q[kept], t[kept]), hinges, asked, jumping) if hinges.any() else (1.0, "")
+    others: list[tuple[float, str]] = []
+    if named is None and not jumping and hinges.all():
+        others = told_units(signals, measured, pair.command, [s.t_s for s in stamps], rows[kept])
+    samples = q[kept], t[kept]
+    to_rad, why = _radian(file, measured, samples, hinges, asked, jumping, others) if hinges.any() else (1.0, "")
     over, values = _over_the_end(q, to_rad, hinges), _counted(measured.values, to_rad, hinges)
     turn, angle = plausible.TURN_RAD * to_rad, values[rows]
     _refuse_turns(measured, over, angle / to_rad, asked, path)
@@ -118,17 +128,24 @@ def _radian(
     hinges: np.ndarray,
     asked: Asked,
     jumping: list[float],
+    others: Sequence[tuple[float, str]],
 ) -> tuple[float, str]:
     """Return how many units a radian is, and how that is known, by what the file says of itself or by the data."""
     path, (q, t_s) = str(file.path), samples
     if are_degrees(file.facts, _names_of(file, measured), q, path):
         return DEGREES, "its steps are those of encoders of 4096 a turn"
     ranges = asked.ranges[hinges] if asked.ranges is not None and len(asked.ranges) == len(hinges) else None
-    return radian(measured, q[:, hinges], t_s, replace(asked, ranges=ranges), path, jumping)
+    return radian(measured, q[:, hinges], t_s, replace(asked, ranges=ranges), path, jumping, others)
 
 
 def radian(
-    measured: Signal, q: np.ndarray, t_s: np.ndarray, asked: Asked, path: str, jumping: list[float]
+    measured: Signal,
+    q: np.ndarray,
+    t_s: np.ndarray,
+    asked: Asked,
+    path: str,
+    jumping: list[float],
+    others: Sequence[tuple[float, str]],
 ) -> tuple[float, str]:
     """Return how many units a radian is, and how that is known.
 
@@ -139,6 +156,7 @@ def radian(
         asked: What the user knows.
         path: The file, for errors.
         jumping: Units in a radian by whose turn the positions jump.
+        others: Units in a radian by other signals, and how they say so.
 
     Raises:
         UsageError: When it is not clear.
@@ -151,6 +169,14 @@ def radian(
     kinds = {unit for unit, _ in encoders}
     if len(kinds) == 1:
         return (1.0 if kinds == {"rad"} else DEGREES), f"its steps are those of an encoder of {encoders[0][1]} a turn"
+    if len({unit for unit, _ in others}) > 1:
+        raise UsageError(
+            f"is {measured.name!r} in {path} in radians or degrees? Other signals contradict each other: "
+            f"{'; '.join(said for _, said in others)}",
+            hint="correct their names, or write a mapping with the scales",
+        )
+    if others:
+        return others[0]
     if asked.ranges is not None and len(asked.ranges) == q.shape[1]:
         low, high = asked.ranges.T
         known = high > low

@@ -63,7 +63,7 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     places, labels, ordered = _joint_order(pair.measured, asked, path)
     places, labels, empty = _with_numbers(pair.measured, places, labels, asked, path)
     # Positions that no joint can have had are no evidence, and would be motion to an identification.
-    checked = checked_positions(file, taken(pair.measured, places), stamps[0].t_s, asked)
+    checked = checked_positions(file, signals, replace(pair, measured=taken(pair.measured, places)), stamps, asked)
     measured, said = checked.signal, [*said, *ordered, *empty, *checked.said]
     command, turn = turned_commands(command, checked)
     clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)

@@ -93,6 +93,15 @@ def field_of(signal: Signal, unit: str, scales: Sequence[float], turn: float = 0
     return FieldMapping(sources, unit, scale, 0.0, (signal.width,), turn=turn)
 
 
+def velocities(signals: Sequence[Signal], measured: Signal) -> list[Signal]:
+    """Return what may be the measured velocity."""
+    return [
+        s for s in signals
+        if s.meaning.quantity == "velocity" and s.meaning.side != "command"
+        and len(s.values) == len(measured.values) and s.width >= measured.width and s.values.ndim == 2
+    ]  # fmt: skip
+
+
 def velocity_of(
     signals: Sequence[Signal], measured: Signal, t_s: np.ndarray, to_rad: float, places: np.ndarray
 ) -> tuple[dict[str, FieldMapping], list[str], np.ndarray]:
@@ -105,11 +114,7 @@ def velocity_of(
         to_rad: Units of the positions in a radian.
         places: Which column is which joint.
     """
-    fitting = [
-        s for s in signals
-        if s.meaning.quantity == "velocity" and s.meaning.side != "command"
-        and len(s.values) == len(measured.values) and s.width >= measured.width and s.values.ndim == 2
-    ]  # fmt: skip
+    fitting = velocities(signals, measured)
     whole = np.zeros(len(measured.values), bool)
     if len(fitting) != 1:
         return (
@@ -132,13 +137,12 @@ def velocity_of(
     ratio = evidence.unit_ratio(slope[np.abs(r) > SURE])
     off = np.abs(slope / (ratio or 1.0)) if ratio else slope
     odd = still | (np.abs(r) > 0.05) & ((np.abs(r) < SURE) | (off < 0.6) | (off > 1.7))
-    if ratio is None or odd.any():
+    typical = float(np.median(slope))
+    own = {1.0: "rad", evidence.DEGREES: "deg"}.get(ratio or 0.0, "")
+    if ratio is None or odd.any() or velocity.meaning.unit not in ("", own):
         listed = ", ".join(f"{velocity.sources[i]} r {r[i]:.2f}, slope {slope[i]:.3g}" for i in np.flatnonzero(odd)[:3])
-        return (
-            {},
-            [f"{velocity.name!r} is not the rate of {measured.name!r} ({listed or 'no unit fits'}): left out"],
-            whole,
-        )
+        why = listed or f"slope {typical:.3g}: no unit fits"
+        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({why}): left out"], whole
     scales = [float((-1 if x < -SURE else 1) / ratio) for x in r]
     said = [
         f"{velocity.name!r} is the rate of {measured.name!r}: r {np.abs(r).max():.2f}, slope {np.median(slope):.3g}"
