@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.composer.interop.copies", "sim2real.composer.interop.counted"},
     "mixture": {"sim2real.graph.fitting"},
-    "parquet": {"sim2real.log.foreign"},
+    "parquet": {"sim2real.log.lerobot"},
     "tensorboard": {"sim2real.stages.events"},
     "warp": set(),  # MJX imports Warp itself
 }

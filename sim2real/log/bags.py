@@ -3,198 +3,321 @@
 from __future__ import annotations
 
 import json
+import mmap
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
 
-from sim2real.errors import UsageError
-from sim2real.log.cdr import ENCAPSULATION
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.log.bag_columns import Columns
+from sim2real.log.budget import MOST_BYTES, MOST_TEXT_BYTES, require_memory, require_signals
+from sim2real.log.document import SESSION
+from sim2real.log.raw import RawSignals
+from sim2real.log.records import BROKEN, Damage, Record, chunk_content, chunk_records, opened, parsed, records
+from sim2real.log.ros_messages import Decode, Undecodable, decoder
 
-_SIZES = {"bool": "?", "byte": "B", "char": "B", "float32": "f", "float64": "d"} | {
-    f"{sign}int{bits}": code if not sign else code.upper()
-    for sign in ("", "u") for bits, code in zip((8, 16, 32, 64), "bhiq", strict=True)
+_MESSAGE = struct.Struct("<HIQQ")
+_LARGE_BYTES = 64 * 1024
+"""A message of joints is smaller [bytes]: this is room for a thousand of them."""
+_UNPACKED = 256
+"""The chunks of a bag hold at most this multiple of its size, beside the memory of the budget."""
+_RELEASED_BYTES = 1 << 24
+_JOINTLESS = {
+    "tf2_msgs", "diagnostic_msgs", "visualization_msgs", "rcl_interfaces", "rosgraph_msgs", "nav_msgs", "map_msgs",
+    "lifecycle_msgs", "stereo_msgs", "shape_msgs", "vision_msgs", "rosbag2_interfaces", "statistics_msgs",
 }  # fmt: skip
-_FIELD = re.compile(r"^\s*([\w/]+)(<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=)?")
-Decode = Callable[[bytes], Any]
+"""Packages of ROS whose messages hold no joints."""
+_JOINTS = ("JointState", "MultiDOFJointState")
+"""The messages of sensor_msgs that hold joints."""
 
 
-def read_bag(path: Path) -> tuple[list[str], Callable[[str], Any], dict[str, list[str]]]:
-    """Return names of columns, what loads one, and names of the entries of vectors.
+@dataclass
+class _Topic:
+    """The messages of a topic, in the order of the file.
+
+    Attributes:
+        name: Its name.
+        kind: Type of its messages.
+        decode: Decodes one message; None where that is not possible.
+        why: Why it is left out; empty where it is read.
+        data: The messages.
+        log_ns: When the recorder got each [ns].
+        count: Number of messages.
+    """
+
+    name: str
+    kind: str
+    decode: Decode | None
+    why: str
+    data: list[bytes] = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    count: int = 0
+
+    def leave_out(self, why: str) -> None:
+        """Forget the messages, and say why."""
+        self.why, self.data, self.log_ns = why, [], []
+
+
+_Place = tuple[_Topic, int, "mmap.mmap | bytes", int, int]
+"""A message: its topic, its log time [ns], and where its data begins and ends in what."""
+
+
+def read_bag(paths: Sequence[Path]) -> RawSignals:
+    """Read a bag, from one file or from several that continue each other.
 
     Columns are ``/topic.field.field``; ``/topic.log_time`` is when the recorder got a message [ns], and a header's
-    stamp is one number [ns]. Messages with names, such as joint states, are sorted by those of the first message.
+    stamp is one number [ns]. Messages keep the order of the file, which no clock changes. Messages with names, such
+    as joint states, are sorted by those of the first message. Senders on one topic, each with joints of its own, are
+    read as ``/topic#1``, ``/topic#2`` and so on. Topics without joints, and those that cannot be decoded, are left out,
+    and the notes say so.
 
     Raises:
-        UsageError: When it is no MCAP file, is a log of sim2real, or has no message that can be read.
+        UsageError: When a file is no MCAP file, is a log of sim2real, is damaged, or has no message that can be read.
     """
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
+    topics, notes = _scan(paths)
+    columns: dict[str, Columns] = {}
+    for topic in topics.values():
+        if not topic.why:
+            read = _decoded(topic)
+            whole = next(iter(read.values()))
+            if len(read) == 1 and whole.broken and not whole.fields:
+                topic.leave_out(whole.broken)
+            else:
+                columns |= read
+    reasons = [f"{t.name} ({t.kind}): {t.why}" for t in topics.values() if t.why and t.count]
+    if not columns:
+        listed = "; ".join(reasons) or "no messages"
+        raise UsageError(f"nothing in {paths[0]} can be read: {listed}", hint="record joint states and commands")
+    keys = [f"{name}.{key}" for name, read in columns.items() for key in read.offered]
+    require_signals(len(keys), paths[0])
 
-    rows: dict[str, list[dict[str, Any]]] = {}
-    refused: dict[str, str] = {}
-    decoders: dict[int, Decode | None] = {}
-    try:
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            if any(m.name == "session" for m in reader.iter_metadata()):
-                raise UsageError(f"{path} is a log of sim2real already", hint="use it as it is: --log FILE")
-            for schema, channel, message in reader.iter_messages():
-                if channel.id not in decoders:
-                    decoders[channel.id], why = _decoder(channel.message_encoding, schema)
-                    if why:
-                        refused[channel.topic] = why
-                decode = decoders[channel.id]
-                if decode is not None:
-                    row = {**_flat(decode(message.data)), "log_time": message.log_time}
-                    rows.setdefault(channel.topic, []).append(row)
-    except (McapError, struct.error, UnicodeDecodeError, json.JSONDecodeError, IndexError, EOFError) as error:
-        raise UsageError(f"{path} is no MCAP file, or is damaged: {error}", hint="`mcap doctor` says where") from None
-    if not rows:
-        listed = "; ".join(f"{topic}: {why}" for topic, why in refused.items()) or "no messages"
-        raise UsageError(f"nothing in {path} can be read: {listed}", hint="record joint states and commands")
-    found: dict[str, tuple[list[dict[str, Any]], str]] = {}
-    names: dict[str, list[str]] = {}
-    for topic, messages in rows.items():
-        own = messages[0].get("name") or messages[0].get("joint_names")
-        for field in messages[0]:
-            key = f"{topic}.{field}"
-            found[key] = (messages, field)
-            size = len(value) if isinstance(value := messages[0][field], list) else 0
-            if own and size == len(own) and isinstance(own, list):
-                names[key] = [str(n) for n in own]
-    return list(found), lambda key: _column(*found[key], path), names
+    def load(key: str) -> np.ndarray:
+        name, _, rest = key.partition(".")
+        if name not in columns:
+            # A mapping may name a topic that no mapping is proposed from.
+            if name not in topics or topics[name].decode is None:
+                raise KeyError(key)
+            columns.update(_decoded(_scan(paths, name)[0][name]))
+            if name not in columns:
+                raise UsageError(
+                    f"several senders are on {name} in {paths[0]}, each with joints of its own",
+                    hint=f"name one of them: {name}#1.{rest}",
+                )
+        return columns[name].column(rest, f"{name} in {paths[0]}")
+
+    names = {f"{name}.{key}": own for name, read in columns.items() for key, own in read.names.items()}
+    clocks = [f"{name}: {read.clock}" for name, read in columns.items() if read.clock]
+    clocks += [f"{name} are the messages of {', '.join(sorted(read.joints[0]))}" for name, read in columns.items()
+               if "#" in name]  # fmt: skip
+    return RawSignals(keys, load, names, (*notes, *(f"left out: {reason}" for reason in reasons), *clocks))
 
 
 def is_ours(path: Path) -> bool:
     """Return whether an MCAP file is a log of sim2real, as far as it can be read."""
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-
     try:
-        with path.open("rb") as stream:
-            return any(m.name == "session" for m in make_reader(stream).iter_metadata())
-    except (McapError, OSError, struct.error):
-        return True  # a log that was cut: its own reader says more
+        with opened(path) as data:
+            for record in records(data, damage := Damage()):
+                if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                    return False
+                if record.opcode == Opcode.METADATA:
+                    entry = parsed(Metadata, data, record, damage)
+                    if entry is not None and entry.name == SESSION:
+                        return True
+    except (Sim2RealError, OSError):
+        pass
+    return True  # a log that was cut before its data: its own reader says more
 
 
-def _column(messages: list[dict[str, Any]], field: str, path: Path) -> Any:
-    """Return one field of all messages, sorted by their names where those differ between messages."""
-    first = messages[0].get("name") or messages[0].get("joint_names")
-    values = []
-    for number, message in enumerate(messages):
-        value, names = message.get(field), message.get("name") or message.get("joint_names")
-        if isinstance(value, list) and isinstance(names, list) and names != first and len(value) == len(names):
-            if sorted(map(str, names)) != sorted(map(str, first or [])):
-                raise UsageError(
-                    f"message {number} of {field!r} in {path} is of other joints than the first: {', '.join(names)}",
-                    hint="record each group of joints on a topic of its own",
-                )
-            value = [value[names.index(n)] for n in first or []]
-        values.append(value)
-    sizes = {len(v) if isinstance(v, list) else -1 for v in values}
-    if len(sizes) > 1:
-        raise UsageError(f"messages of {field!r} in {path} differ in their number of entries", hint="cut the file")
-    return values
+def bag_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a ROS 2 bag's folder, in the order in which they continue each other.
+
+    Raises:
+        UsageError: When there are none, one is missing, or they are not of one bag.
+    """
+    there = {p.name: p for p in folder.glob("*.mcap")}
+    about = folder / "metadata.yaml"
+    if not there:
+        packed, other = sorted(folder.glob("*.mcap.zst*")), sorted(folder.glob("*.db3"))
+        if not (packed or other or about.is_file()):
+            hint = "name the files in it, or the folder of a ROS 2 bag or of a LeRobot data set (with meta/info.json)"
+            raise UsageError(f"{folder} is a folder, not a file", hint=hint)
+        hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
+        hint = f"unpack it first: zstd -d {packed[0].name}" if packed else hint
+        raise UsageError(f"{folder} holds 0 MCAP files, and {len(other)} of SQLite", hint=hint)
+    listed: list[str] = []
+    if about.is_file():
+        text = about.read_text(encoding="utf-8", errors="replace")[:MOST_TEXT_BYTES]
+        named = re.findall(r"^\s*-\s+[\"']?([^\s\"']+\.mcap)[\"']?\s*$", text, re.MULTILINE)
+        listed = list(dict.fromkeys(Path(name).name for name in named))
+    if lost := [name for name in listed if name not in there]:
+        raise UsageError(
+            f"{lost[0]}, which metadata.yaml names, is not in {folder}",
+            hint="copy it there, or name the files that are",
+        )
+    if listed:
+        return [there[name] for name in listed]
+    parts = {name: re.fullmatch(r"(.*?)_?(\d+)\.mcap", name) for name in there}
+    order = sorted(there, key=lambda name: int(found[2]) if (found := parts[name]) else -1)
+    numbers = [int(found[2]) for name in order if (found := parts[name])]
+    one_bag = len({found[1] for found in parts.values() if found}) == 1 and len(numbers) == len(there)
+    if len(there) > 1 and not (one_bag and numbers == list(range(numbers[0], numbers[0] + len(numbers)))):
+        raise UsageError(
+            f"{folder} has no metadata.yaml, and its files are not numbered one after another: {', '.join(order[:6])}",
+            hint="name one of them: each becomes a log",
+        )
+    return [there[name] for name in order]
 
 
-def _flat(value: Any, trail: str = "") -> dict[str, Any]:
-    """Return the leaves of a message: numbers, and lists of numbers or names; of a trajectory the first point."""
-    if isinstance(value, Mapping):
-        if set(value) in ({"sec", "nanosec"}, {"sec", "nsec"}):
-            return {trail: int(value["sec"]) * 10**9 + int(value.get("nanosec", value.get("nsec", 0)))}
-        return {k: v for name, item in value.items() for k, v in _flat(item, f"{trail}.{name}".lstrip(".")).items()}
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
-        return _flat(value[0], trail)
-    if isinstance(value, str) and not value:
-        return {}
-    return {} if isinstance(value, list) and not value else {trail: value}
+def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _Topic], list[str]]:
+    """Return the topics of a bag with the messages that are read, and what to say of the files.
+
+    Args:
+        paths: The files, in their order.
+        only: The topic that is read, whatever it holds; None: all topics that may hold joints.
+    """
+    topics: dict[str, _Topic] = {}
+    notes, kept = [], 0
+    for path in paths:
+        damage = Damage()
+        try:
+            for topic, log_ns, source, start, end in _messages(path, topics, damage):
+                topic.count += 1
+                if topic.why if only is None else topic.name != only:
+                    continue
+                if end - start > _LARGE_BYTES and only is None:
+                    topic.leave_out(f"messages of {(end - start) / 1000:.0f} kB, too large for joints")
+                    continue
+                kept += end - start
+                require_memory(kept, f"{path}: the messages of joints")
+                topic.data.append(source[start:end])
+                topic.log_ns.append(log_ns)
+        except UsageError:
+            raise
+        except (Sim2RealError, OSError) as error:
+            raise UsageError(
+                f"{path} is no MCAP file, or is damaged: {error}", hint="`mcap doctor` says where"
+            ) from None
+        if damage.skipped:
+            raise UsageError(
+                f"{path} is damaged: {damage.skipped[0]} cannot be read",
+                hint="`sim2real log recover` copies what is readable into a new file, with gaps",
+            )
+        if damage.cut:
+            notes.append(f"{path.name} was cut: it is read up to its end")
+    return topics, notes
 
 
-def _decoder(encoding: str, schema: Any) -> tuple[Decode | None, str]:
-    """Return what decodes the messages of a channel, or why nothing does."""
-    if encoding == "json":
-        return json.loads, ""
-    if encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
-        kind = f"{encoding} with a schema in {schema.encoding or 'nothing'}" if schema is not None else encoding
-        return None, f"messages in {kind}, not in CDR with ros2msg, nor in JSON"
-    types = _parse(schema.name, schema.data.decode())
+def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator[_Place]:
+    """Yield the messages of a file in its order; topics are added as they appear."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, _Topic] = {}
 
-    def decode(data: bytes) -> Any:
-        return _Reader(data, types).record(schema.name)
+    def take(source: mmap.mmap | bytes, record: Record) -> _Place | None:
+        if record.opcode == Opcode.MESSAGE:
+            whole = record.end - record.start >= _MESSAGE.size
+            number, _, log_ns, _ = _MESSAGE.unpack_from(source, record.start) if whole else (-1, 0, 0, 0)
+            if number not in channels:
+                damage.skip(f"a message at {record.start}, of no known channel,")
+                return None
+            return channels[number], log_ns, source, record.start + _MESSAGE.size, record.end
+        if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, damage)) is not None:
+            schemas[schema.id] = schema
+        elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, damage)) is not None:
+            found = _topic(channel, schemas.get(channel.schema_id))
+            known = topics.setdefault(channel.topic, found)
+            # Two types on one topic are two signals; the second has no name of its own.
+            other = known.kind != found.kind
+            channels[channel.id] = topics.setdefault(f"{channel.topic} ({found.kind})", found) if other else known
+            if other:
+                found.leave_out(f"other messages of this topic are {known.kind}")
+        return None
 
-    return decode, ""
+    unpacked, released, begun = 0, 0, False
+    with opened(path) as data:
+        most = _UNPACKED * len(data) + MOST_BYTES
+        for record in records(data, damage):
+            begun = True
+            if record.start - released > _RELEASED_BYTES:
+                # What was read leaves the memory: a bag with images may be larger than that.
+                data.madvise(mmap.MADV_DONTNEED, released, _RELEASED_BYTES)
+                released += _RELEASED_BYTES
+            if record.opcode == Opcode.METADATA:
+                entry = parsed(Metadata, data, record, damage)
+                if entry is not None and entry.name == SESSION:
+                    raise UsageError(f"{path} is a log of sim2real already", hint="use it as it is: --log FILE")
+            elif record.opcode != Opcode.CHUNK:
+                if (found := take(data, record)) is not None:
+                    yield found
+            else:
+                content = chunk_content(data, record, damage)
+                unpacked += len(content)
+                if unpacked > most:
+                    raise UsageError(f"{path} unpacks to more than {most >> 20} MiB: no recorder wrote it")
+                try:
+                    for part in chunk_records(content):
+                        if (found := take(content, Record(*part))) is not None:
+                            yield found
+                except ValueError as error:
+                    damage.skip(str(error))
+        if not begun:
+            raise UsageError(
+                f"{path} is no MCAP file, or is damaged from its beginning", hint="`mcap doctor` says where"
+            )
 
 
-def _parse(name: str, text: str) -> dict[str, list[tuple[str, str, str]]]:
-    """Return type -> fields (type, array, name) of a ``ros2msg`` schema with the types that it uses."""
-    types = {}
-    for part in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
-        lines = [line.split("#")[0] for line in part.strip().splitlines()]
-        if lines and (title := re.match(r"\s*MSG:\s*(\S+)", lines[0])):
-            own, lines = title[1], lines[1:]
-        else:
-            own = name
-        package, fields = own.split("/")[0], []
-        for line in lines:
-            if (found := _FIELD.match(line)) and not found[5]:
-                kind = found[1]
-                plain = kind in _SIZES or kind in ("string", "wstring")
-                fields.append((kind if plain or "/" in kind else f"{package}/{kind}", found[3] or "", found[4]))
-        types[_short(own)] = fields
-    types.setdefault("builtin_interfaces/Time", [("int32", "", "sec"), ("uint32", "", "nanosec")])
-    types.setdefault("builtin_interfaces/Duration", [("int32", "", "sec"), ("uint32", "", "nanosec")])
-    return types
+def _topic(channel: Channel, schema: Schema | None) -> _Topic:
+    """Return an empty topic, with what decodes its messages or why they are left out."""
+    kind = schema.name if schema is not None else channel.message_encoding
+    if channel.message_encoding == "json":
+        return _Topic(channel.topic, kind, json.loads, "")
+    if channel.message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
+        encoding = channel.message_encoding
+        encoding += f" with a schema in {schema.encoding or 'nothing'}" if schema is not None else ""
+        return _Topic(channel.topic, kind, None, f"messages in {encoding}, not in CDR with ros2msg, nor in JSON")
+    try:
+        decode = decoder(schema.name, schema.data.decode())
+    except (Undecodable, ValueError) as error:
+        return _Topic(channel.topic, kind, None, str(error))
+    package, name = kind.split("/")[0], kind.split("/")[-1]
+    jointless = package in _JOINTLESS or (package == "sensor_msgs" and name not in _JOINTS)
+    return _Topic(channel.topic, kind, decode, "messages of this type hold no joints" if jointless else "")
 
 
-def _short(name: str) -> str:
-    """Return a type's name without the ``msg`` in its middle."""
-    return name.replace("/msg/", "/")
+def _decoded(topic: _Topic) -> dict[str, Columns]:
+    """Return the columns of a topic by its name; the messages are forgotten.
 
-
-class _Reader:
-    """Reads one CDR message (XCDR1), of either byte order."""
-
-    def __init__(self, data: bytes, types: Mapping[str, list[tuple[str, str, str]]]) -> None:
-        self._data, self._types, self._at = data, types, len(ENCAPSULATION)
-        self._order = "<" if data[1] & 1 else ">"
-
-    def record(self, name: str) -> dict[str, Any]:
-        """Read the fields of a type."""
+    Where several senders are on it, each with joints of its own, they are ``/topic#1``, ``/topic#2`` and so on.
+    """
+    whole = _columns(topic, topic.log_ns, topic.data)
+    found = {topic.name: whole}
+    if not whole.broken and (groups := whole.groups()):
         found = {}
-        for kind, array, field in self._types[_short(name)]:
-            found[field] = self._array(kind, array) if array else self._value(kind)
-        return found
+        for number, joints in enumerate(groups, 1):
+            rows = [i for i, own in enumerate(whole.joints) if own == joints]
+            found[f"{topic.name}#{number}"] = _columns(
+                topic, [topic.log_ns[i] for i in rows], [topic.data[i] for i in rows]
+            )
+    topic.data, topic.log_ns = [], []
+    return found
 
-    def _array(self, kind: str, array: str) -> list[Any]:
-        bounds = array.strip("[]")
-        count = int(bounds) if bounds.isdigit() else self._number("I")
-        if kind in _SIZES and count:
-            code = np.dtype(self._order + _SIZES[kind] if kind != "bool" else "?")
-            self._align(code.itemsize)
-            values = np.frombuffer(self._data, code, count, self._at)
-            self._at += count * code.itemsize
-            return values.tolist()
-        return [self._value(kind) for _ in range(count)]
 
-    def _value(self, kind: str) -> Any:
-        if kind in _SIZES:
-            return self._number(_SIZES[kind])
-        if kind == "string":
-            count = self._number("I")
-            self._at += count
-            return self._data[self._at - count : self._at - 1].decode()
-        return self.record(kind)
-
-    def _number(self, code: str) -> Any:
-        size = struct.calcsize(code)
-        self._align(size)
-        (value,) = struct.unpack_from(self._order + code, self._data, self._at)
-        self._at += size
-        return value
-
-    def _align(self, size: int) -> None:
-        self._at += -(self._at - len(ENCAPSULATION)) % size
+def _columns(topic: _Topic, logs_ns: Sequence[int], messages: Sequence[bytes]) -> Columns:
+    """Return the columns of some messages of a topic."""
+    found = Columns()
+    for log_ns, data in zip(logs_ns, messages, strict=True):
+        try:
+            message = topic.decode(data) if topic.decode else None
+            if not isinstance(message, Mapping):
+                raise ValueError("it is no record of named values")
+            found.add(message, log_ns)
+        except (*BROKEN, UnicodeDecodeError) as error:
+            found.broken = f"message {found.count} cannot be decoded: {error}"
+            break
+    found.finish()
+    return found

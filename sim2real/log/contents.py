@@ -163,7 +163,7 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
             )
         if not found.chunks:
             raise cut_before_session(path)
-        found.damage.skipped.append("the session's metadata")
+        found.damage.skip("the session's metadata")
     return found
 
 

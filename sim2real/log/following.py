@@ -131,7 +131,10 @@ def on_grid(
         measured: Shape ``(M, columns)``.
         acting: Shape ``(N,)``: whether commands act; None: all do.
     """
-    period = float(np.median(np.diff(t_measured)))
+    steps = np.diff(t_measured)
+    typical = float(np.median(steps))
+    # Their mean: dates in float64 are rounded to 0.24 us, which would add up over thousands of rows.
+    period = float(steps[np.abs(steps - typical) <= 0.1 * typical].mean())
     begin, end = max(t_command[0], t_measured[0]), min(t_command[-1], t_measured[-1])
     t = begin + period * np.arange(min(max(int((end - begin) / period), 0), _MOST_ROWS))
     newest = np.clip(np.searchsorted(t_command, t + 1e-3 * period, side="right") - 1, 0, len(command) - 1)

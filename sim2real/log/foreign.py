@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +13,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.bags import read_bag
+from sim2real.log import dates, lerobot
+from sim2real.log.arrays import DAMAGED, read_npz
+from sim2real.log.bags import bag_files, read_bag
+from sim2real.log.budget import (
+    MOST_COLUMNS,
+    MOST_LEVELS,
+    MOST_TEXT_BYTES,
+    WHOLE,
+    require_signals,
+    require_size,
+)
+from sim2real.log.cells import OTHER, NoNumbers, from_words
+from sim2real.log.names import meaning
+from sim2real.log.raw import RawSignals
+from sim2real.log.tables import encoding_of, read_csv
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -24,18 +35,6 @@ if TYPE_CHECKING:
 SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot", ".mcap": "mcap"}
 """File suffix -> format, used unless a format is given."""
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
-# What the libraries raise for damaged content.
-_DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
-_OTHER = "name another source in the mapping"
-_WHOLE = "check that the file is complete, and of the format that its name or --format says"
-
-
-_MISSING = {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "nil", "none", "missing", "<na>"}
-"""Words that stand for a missing number."""
-
-
-class NoNumbers(UsageError):  # noqa: N818 - it says what a signal is
-    """A signal is text, or something else without a single number."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,13 @@ class ForeignFile:
     Attributes:
         path: The file.
         format: One of the values of ``SUFFIXES``.
-        keys: Names of its signals.
+        keys: Names of its signals that a mapping is proposed from.
         load: Returns a signal by name; raises KeyError if there is none.
         columns: Names of a signal's columns, where the file has some.
         beside: Further files of the same recording.
+        notes: What was left out and why: sentences.
+        nominal: Names of stamps that were generated from a rate, not recorded.
+        facts: What the file says about itself: of a LeRobot data set ``meta/info.json``.
     """
 
     path: Path
@@ -57,6 +59,9 @@ class ForeignFile:
     load: Callable[[str], Any]
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     beside: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+    nominal: frozenset[str] = frozenset()
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     def signal(self, source: str, column: int | None = None) -> np.ndarray:
         """Return a signal.
@@ -82,15 +87,21 @@ class ForeignFile:
         except KeyError:
             close = difflib.get_close_matches(name, self.keys, n=1)
             raise UsageError(
-                f"{self.path} has no {name!r}. Available: {', '.join(self.keys) or 'nothing'}",
+                f"{self.path} has no {name!r}. Available: {', '.join(self.keys[:100]) or 'nothing'}",
                 hint=f"did you mean {close[0]}?" if close else "correct the source in the mapping",
             ) from None
         except UsageError:
             raise
-        except _DAMAGED as error:
-            raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=_WHOLE) from None
-        values = _numbers(raw, f"{name!r} in {self.path}")
+        except DAMAGED as error:
+            raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=WHOLE) from None
+        values = _numbers(raw, f"{name!r} in {self.path}", meaning(name).unit)
         if chosen is None:
+            if values.ndim == 2 and values.shape[1] > MOST_COLUMNS:
+                raise UsageError(
+                    f"{name!r} in {self.path} has {values.shape[1]} columns, as images have; at most {MOST_COLUMNS} "
+                    "are read",
+                    hint=f"choose some: {name}[:,0:6]",
+                )
             return values
         try:
             return values[:, chosen]
@@ -101,181 +112,81 @@ class ForeignFile:
             ) from None
 
 
-def open_foreign(path: Path, format: str | None = None) -> ForeignFile:
-    """Open a file of another recorder.
+def open_foreign(path: Path, format: str | None = None, episode: int | None = None) -> ForeignFile:
+    """Open a file of another recorder, the folder of a ROS 2 bag, or that of a LeRobot data set.
 
     Args:
-        path: The file.
+        path: The file or folder.
         format: One of the values of ``SUFFIXES``; None: chosen by the file's suffix.
+        episode: Number of the episode of a LeRobot data set; None: the only one.
 
     Raises:
         UsageError: When the file does not exist, is empty, or does not have this format.
     """
-    formats = ", ".join(_READERS)
-    if format is None and not path.is_dir():
+    formats = ", ".join(_FORMATS)
+    files = [path]
+    if path.is_dir() and (path / lerobot.INFO).is_file():
+        files, format = lerobot.files_of(path, episode), "lerobot"
+    elif path.is_dir():
+        files, format = bag_files(path), "mcap"
+    elif format is None:
         format = SUFFIXES.get(path.suffix.lower())
         if format is None:
             raise UsageError(
                 f"the format of {path} is unknown: no suffix {path.suffix!r}. Available: {', '.join(SUFFIXES)}",
                 hint=f"name it with --format: {formats}",
             )
-    if format not in (*_READERS, None):
+    if format not in _FORMATS:
         raise UsageError(f"unknown format {format!r}. Available: {formats}", hint="save the file as one of these")
-    if path.is_dir() and (path / "metadata.yaml").is_file():
-        path, format = _bag_file(path), "mcap"
-    if path.is_dir():
-        hint = "name the files in it; of a LeRobot data set: DIR/data/chunk-*/episode_*.parquet"
-        raise UsageError(f"{path} is a folder, not a file", hint=hint)
+    if episode is not None and format != "lerobot":
+        raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="leave --episode out")
     try:
-        if path.stat().st_size == 0:
-            raise UsageError(f"{path} is empty", hint=_WHOLE)
-        return _READERS[str(format)](path)
+        if not path.is_dir() and not path.is_file():
+            why = "it is a pipe or a device" if path.exists() else "there is no such file"
+            raise UsageError(f"cannot read {path}: {why}", hint="check its name")
+        if not all(part.stat().st_size for part in files):
+            raise UsageError(f"{next(p for p in files if not p.stat().st_size)} is empty", hint=WHOLE)
+        if format == "lerobot":
+            found = lerobot.read_lerobot(path, episode)
+        else:
+            found = read_bag(files) if format == "mcap" else _READERS[format](path)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}", hint="check its name") from None
+    return ForeignFile(
+        files[0],
+        format,
+        found.keys,
+        found.load,
+        found.columns,
+        tuple(files[1:]),
+        found.notes,
+        found.nominal,
+        found.facts,
+    )
 
 
-def _bag_file(folder: Path) -> Path:
-    """Return the only MCAP file of a ROS 2 bag's folder."""
-    found = sorted(folder.glob("*.mcap"))
-    if len(found) != 1:
-        other = sorted(folder.glob("*.db3"))
-        hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
-        raise UsageError(f"{folder} holds {len(found)} MCAP files, and {len(other)} of SQLite", hint=hint)
-    return found[0]
-
-
-def _read_npz(path: Path) -> ForeignFile:
-    # numpy would try to read anything but a ZIP archive as a pickle.
-    if not zipfile.is_zipfile(path):
-        raise UsageError(f"{path} is no npz file, or is cut off", hint=_WHOLE)
-
-    def load(name: str) -> Any:
-        # Opened again for each signal, so that one with Python objects does not prevent reading the others.
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                return data[name]
-        except ValueError as error:
-            if "pickle" not in str(error):
-                raise
-            raise UsageError(
-                f"{name!r} in {path} holds Python objects, which could run any code when loaded",
-                hint="save it again as an array of numbers",
-            ) from None
-
+def _read_json(path: Path) -> RawSignals:
+    require_size(path, MOST_TEXT_BYTES)
+    encoding = encoding_of(path, "JSON")
     try:
-        with zipfile.ZipFile(path) as archive:
-            keys = [name.removesuffix(".npy") for name in archive.namelist()]
-    except _DAMAGED as error:
-        raise UsageError(f"{path} is no npz file, or is damaged: {error}", hint=_WHOLE) from None
-    return ForeignFile(path, "npz", keys, load)
-
-
-def _read_json(path: Path) -> ForeignFile:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = json.loads(path.read_text(encoding=encoding))
         keys = _paths(document)
     except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
-        raise UsageError(f"{path} is no JSON, or is cut off: {error}", hint=_WHOLE) from None
+        if isinstance(error, UsageError):
+            raise
+        deep = f"it is nested deeper than {MOST_LEVELS} levels"
+        why = deep if isinstance(error, RecursionError) else error
+        raise UsageError(f"{path} is no JSON, or is cut off: {why}", hint=WHOLE) from None
     if not isinstance(document, dict | list):
-        raise UsageError(f"{path} holds a single value, no signals", hint=_WHOLE)
+        raise UsageError(f"{path} holds a single value, no signals", hint=WHOLE)
+    require_signals(len(keys), path)
 
     def load(name: str) -> Any:
         if isinstance(document, dict) and name in document:
             return document[name]
         return _walk(document, [p for p in re.split(r"\.|(?=\[\])", name) if p], path)
 
-    return ForeignFile(path, "json", keys, load)
-
-
-def _read_csv(path: Path) -> ForeignFile:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        first = text.partition("\n")[0]
-        lines = csv.reader(text.splitlines(), delimiter=max(",;\t", key=first.count), skipinitialspace=True)
-        rows = [(lines.line_num, row) for row in lines if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{path} is no CSV: {error}", hint=_WHOLE) from None
-    if not rows:
-        raise UsageError(f"{path} is empty", hint=_WHOLE)
-    header = [name.strip() for name in rows.pop(0)[1]]
-    # A comma at the end of lines is no column.
-    while header and not header[-1] and all(len(row) < len(header) for _, row in rows):
-        header.pop()
-    rows = [(n, row if "".join(row[len(header) :]).strip() else row[: len(header)]) for n, row in rows]
-    if twice := {name for name in header if name and header.count(name) > 1}:
-        raise UsageError(f"{path} has more than one column {sorted(twice)[0]!r}", hint="rename one of them")
-    if all(_is_number(name) for name in header):
-        raise UsageError(f"the first line of {path} holds numbers, not names", hint="put the columns' names there")
-    for number, row in rows:
-        if len(row) != len(header):
-            raise UsageError(f"line {number} of {path} has {len(row)} cells, the first has {len(header)}", hint=_WHOLE)
-
-    def load(name: str) -> Any:
-        if name not in header:
-            raise KeyError(name)
-        index = header.index(name)
-        if rows and rows[0][1][index].startswith("["):
-            return [_list(row[index], f"line {n} of {path}, column {name!r}") for n, row in rows]
-        try:
-            return np.array([int(row[index]) for _, row in rows], np.int64)
-        except (ValueError, OverflowError):
-            cells = [row[index].strip() for _, row in rows]
-        if not any(_is_number(cell) or cell.lower() in _MISSING for cell in cells):
-            raise NoNumbers(f"column {name!r} of {path} holds no numbers: {cells[0]!r}", hint=_OTHER)
-        return np.array(
-            [_cell(c, f"line {n} of {path}, column {name!r}") for (n, _), c in zip(rows, cells, strict=True)]
-        )
-
-    return ForeignFile(path, "csv", [name for name in header if name], load)
-
-
-def _read_lerobot(path: Path) -> ForeignFile:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise UsageError(
-            f"{path} is a Parquet file, which needs pyarrow", hint="pip install 'sim2real[parquet]'"
-        ) from None
-    try:
-        file = pyarrow.parquet.ParquetFile(path)
-    except (pyarrow.ArrowException, *_DAMAGED) as error:
-        raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
-    columns = list(file.schema_arrow.names)
-    # For DIR/data/chunk-000/episode_000000.parquet, DIR/meta/info.json has what all episodes share.
-    infos = [folder / "meta" / "info.json" for folder in path.absolute().parents[2:3]]
-    facts = [_read_json(info) for info in infos if info.is_file()]
-
-    def load(name: str) -> Any:
-        if name not in columns:
-            if not facts:
-                raise KeyError(name)
-            return facts[0].load(name)
-        return file.read(columns=[name]).column(0).to_pylist()
-
-    named = _feature_names(infos[0]) if facts else {}
-    found = ForeignFile(path, "lerobot", [*columns, *(["fps"] if facts else [])], load, named)
-    if "episode_index" in columns and len(np.unique(found.signal("episode_index"))) > 1:
-        raise UsageError(
-            f"{path} holds more than one episode", hint="import data sets of LeRobot v2, where a file is an episode"
-        )
-    return found
-
-
-def _feature_names(info: Path) -> dict[str, list[str]]:
-    """Return the names of the entries of a LeRobot data set's columns, as ``meta/info.json`` has them."""
-    found = {}
-    for key, feature in json.loads(info.read_text(encoding="utf-8")).get("features", {}).items():
-        names = feature.get("names") if isinstance(feature, dict) else None
-        names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
-        if isinstance(names, list) and all(isinstance(n, str) for n in names):
-            found[key] = names
-    return found
-
-
-def _read_mcap(path: Path) -> ForeignFile:
-    keys, load, columns = read_bag(path)
-    return ForeignFile(path, "mcap", keys, load, columns)
+    return RawSignals(keys, load, notes=(f"{path.name} is no UTF-8: it is read as latin-1",) * (encoding == "latin-1"))
 
 
 def joined(files: Sequence[ForeignFile]) -> ForeignFile:
@@ -300,42 +211,40 @@ def joined(files: Sequence[ForeignFile]) -> ForeignFile:
 
     keys = [f"{stem}/{key}" for stem, file in own.items() for key in file.keys]
     columns = {f"{stem}/{key}": names for stem, file in own.items() for key, names in file.columns.items()}
-    return ForeignFile(files[0].path, files[0].format, keys, load, columns, tuple(f.path for f in files[1:]))
+    beside = tuple(path for f in files for path in (f.path, *f.beside))[1:]
+    notes = tuple(note for f in files for note in f.notes)
+    nominal = frozenset(f"{stem}/{name}" for stem, file in own.items() for name in file.nominal)
+    return ForeignFile(files[0].path, files[0].format, keys, load, columns, beside, notes, nominal, files[0].facts)
 
 
-_READERS: dict[str, Callable[[Path], ForeignFile]] = {
-    "npz": _read_npz,
-    "json": _read_json,
-    "csv": _read_csv,
-    "lerobot": _read_lerobot,
-    "mcap": _read_mcap,
-}
+_READERS: dict[str, Callable[[Path], RawSignals]] = {"npz": read_npz, "json": _read_json, "csv": read_csv}
+_FORMATS = (*_READERS, "lerobot", "mcap")
 
 
-def _numbers(raw: npt.ArrayLike, what: str) -> np.ndarray:
-    """Return a value as an array of float64, float32 or int64."""
+def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
+    """Return a value as an array of float64, float32 or int64; dates as nanoseconds since 1970, or in their unit."""
     try:
         values = np.asarray(raw)
+        if (
+            values.dtype.kind in "UO"
+            and values.ndim == 1
+            and dates.are_dates([v for v in values[:1] if isinstance(v, str)])
+        ):
+            values = dates.parsed([str(v) for v in values], unit if unit in ("s", "ms", "us", "ns") else "")
+        elif values.dtype.kind in "Mm":
+            missing, values = np.isnat(values), values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64)
+            values = np.where(missing, np.nan, values) if missing.any() else values
         if values.dtype == object:  # JSON and Parquet have None for a missing value, which becomes NaN
             values = np.asarray(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
     if values.dtype.kind in "US":
-        values = _from_words(values, what)
+        values = from_words(values, what)
     if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
         return values.astype(np.int64)
     if values.dtype.kind not in "fiub":
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=_OTHER)
+        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
     return values if values.dtype == np.float32 else values.astype(np.float64)
-
-
-def _from_words(values: np.ndarray, what: str) -> np.ndarray:
-    """Return numbers that were saved as words; NaN for a word that stands for a missing one."""
-    words = [str(word).strip() for word in values.astype(str).reshape(-1)]
-    if not any(map(_is_number, words)):
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=_OTHER)
-    numbers = [_cell(word, f"sample {i} of {what}") for i, word in enumerate(words)]
-    return np.array(numbers).reshape(values.shape)
 
 
 def _index(text: str) -> int | slice:
@@ -358,7 +267,7 @@ def _walk(value: object, parts: Sequence[str], path: Path) -> Any:
                 if not i:
                     raise
                 raise UsageError(
-                    f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=_WHOLE
+                    f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=WHOLE
                 ) from None
         return found
     if isinstance(value, dict) and head in value:
@@ -366,35 +275,12 @@ def _walk(value: object, parts: Sequence[str], path: Path) -> Any:
     raise KeyError(head)
 
 
-def _paths(value: object, trail: str = "") -> list[str]:
+def _paths(value: object, trail: str = "", level: int = 0) -> list[str]:
     """Return the paths to all values of a JSON document; for a list of objects, those of the first object."""
+    if level > MOST_LEVELS:
+        raise ValueError(f"it is nested deeper than {MOST_LEVELS} levels")
     if isinstance(value, dict):
-        return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."))]
+        return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."), level + 1)]
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return _paths(value[0], f"{trail}[]")
+        return _paths(value[0], f"{trail}[]", level + 1)
     return [trail] if trail else []
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _list(text: str, where: str) -> Any:
-    """Return the list in a CSV cell, as ``[0.1, 0.2]`` or ``[0.1 0.2]``."""
-    try:
-        return json.loads(text) if "," in text else [float(x) for x in text.strip("[] ").split()]
-    except ValueError:
-        raise UsageError(f"{where} holds {text!r}, no list of numbers", hint=_WHOLE) from None
-
-
-def _cell(text: str, where: str) -> float:
-    """Return the number in a CSV cell; NaN if it is empty, or a word for a missing number."""
-    if text.lower() in _MISSING:
-        return float("nan")
-    if not _is_number(text):
-        raise UsageError(f"{where} holds {text!r}, no number", hint=f"correct the cell, or empty it; {_OTHER}")
-    return float(text)

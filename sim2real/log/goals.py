@@ -76,6 +76,12 @@ def goal(
             hint="write a mapping with the scale that its maker gives",
         )
     unit = to_rad / (ratio or to_rad / (told or 1.0))
+    if not np.isclose(unit, (1.0, DEGREES)).any():
+        raise UsageError(
+            f"{measured.name!r} in {path}, in {'degrees' if to_rad != 1 else 'radians'}, follows {command.name!r} with "
+            f"slopes of {slopes[:3].round(4)}: then that is neither in radians nor in degrees",
+            hint="end both names with their units, as in q_rad and goal_deg, or write a mapping with the scales",
+        )
     if told is not None and ratio is not None and not np.isclose(told, unit):
         raise UsageError(
             f"{command.name!r} in {path} is in {command.meaning.unit} by its name, but {measured.name!r}, in "
@@ -124,17 +130,17 @@ def _signs(names: Sequence[str], own: Following, sure: np.ndarray, path: str, as
         return [f"the commands repeat, so the data cannot tell signs: {listed}; they are kept as the file has them"]
     again = sure & (np.isfinite(against) | np.isfinite(repeats))
     for i in np.flatnonzero(again)[:1].tolist():
-        fits = [f"{_ms(repeats[i])} ms"] * bool(np.isfinite(repeats[i]))
-        fits += [f"{_ms(against[i])} ms with the opposite sign"] * bool(np.isfinite(against[i]))
+        others = ((repeats[i], ""), (against[i], " with the opposite sign"))
+        fits = [f"{_ms(late)} ms{sign}" for late, sign in others if np.isfinite(late)]
         return [
-            f"commands repeat, so the data alone cannot tell lags and signs: {names[i]} follows {_ms(lag[i])} ms later, "
-            f"and {' and '.join(fits)} would fit as well: the least lag and the same sign are taken"
+            f"commands repeat, so the data alone cannot tell lags and signs: {names[i]} follows {_ms(lag[i])} ms "
+            f"later, and {' and '.join(fits)} would fit as well: the least lag and the same sign are taken"
         ]
     return []
 
 
 def _others_agree(own: Following, sure: np.ndarray) -> np.ndarray:
-    """Return whose opposite sign has the lag of the other joints, while the lag that was taken differs, ``(joints,)``."""
+    """Return which joints have the lag of the others with the opposite sign, but not with theirs, ``(joints,)``."""
     lag, against, repeats = (np.diag(a) for a in (own.lag_s, own.against_s, own.repeats_s))
     options = np.stack([lag, repeats, against])[:, sure]
     most = 2.0 * own.period_s + _SAME_S
@@ -197,8 +203,8 @@ def refuse_copies(measured: Signal, command: Signal, copies: np.ndarray, path: s
     return [f"warning: commands are the measurements themselves: {listed}"]
 
 
-def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds + 0.0:.0f}".replace("-0", "0")
+def _ms(seconds: float | np.ndarray) -> str:
+    return f"{round(1e3 * float(seconds))}"
 
 
 def _slopes(found: Following) -> np.ndarray:

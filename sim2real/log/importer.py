@@ -15,8 +15,8 @@ from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
 from sim2real.log import plausible
 from sim2real.log.foreign import ForeignFile, open_foreign
+from sim2real.log.kept import align_turns, kept_samples, plausible_samples
 from sim2real.log.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
-from sim2real.log.names import meaning
 from sim2real.log.session_file import SessionFile
 
 RECORDED, GENERATED = "recorded", "generated"
@@ -45,13 +45,18 @@ class _Signals:
 
 
 def import_file(
-    path: str | Path, mapping: ImportMapping | str | Path, samples: slice | None = None, format: str | None = None
+    path: str | Path,
+    mapping: ImportMapping | str | Path,
+    samples: slice | None = None,
+    format: str | None = None,
+    episode: int | None = None,
 ) -> Episode:
     """Read a file of another recorder as an episode.
 
     Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are kept, rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
-    sample. Without recorded stamps, they are generated from the node's rate. The episode's metadata has ``stamps``
+    sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
+    ``frame_index / fps`` count as generated. The episode's metadata has ``stamps``
     (node -> ``recorded`` or ``generated``), ``pipeline``, ``source``, ``graph``, ``mapping`` and
     ``versions``.
 
@@ -60,13 +65,14 @@ def import_file(
         mapping: The mapping from signals to fields, or the mapping file.
         samples: The samples to take, for every node; None: all.
         format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; None: chosen by the file's suffix.
+        episode: Number of the episode of a LeRobot data set; None: the only one.
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
             differ in length, a sample is not finite, or stamps do not increase.
     """
     found = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
-    return import_opened(open_foreign(Path(path), format), found, samples)
+    return import_opened(open_foreign(Path(path), format, episode), found, samples)
 
 
 def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | None = None) -> Episode:
@@ -82,26 +88,26 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
     ticks, outputs, stamps, dropped = {}, {}, {}, {}
     for name, node in mapping.nodes.items():
         found, last = signals[name], signals[name].count if stop is None else stop
-        kept = _kept(node, found, first, last)
-        kept = _plausible(file, name, node, found, kept)
+        kept = kept_samples(node, found.fields, found.stamps, first, last)
+        kept = plausible_samples(f"node {name} in {file.path}", node, found.fields, _seconds(node, found, kept), kept)
         outputs[name] = {
             field: _samples(file, f"{name}.{field}", found.fields[field], how, kept)
             for field, how in node.fields.items()
         }
         ticks[name] = _ticks(file, name, node, found, kept)
-        stamps[name] = GENERATED if found.stamps is None else RECORDED
+        stamps[name] = GENERATED if found.stamps is None or node.stamps in file.nominal else RECORDED
         dropped[name] = last - first - len(kept)
-    _align_turns(mapping, outputs, ticks)
-    zero = _time_zero([ticks[name] for name, kind in stamps.items() if kind == RECORDED], first)
-    for name, kind in stamps.items():
-        ticks[name] -= zero if kind == RECORDED else 0
+    align_turns(mapping, outputs, ticks)
+    from_file = [name for name, found in signals.items() if found.stamps is not None]
+    zero = _time_zero([ticks[name] for name in from_file], first)
+    for name in from_file:
+        ticks[name] -= zero
     source = {
         "file": file.path.name,
         "format": file.format,
-        "sha256": hashlib.sha256(file.path.read_bytes()).hexdigest(),
-        **(
-            {"beside": {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in file.beside}} if file.beside else {}
-        ),
+        "sha256": _sha256(file.path),
+        **({"beside": {p.name: _sha256(p) for p in file.beside}} if file.beside else {}),
+        **({"notes": list(file.notes)} if file.notes else {}),
         "first_sample": first,
         "time_zero_us": zero,
         "dropped": dropped,
@@ -120,6 +126,11 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
         },
         units=mapping.units,
     )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> None:
@@ -250,81 +261,11 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
     return first, stop
 
 
-def _kept(node: NodeMapping, signals: _Signals, first: int, stop: int) -> np.ndarray:
-    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep."""
-    kept = np.arange(first, stop)
-    series = [v for v in (*signals.fields.values(), signals.stamps) if v is not None and v.ndim]
-    if node.missing == "drop":
-        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
-        kept = kept[good]
-    if node.repeated == "first" and signals.stamps is not None and len(kept):
-        stamps = signals.stamps[kept]
-        kept = kept[np.concatenate([[True], stamps[1:] != stamps[:-1]])]
-    return kept
-
-
-def _plausible(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
-    """Return the numbers of those samples whose positions a joint can have had.
-
-    Raises:
-        UsageError: When positions leap away and back, and the mapping does not say to drop such samples; jump at the
-            end of a turn that is not to be counted; or change by more than a joint can move.
-    """
-    t_s = kept / signals.rate_hz if signals.rate_hz else None
-    if t_s is None and signals.stamps is not None:
-        t_s = signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
-    if t_s is None or len(kept) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-        return kept  # the errors of stamps say more
-    for field, how in node.fields.items():
-        if how.unit != "rad" or meaning(field).side == "command" or meaning(field).quantity != "position":
-            continue
-        values = signals.fields[field]
-        angle = np.atleast_2d(values[kept].reshape(len(kept), -1) * np.asarray(how.scale)) if values.ndim else None
-        if angle is None or not np.isfinite(angle).all():
-            continue
-        where = f"{name}.{field} in {file.path}"
-        if not how.turn and (over := plausible.turns(angle, plausible.TURN_RAD)).any():
-            raise UsageError(
-                f"column {int(over.argmax())} of {where} jumps by 2 pi at the end of a turn",
-                hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
-            )
-        leapt = plausible.glitches(t_s, angle)
-        if leapt.any() and node.implausible == "refuse":
-            k, i = (int(x[0]) for x in np.nonzero(leapt))
-            raise UsageError(
-                f"column {i} of {where} reads {angle[k, i]:.4g} rad in sample {kept[k]}: it leaps away and back, as no "
-                f"joint can, in {int(leapt.any(axis=1).sum())} samples",
-                hint='implausible = "drop" in the mapping leaves such samples out',
-            )
-        kept, angle, t_s = (x[~leapt.any(axis=1)] for x in (kept, angle, t_s))
-        if (jump := plausible.leap(t_s, angle)) is not None:
-            raise UsageError(
-                f"column {jump[1]} of {where} changes by {jump[2]:.4g} rad before sample {kept[jump[0]]}, within "
-                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: no joint can, so its zero or its unit has changed",
-                hint="cut the file there with --samples A:B, or leave this joint out",
-            )
-    return kept
-
-
-def _align_turns(
-    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, Any]
-) -> None:
-    """Bring positions and commands whose turns were counted, each from its own beginning, to the same turn."""
-    angles = [
-        (name, field, how)
-        for name, node in mapping.nodes.items()
-        for field, how in node.fields.items()
-        if how.unit == "rad"
-    ]
-    for name, field, how in angles:
-        for other, goal, its in angles:
-            a, b = outputs[name][field], outputs[other][goal]
-            if meaning(field).side == "command" or meaning(goal).side != "command" or not (how.turn or its.turn):
-                continue
-            if meaning(field).quantity != "position" or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
-                continue
-            flat, t = [x.reshape(len(x), -1) for x in (b, a)], [np.asarray(ticks[n], float) for n in (other, name)]
-            outputs[other][goal] = plausible.same_turn(flat[0], t[0], flat[1], t[1]).reshape(b.shape)
+def _seconds(node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+    """Return the stamps of samples, recorded or generated [s]."""
+    if signals.stamps is None:
+        return kept / (signals.rate_hz or 1.0)
+    return signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
 
 
 def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, kept: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
         raise UsageError(f"there is no mapping file {path}", hint=f"write one, or name another; {_HINT}") from None
     except OSError as error:
         raise UsageError(f"the mapping file {path} cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path} is no TOML: {error}", hint=_HINT) from None
     return ImportMapping.from_dict(tables, pipeline, path)
 

@@ -13,7 +13,7 @@ _SIDES = {
     "measured": "meas measured measurement state states actual present obs observation fb feedback sensor encoder",
 }
 _QUANTITIES = {
-    "stamp": "t time times stamp stamps timestamp timestamps sec secs",
+    "stamp": "t time times stamp stamps timestamp timestamps sec secs date datetime",
     "position": "q qs qpos pos position positions angle angles th theta",
     "velocity": "dq qd qvel vel velocity velocities speed speeds omega thdot qdot rate_of_angle",
     "torque": "tau torque torques effort efforts load loads current currents force forces",
@@ -24,6 +24,7 @@ _QUANTITIES = {
     "enabled": "enable enabled",
     "rate": "fps rate hz freq frequency",
     "period": "dt period",
+    "error": "error errors err",
 }
 _UNITS = {
     "rad": "rad rads radian radians",
@@ -34,6 +35,7 @@ _UNITS = {
     "ns": "ns nsec nanos nanoseconds nanosec",
     "raw": "raw counts ticks",
 }
+_WEAK = {"state", "states"}
 _SIDE = {word: side for side, words in _SIDES.items() for word in words.split()}
 _QUANTITY = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
 _UNIT = {word: unit for unit, words in _UNITS.items() for word in words.split()}
@@ -63,7 +65,7 @@ class Meaning:
     Attributes:
         side: ``command`` or ``measured``.
         quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
-            ``enabled``, ``rate`` or ``period``.
+            ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
         unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns`` or ``raw``.
         label: The rest: the joint.
     """
@@ -76,17 +78,17 @@ class Meaning:
 
 def meaning(name: str) -> Meaning:
     """Return what a name says, such as ``cmd_deg/FL_hip`` (a command in degrees, of joint ``fl_hip``)."""
-    words = [word.lower() for word in _WORDS.findall(name)]
-    side = quantity = unit = ""
+    quantity = unit = ""
     rest = []
+    words = [word.lower() for word in _WORDS.findall(name)]
     for place, word in enumerate(words):
         # A letter is a unit only behind something, as in `t_s`; `s` alone is a name.
         known_unit = _UNIT.get(word, "") if place else ""
         if word in _SIDE:
-            side = side or _SIDE[word]
-        elif word in _QUANTITY and not (quantity == "stamp" and known_unit):
-            # `torque_enable` enables, `goal_time` is a time: what stands last counts.
-            quantity = _QUANTITY[word]
+            continue
+        if word in _QUANTITY and not (quantity == "stamp" and known_unit):
+            # `torque_enable` enables, `goal_time` is a time: what stands last counts, but of an error.
+            quantity = quantity if quantity == "error" else _QUANTITY[word]
         elif known_unit:
             unit = known_unit
         elif word not in _FILLERS:
@@ -94,7 +96,21 @@ def meaning(name: str) -> Meaning:
     # `dq_rad_s`: an angle over a time is a velocity, in the angle's unit.
     if quantity == "velocity" and unit == "s":
         unit = next((u for w in words if (u := _UNIT.get(w, "")) in ("rad", "deg")), "")
-    return Meaning(side, quantity, unit, "_".join(rest))
+    return Meaning(_side(name), quantity, unit, "_".join(rest))
+
+
+def _side(name: str) -> str:
+    """Return who sent a signal: the innermost part of its path that says so.
+
+    ``/controller_state.reference.positions`` is a command, although its topic is a state.
+    """
+    for part in re.split(r"[./]", name)[::-1]:
+        words = [word for word in map(str.lower, _WORDS.findall(part)) if word in _SIDE]
+        # `target_joint_state` and `state_desired` are commands: a state is what anything has.
+        strong = [word for word in words if word not in _WEAK] or words
+        if strong:
+            return _SIDE[strong[0]]
+    return ""
 
 
 def same_joint(label: str, joint: str) -> bool:

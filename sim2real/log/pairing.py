@@ -9,10 +9,11 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.following import following, on_grid
-from sim2real.log.names import Meaning
+from sim2real.log.names import Meaning, same_joint
 from sim2real.log.signals import Signal, find_stamps
 
 _SURE = 0.8
+_MOST_UNNAMED, _MOST_LISTED = 50, 20
 _KINDS = ("position", "velocity", "torque", "duty", "voltage")
 
 
@@ -33,13 +34,14 @@ class Pair:
     said: tuple[str, ...]
 
 
-def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pair:
+def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joints: Sequence[str] = ()) -> Pair:
     """Return measured positions and their commands.
 
     Args:
         signals: All of the file.
         path: The file, for errors.
         rate_hz: Rate of samples without stamps [Hz].
+        joints: The joints that are asked for, where they are known.
 
     Raises:
         UsageError: When there is none, or more than one that may be it: all are named.
@@ -47,18 +49,19 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None) -> Pa
     series = [
         s for s in signals if s.values.ndim == 2 and s.width and s.meaning.quantity != "stamp" and len(s.values) > 2
     ]
-    measured = _one(
-        [s for s in series if s.meaning.quantity == "position" and s.meaning.side != "command"]
-        or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity],
-        "measured position", path,
-    )  # fmt: skip
+    positions = [s for s in series if s.meaning.quantity == "position" and s.meaning.side != "command"]
+    positions = positions or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity]
     named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
-    series = [s for s in series if np.ptp(s.values[s.finite], axis=0).any()] or series
+    series = [s for s in series if _varies(s)] or series
     # A command that never changes is still the command, where there is no other: to say so is what `check` is for.
     commands = [s for s in named if any(s is other for other in series)] or named
     # A feed-forward beside a goal is no command of its own; a goal is what positions follow.
     goals = [s for s in commands if s.meaning.quantity in ("", "position")]
-    command = _one(goals or commands, "command", path)
+    if not joints and len(goals or commands) == 1:
+        joints = (goals or commands)[0].labels  # what was commanded was measured
+        joints = joints if all(joints) else ()
+    measured = _one(_of_joints(positions, joints), "measured position", path)
+    command = _one(_of_joints(goals or commands, joints), "command", path)
     if measured is not None and command is not None:
         names = f"{measured.name!r} was measured and {command.name!r} commanded, by their names"
         return Pair(measured, command, _kind(command), (names,))
@@ -103,8 +106,20 @@ def _one(fitting: Sequence[Signal], what: str, path: str) -> Signal | None:
         return None
     raise UsageError(
         f"which signal of {path} is the {what}? Candidates: {', '.join(repr(s.name) for s in fitting)}",
-        hint="write a mapping, or leave the others out of the file",
+        hint="say with --joints which joints are meant, write a mapping, or leave the others out of the file",
     )
+
+
+def _of_joints(signals: Sequence[Signal], joints: Sequence[str]) -> Sequence[Signal]:
+    """Return those signals whose names have all the joints; all signals where none has."""
+    if not joints or len(signals) < 2:
+        return signals
+    return [s for s in signals if all(any(same_joint(own, joint) for own in s.labels) for joint in joints)] or signals
+
+
+def _varies(signal: Signal) -> bool:
+    columns = [column[np.isfinite(column)] for column in signal.values.T]
+    return any(column.size and np.ptp(column) > 0 for column in columns)
 
 
 def _moves(signal: Signal) -> bool:
@@ -143,6 +158,12 @@ def _link(a: Signal, b: Signal, signals: Sequence[Signal], path: str, rate_hz: f
 
 def _by_data(candidates: Sequence[Signal], path: str, rate_hz: float | None, signals: Sequence[Signal]) -> Pair:
     """Return the pair where names say nothing: what follows was measured, what leads was commanded."""
+    if len(candidates) > _MOST_UNNAMED:
+        raise UsageError(
+            f"names in {path} do not say what was measured and what was commanded, and {len(candidates)} signals are "
+            f"too many to compare each with each (at most {_MOST_UNNAMED}): {_names(candidates)}",
+            hint="name the columns so that it shows, as in q_rad and goal_rad, or write a mapping",
+        )
     found = []
     for i, a in enumerate(candidates):
         for b in candidates[:i]:
@@ -157,7 +178,7 @@ def _by_data(candidates: Sequence[Signal], path: str, rate_hz: float | None, sig
     widest = max((a.width for a, *_ in found), default=0)
     found = [f for f in found if f[0].width == widest]
     if len(found) != 1:
-        listed = "; ".join(f"{a.name} and {b.name}" for a, b, *_ in found) or _names(signals)
+        listed = "; ".join(f"{a.name} and {b.name}" for a, b, *_ in found[:_MOST_LISTED]) or _names(signals)
         raise UsageError(
             f"names in {path} do not say what was measured and what was commanded, "
             f"and {'several pairs follow each other' if found else 'nothing follows anything'}. Candidates: {listed}",
@@ -200,4 +221,5 @@ def _halves(
 
 
 def _names(signals: Sequence[Signal]) -> str:
-    return ", ".join(repr(s.name) for s in signals) or "nothing"
+    more = f" and {len(signals) - _MOST_LISTED} more" if len(signals) > _MOST_LISTED else ""
+    return ", ".join(repr(s.name) for s in signals[:_MOST_LISTED]) + more or "nothing"

@@ -84,9 +84,13 @@ def glitches(t_s: np.ndarray, angle: np.ndarray, radian: float = 1.0) -> np.ndar
         fastest = max(_SLOWEST_RAD_S, 1.5 * float((np.abs(np.diff(middle)) / steps_s).max()))
         off = np.abs(column - middle)
         leap = np.abs(np.diff(column))
-        # A fast motion goes there in steps, a leap in one.
-        sudden = np.maximum(np.append(0.0, leap), np.append(leap, 0.0)) > 0.5 * off
-        far = (off > reach_rad(fastest, period_s) + 12.0 * float(np.median(off))) & sudden
+        far = off > reach_rad(fastest, period_s) + 12.0 * float(np.median(off))
+        edges = np.flatnonzero(np.diff(far, prepend=False, append=False)).reshape(-1, 2)
+        for begin, end in edges:
+            # A fast motion goes there in steps, a leap in one.
+            ways = leap[max(begin - 1, 0) : begin], leap[end - 1 : end]
+            if max(float(way.max(initial=0.0)) for way in ways) < 0.5 * off[begin:end].max():
+                far[begin:end] = False
         found[:, i] = far if far.mean() <= _RARE else False
     return found
 

@@ -11,14 +11,14 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.log import evidence
 from sim2real.log.evidence import SURE
-from sim2real.log.following import following, on_grid
+from sim2real.log.following import Following, following, on_grid
 from sim2real.log.foreign import ForeignFile
 from sim2real.log.goals import follows, goal, refuse_copies
 from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping
-from sim2real.log.names import same_joint
-from sim2real.log.pairing import find_pair
+from sim2real.log.names import meaning, same_joint
+from sim2real.log.pairing import Pair, find_pair
 from sim2real.log.plausible import TURN_RAD
-from sim2real.log.positions import checked_positions, turned_commands
+from sim2real.log.positions import CheckedPositions, checked_positions, turned_commands
 from sim2real.log.quantities import Asked, clean, extras, field_of, matched, taken, velocity_of
 from sim2real.log.signals import Signal, Stamps, collect, find_stamps
 
@@ -46,6 +46,7 @@ class Proposal:
     evidence: tuple[str, ...]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
 def propose(file: ForeignFile, asked: Asked) -> Proposal:
     """Return the mapping that names and data speak for.
 
@@ -56,63 +57,117 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
     Raises:
         UsageError: When something is ambiguous: the candidates are named.
     """
-    path = str(file.path)
     signals, unread = collect(file)
+    pair, stamps, said = _streams(file, signals, unread, asked)
+    path, command = str(file.path), pair.command
+    places, labels, ordered = _joint_order(pair.measured, asked, path)
+    places, labels, empty = _with_numbers(pair.measured, places, labels, asked, path)
+    # Positions that no joint can have had are no evidence, and would be motion to an identification.
+    checked = checked_positions(file, signals, replace(pair, measured=taken(pair.measured, places)), stamps, asked)
+    measured, said = checked.signal, [*said, *ordered, *empty, *checked.said]
+    command, turn = turned_commands(command, checked)
+    clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
+    rows = clean(clocks[0], measured), clean(clocks[1], command)
+    q, c = measured.values[rows[0]], command.values[rows[1]]
+    held, joined, period_s = _compared(
+        [own[r] for own, r in zip(clocks, rows, strict=True)],
+        c,
+        q,
+        _acting(signals, rows[1]),
+        [measured, command],
+        path,
+    )
+    circle = TURN_RAD * checked.to_rad if checked.hinges.any() else 0.0
+    found = replace(following(held, joined, period_s), turn=circle)
+    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
+    command, goals, more = _commanded(pair, command, checked, turn, found, (clocks, rows), places, path, asked)
+    velocity, on_velocity, lacking = velocity_of(signals, measured, clocks[0], checked.to_rad, places)
+    position = field_of(measured, "rad", [1 / checked.to_rad] * measured.width, checked.turn)
+    said += [*more, *shift]
+    nodes = {}
+    for name, fields, at, lacks, offset, leapt in (
+        ("actuator", goals | extra, stamps[1], ~command.finite, offset_s, np.zeros(len(command.values), bool)),
+        ("sensor", {"position": position} | velocity, stamps[0], ~(measured.finite | checked.leapt) | lacking, 0.0,
+         checked.leapt),
+    ):  # fmt: skip
+        nodes[name], policy = _node(name, fields, at, lacks, offset, leapt)
+        said += policy
+    said += [*on_velocity, *others, *unread, *file.notes]
+    return Proposal(ImportMapping(asked.pipeline, nodes), labels, tuple(said))
+
+
+def _streams(
+    file: ForeignFile, signals: Sequence[Signal], unread: Sequence[str], asked: Asked
+) -> tuple[Pair, list[Stamps], list[str]]:
+    """Return what was measured and what was commanded, the stamps of both, and what to say of them.
+
+    Raises:
+        UsageError: When there is none, or more than one.
+    """
+    path = str(file.path)
     try:
-        pair = find_pair(signals, path, asked.rate_hz)
+        pair = find_pair(signals, path, asked.rate_hz, asked.joints)
     except UsageError as error:
         raise UsageError("; ".join([error.args[0], *unread]), hint=error.hint) from None
-    said = list(pair.said)
-    measured, command = pair.measured, pair.command
-    stamps = [find_stamps(signals, s, side, path, asked.rate_hz)
-              for s, side in ((measured, "measured"), (command, "command"))]  # fmt: skip
-    said += _on_stamps(measured, stamps[0]) + (
-        _on_stamps(command, stamps[1]) if stamps[1].source != stamps[0].source else []
-    )
-    places, labels, ordered = _joint_order(measured, asked, path)
-    places, labels, empty = _with_numbers(measured, places, labels, asked, path)
-    measured, said = taken(measured, places), said + ordered + empty
-    # Positions that no joint can have had are no evidence, and would be motion to an identification.
-    checked = checked_positions(measured, stamps[0].t_s, asked, path)
-    measured, to_rad, said = checked.signal, checked.to_rad, said + checked.said
-    command, turn = turned_commands(command, checked)
-    clocks, offset_s, shift = _clocks(stamps, measured, command, path)
-    rows = clean(clocks[0], measured), clean(clocks[1], command)
-    t, q, c = (clocks[0][rows[0]], clocks[1][rows[1]]), measured.values[rows[0]], command.values[rows[1]]
-    held, joined, period_s = _compared(t, c, q, _acting(signals, rows[1]), [measured, command], path)
-    found = replace(following(held, joined, period_s), turn=TURN_RAD * to_rad)
-    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
-    fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
-    fields["sensor"]["position"] = field_of(measured, "rad", [1 / to_rad] * measured.width, checked.turn)
+    sides = (pair.measured, "measured"), (pair.command, "command")
+    try:
+        stamps = [find_stamps(signals, signal, side, path, asked.rate_hz) for signal, side in sides]
+    except UsageError:
+        _require_readable_stamps(file)
+        raise
+    said = [*pair.said, *_on_stamps(pair.measured, stamps[0])]
+    if stamps[1].source != stamps[0].source:
+        said += _on_stamps(pair.command, stamps[1])
+    return pair, stamps, said
+
+
+def _commanded(
+    pair: Pair,
+    command: Signal,
+    checked: CheckedPositions,
+    turn: float,
+    found: Following,
+    samples: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
+    places: np.ndarray,
+    path: str,
+    asked: Asked,
+) -> tuple[Signal, dict[str, FieldMapping], list[str]]:
+    """Return commands in the order of the joints, the field that they become, and what to say of them.
+
+    Args:
+        pair: What was measured and what was commanded.
+        command: The commands, with turns counted.
+        checked: The positions.
+        turn: A turn in the unit of the commands, where turns are counted; else 0.
+        found: How positions follow commands.
+        samples: Stamps [s] and rows that are compared, of positions and of commands.
+        places: Which column is which joint.
+        path: The file, for errors.
+        asked: What the user knows.
+    """
+    measured, (clocks, rows) = checked.signal, samples
     kind = pair.kind or (
         "position" if command.meaning.unit in ("rad", "deg") or follows(found, command, path) else "duty"
     )
-    if kind == "position":
-        command, scales, more = goal(measured, command, found, to_rad, path, asked.as_told)
-        in_rad = command.values[rows[1]] * scales, q / to_rad
-        turn, circle = _circle(command, turn, *in_rad, abs(scales[0]))
-        fields["actuator"]["goal"] = field_of(command, "rad", scales, turn)
-        copies = evidence.copied(t[1], t[0], *in_rad)
-        more += circle + refuse_copies(measured, command, copies, path, asked.as_told)
-    else:
+    if kind != "position":
         command = _other_command(command, measured, places)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
-        fields["actuator"][_FIELDS[kind]] = field_of(command, unit, [1.0] * command.width)
-        more = [f"{command.name!r} commands {kind}: it goes by its name, no position follows it (|r| at most "
-                f"{np.abs(found.r).max():.2f})"]  # fmt: skip
-    said += more + shift
-    velocity, more = velocity_of(signals, measured, clocks[0], to_rad, places)
-    fields["sensor"] |= velocity
-    fields["actuator"] |= extra
-    nodes = {}
-    for name, at, signal, offset, leapt in (
-        ("actuator", stamps[1], command, offset_s, np.zeros(len(command.values), bool)),
-        ("sensor", stamps[0], measured, 0.0, checked.leapt),
-    ):
-        nodes[name], policy = _node(name, fields[name], at, signal, offset, leapt)
-        said += policy
-    mapping = ImportMapping(asked.pipeline, nodes)
-    return Proposal(mapping, labels, tuple(said + more + others + unread))
+        said = f"it goes by its name, no position follows it (|r| at most {np.abs(found.r).max():.2f})"
+        fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}
+        return command, fields, [f"{command.name!r} commands {kind}: {said}"]
+    command, scales, more = goal(measured, command, found, checked.to_rad, path, asked.as_told)
+    in_rad = command.values[rows[1]] * scales, measured.values[rows[0]] / checked.to_rad
+    turn, circle = _circle(command, turn, *in_rad, abs(scales[0]), checked.hinges)
+    copies = evidence.copied(clocks[1][rows[1]], clocks[0][rows[0]], *in_rad)
+    said = circle + refuse_copies(measured, command, copies, path, asked.as_told)
+    return command, {"goal": field_of(command, "rad", scales, turn)}, [*more, *said]
+
+
+def _require_readable_stamps(file: ForeignFile) -> None:
+    """Raise the error of a signal that is named like a time stamp, but cannot be read."""
+    for key in file.keys:
+        if meaning(key).quantity == "stamp":
+            file.signal(key)
 
 
 def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
@@ -124,13 +179,13 @@ def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
 
 
 def _circle(
-    command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float
+    command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float, hinges: np.ndarray
 ) -> tuple[float, list[str]]:
     """Return a turn in the unit of the goals, where turns are counted or differ, else 0, and what to say of it."""
     if turn:
         return turn, [f"{command.name!r} jumps at the end of a turn: turns are counted"]
     apart = (goal_rad.mean(axis=0) - q_rad.mean(axis=0)) / TURN_RAD
-    other = (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
+    other = hinges & (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
     if not other.any():
         return 0.0, []
     who = ", ".join(np.array(command.sources)[other])
@@ -221,7 +276,7 @@ def _joint_order(measured: Signal, asked: Asked, path: str) -> tuple[np.ndarray,
 
 
 def _clocks(
-    stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
+    signals: Sequence[Signal], stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
 ) -> tuple[list[np.ndarray], float, list[str]]:
     """Return both streams' times, the offset of the commands' clock, and what to say of it.
 
@@ -256,6 +311,8 @@ def _clocks(
             0.0,
             [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"] * (not one),
         )
+    if not apart and _leads_on_recorder(signals, (measured, command), rows):
+        return [t, c], 0.0, []  # no clock explains it
     if (np.isfinite(found.against_s) | np.isfinite(found.repeats_s) | found.either)[sure].all():
         raise UsageError(
             f"the clocks of {measured.name!r} and {command.name!r} in {path} do not agree, and commands that repeat "
@@ -271,13 +328,28 @@ def _clocks(
     return [t, c + offset], offset, [said]
 
 
+def _leads_on_recorder(
+    signals: Sequence[Signal], pair: tuple[Signal, Signal], rows: tuple[np.ndarray, np.ndarray]
+) -> bool:
+    """Return whether positions move before their commands by the recorder's clock, too, which is one for both."""
+    names = [s.sources[0].partition(".")[0] + ".log_time" for s in pair]
+    found = [s.values[:, 0] * 1e-9 for name in names for s in signals if s.name == name]
+    if [len(x) for x in found] != [len(r) for r in rows]:
+        return False
+    q, c = (s.values[r] for s, r in zip(pair, rows, strict=True))
+    held, joined, period_s = on_grid(found[1][rows[1]], c, found[0][rows[0]], q)
+    own = following(held, joined, period_s)
+    sure = np.abs(own.r) > SURE
+    return bool(sure.any() and np.median(own.lag_s[sure]) < -1.5 * period_s)
+
+
 def _node(
-    name: str, fields: dict[str, FieldMapping], stamps: Stamps, signal: Signal, offset_s: float, leapt: np.ndarray
+    name: str, fields: dict[str, FieldMapping], stamps: Stamps, lacks: np.ndarray, offset_s: float, leapt: np.ndarray
 ) -> tuple[NodeMapping, list[str]]:
     """Return a node's mapping, with policies only where the data needs them, and what to say of those."""
     said = []
     missing, repeated = "refuse", "refuse"
-    good = (signal.finite | leapt) & np.isfinite(stamps.t_s)
+    good = ~lacks & np.isfinite(stamps.t_s)
     if not good.all():
         missing = "drop"
         said.append(
@@ -286,13 +358,15 @@ def _node(
     if stamps.repeated:
         repeated = "first"
         said.append(f'{name}: {stamps.repeated} stamps repeat: repeated = "first" keeps the first sample of each')
-    if stamps.backward:
-        raise UsageError(
-            f"{stamps.backward} stamps of {stamps.source!r} are earlier than the one before: a clock that was set, or "
-            "files that were joined in the wrong order",
-            hint="sort or cut the file: --samples A:B",
-        )
     steps = np.diff(stamps.t_s[good])
+    if stamps.backward:
+        k = int(np.argmax(steps < 0))
+        raise UsageError(
+            f"{stamps.backward} stamps of {stamps.source!r} are earlier than the one before, first that of sample "
+            f"{np.flatnonzero(good)[k + 1]}, by {-steps[k]:.4g} s: a clock that was set, or files that were joined in "
+            "the wrong order",
+            hint="cut the file there, and import the parts one by one",
+        )
     long = steps > _GAP * np.median(steps)
     if long.any():
         said.append(

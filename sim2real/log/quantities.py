@@ -34,6 +34,7 @@ class Asked:
         joints: Names of the robot's joints, in its order; empty: not known.
         ranges: Shape ``(joints, 2)``: from where to where they move [rad]; empty: not known.
         as_told: Keep names, order and signs as the file has them where the data leaves them open or contradicts them.
+        slides: Those of the joints that are slides, whose positions are lengths.
     """
 
     pipeline: str
@@ -41,6 +42,12 @@ class Asked:
     joints: tuple[str, ...] = ()
     ranges: np.ndarray | None = None
     as_told: bool = False
+    slides: tuple[str, ...] = ()
+
+    def hinges(self, width: int) -> np.ndarray:
+        """Return which of so many columns are joints that turn, ``(width,)``: all but those that are known to slide."""
+        known = len(self.joints) == width
+        return np.array([not (known and self.joints[i] in self.slides) for i in range(width)], bool)
 
 
 def taken(signal: Signal, places: np.ndarray) -> Signal:
@@ -86,10 +93,19 @@ def field_of(signal: Signal, unit: str, scales: Sequence[float], turn: float = 0
     return FieldMapping(sources, unit, scale, 0.0, (signal.width,), turn=turn)
 
 
+def velocities(signals: Sequence[Signal], measured: Signal) -> list[Signal]:
+    """Return what may be the measured velocity."""
+    return [
+        s for s in signals
+        if s.meaning.quantity == "velocity" and s.meaning.side != "command"
+        and len(s.values) == len(measured.values) and s.width >= measured.width and s.values.ndim == 2
+    ]  # fmt: skip
+
+
 def velocity_of(
     signals: Sequence[Signal], measured: Signal, t_s: np.ndarray, to_rad: float, places: np.ndarray
-) -> tuple[dict[str, FieldMapping], list[str]]:
-    """Return the measured velocity, where it is that of the positions.
+) -> tuple[dict[str, FieldMapping], list[str], np.ndarray]:
+    """Return the measured velocity, where it is that of the positions, what to say, and which samples lack numbers.
 
     Args:
         signals: All of the file.
@@ -98,17 +114,18 @@ def velocity_of(
         to_rad: Units of the positions in a radian.
         places: Which column is which joint.
     """
-    fitting = [
-        s for s in signals
-        if s.meaning.quantity == "velocity" and s.meaning.side != "command"
-        and len(s.values) == len(measured.values) and s.width >= measured.width and s.values.ndim == 2
-    ]  # fmt: skip
+    fitting = velocities(signals, measured)
+    whole = np.zeros(len(measured.values), bool)
     if len(fitting) != 1:
-        return {}, [f"several velocities, none is taken: {', '.join(s.name for s in fitting)}"] * (len(fitting) > 1)
+        return (
+            {},
+            [f"several velocities, none is taken: {', '.join(s.name for s in fitting)}"] * (len(fitting) > 1),
+            whole,
+        )
     velocity = matched(fitting[0], measured, places)
     rows = np.flatnonzero(clean(t_s, measured) & velocity.finite)
     if len(rows) < 0.5 * clean(t_s, measured).sum() or len(rows) < 3:
-        return {}, [f"left out: {velocity.name!r} lacks numbers"]
+        return {}, [f"left out: {velocity.name!r} lacks numbers"], whole
     period = float(np.median(np.diff(t_s[rows])))
     rate = np.gradient(measured.values[rows], t_s[rows], axis=0) / to_rad
     found = following(rate, velocity.values[rows], period, 0.1)
@@ -120,16 +137,19 @@ def velocity_of(
     ratio = evidence.unit_ratio(slope[np.abs(r) > SURE])
     off = np.abs(slope / (ratio or 1.0)) if ratio else slope
     odd = still | (np.abs(r) > 0.05) & ((np.abs(r) < SURE) | (off < 0.6) | (off > 1.7))
-    if ratio is None or odd.any():
+    typical = float(np.median(slope))
+    own = {1.0: "rad", evidence.DEGREES: "deg"}.get(ratio or 0.0, "")
+    if ratio is None or odd.any() or velocity.meaning.unit not in ("", own):
         listed = ", ".join(f"{velocity.sources[i]} r {r[i]:.2f}, slope {slope[i]:.3g}" for i in np.flatnonzero(odd)[:3])
-        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({listed or 'no unit fits'}): left out"]
+        why = listed or f"slope {typical:.3g}: no unit fits"
+        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({why}): left out"], whole
     scales = [float((-1 if x < -SURE else 1) / ratio) for x in r]
     said = [
         f"{velocity.name!r} is the rate of {measured.name!r}: r {np.abs(r).max():.2f}, slope {np.median(slope):.3g}"
     ]
     turned = [s for s, x in zip(velocity.sources, r, strict=True) if x < -SURE]
     said += [f"opposite signs, velocities are turned: {', '.join(turned)}"] * bool(turned)
-    return {"velocity": field_of(velocity, "rad/s", scales)}, said
+    return {"velocity": field_of(velocity, "rad/s", scales)}, said, ~velocity.finite
 
 
 def extras(

@@ -9,8 +9,11 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
+from threading import get_ident
 from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
@@ -33,10 +36,15 @@ _CHUNK_NAME_AT = 37
 _METADATA_NAME_AT = _PREFIX.size
 # LZ4 compresses at most 255 to 1. A chunk that claims more is not genuine, and decompressing it could fill the memory.
 _TIGHTEST = 256
+# Zstandard packs equal bytes without such a limit, as those of a black image; a chunk that claims more is not genuine.
+_TIGHTEST_ZSTD_BYTES = 1 << 28
+_BLOCK = 1 << 20
 # Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
 _SMALL_BYTES = 64 * 1024
 # Reading stops once this multiple of the file's size was read: records overlap, and might do so without end.
 _MOST_READ = 4
+# So many unreadable places are described; a file may have millions.
+_MOST_DESCRIBED = 100
 # What parsing a damaged record may raise, or using values that do not fit each other.
 BROKEN = (
     *(McapError, struct.error, zlib.error, ValueError, LookupError, TypeError),
@@ -57,12 +65,23 @@ class Damage:
     """What could not be read.
 
     Attributes:
-        skipped: Descriptions of what is unreadable and where, in the order of the file.
+        skipped: Descriptions of what is unreadable and where, in the order of the file; the last one counts the places
+            beyond the first hundred.
         cut: Whether the file ends before the end of its data section.
+        count: Number of unreadable places.
     """
 
     skipped: list[str] = field(default_factory=list)
     cut: bool = False
+    count: int = 0
+
+    def skip(self, what: str) -> None:
+        """Add the description of an unreadable place."""
+        self.count += 1
+        beyond = self.count - _MOST_DESCRIBED
+        self.skipped[_MOST_DESCRIBED:] = [f"{beyond} more places"] if beyond > 0 else []
+        if beyond <= 0:
+            self.skipped.append(what)
 
 
 @contextmanager
@@ -128,7 +147,7 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
         resume = _next_landmark(data, trusted)
         if resume is None:
             break
-        damage.skipped.append(f"{resume - trusted} bytes at {trusted}")
+        damage.skip(f"{resume - trusted} bytes at {trusted}")
         position, trusted = resume, resume + 1
     damage.cut = True
 
@@ -150,7 +169,7 @@ def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
     try:
         return _decompressed(Chunk.read(stream_of(data, record)))
     except Exception as error:  # decompressors have their own exceptions
-        damage.skipped.append(f"a chunk of {record.end - record.start} bytes at {record.start} ({error})")
+        damage.skip(f"a chunk of {record.end - record.start} bytes at {record.start} ({error})")
         return b""
 
 
@@ -184,7 +203,7 @@ def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Dam
     try:
         return kind.read(stream_of(data, record))
     except BROKEN as error:
-        damage.skipped.append(f"a {kind.__name__.lower()} record at {record.start} ({error})")
+        damage.skip(f"a {kind.__name__.lower()} record at {record.start} ({error})")
         return None
 
 
@@ -236,16 +255,15 @@ def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
 def _decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's content; a wrong size or checksum is an error, found without decompressing more than claimed."""
     size = chunk.uncompressed_size
-    if size > _TIGHTEST * len(chunk.data) + _SMALL_BYTES:
+    most = _TIGHTEST * len(chunk.data) + _SMALL_BYTES
+    if size > (max(most, _TIGHTEST_ZSTD_BYTES) if chunk.compression == "zstd" else most):
         raise ValueError(f"it claims to hold {size} bytes: more than can be packed into {len(chunk.data)}")
     if chunk.compression == "lz4":
         import lz4.frame
 
         content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
     elif chunk.compression == "zstd":
-        import zstandard
-
-        content = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+        content = b"".join(islice(_blocks(_zstd(get_ident()).stream_reader(chunk.data)), 2 + size // _BLOCK))
     elif chunk.compression == "":
         content = chunk.data
     else:
@@ -255,6 +273,20 @@ def _decompressed(chunk: Chunk) -> bytes:
     if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
         raise ValueError("its checksum differs")
     return content
+
+
+@lru_cache(maxsize=16)
+def _zstd(_thread: int) -> Any:
+    """Return a thread's decompressor; to make one takes longer than to decompress a small chunk."""
+    import zstandard
+
+    return zstandard.ZstdDecompressor()
+
+
+def _blocks(stream: Any) -> Iterator[bytes]:
+    """Yield the content of a stream in blocks, so that memory is taken only for what is there."""
+    while block := stream.read(_BLOCK):
+        yield block
 
 
 def _next_landmark(data: mmap.mmap, position: int) -> int | None:

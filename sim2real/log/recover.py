@@ -107,7 +107,7 @@ def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
         return [Record(*found) for found in chunk_records(content)]
     except ValueError as error:
         if damage is not None:
-            damage.skipped.append(str(error))
+            damage.skip(str(error))
         return []
 
 
@@ -165,7 +165,7 @@ class _Copier:
         if record.end - record.start >= _MESSAGE_BYTES:
             message = Message.read(stream_of(source, record), record.end - record.start)
         if message is None or message.channel_id not in self._known.channels:
-            damage.skipped.append(f"a message at {record.start}, of no known channel")
+            damage.skip(f"a message at {record.start}, of no known channel")
             return
         self._begin()
         channel, topic = self._channel(message.channel_id), self._known.channels[message.channel_id].topic

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.foreign import ForeignFile, NoNumbers
+from sim2real.log.cells import NoNumbers
+from sim2real.log.foreign import ForeignFile
 from sim2real.log.mapping import STAMP_UNITS
 from sim2real.log.names import Meaning, meaning
 
@@ -123,11 +124,6 @@ def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
     return found, [*said, *([f"left out, as they hold no numbers: {', '.join(text)}"] if text else [])]
 
 
-def with_numbers(signal: Signal) -> np.ndarray:
-    """Return the places of the columns that have a number in any row."""
-    return np.flatnonzero(np.isfinite(signal.values).any(axis=0))
-
-
 def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rate_hz: float | None) -> Stamps:
     """Return the stamps of the rows of a signal.
 
@@ -159,6 +155,10 @@ def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rat
         if chosen:
             return _stamps(chosen[0], path)
         rate_hz, said = _told_rate(signals), "the file says so"
+        clocks = [s for s in signals if s.values.shape == (length, 1) and s.meaning.quantity == "stamp"]
+        clocks = [s for s in clocks if s.finite.sum() > 2 and np.ptp(s.values[s.finite]) > 0]
+        if rate_hz is None and clocks:
+            raise UsageError(_unusable(clocks[0], path), hint="say the rate of its samples with --rate-hz")
     else:
         said = "--rate-hz"
     if rate_hz is None:
@@ -179,6 +179,19 @@ def _increases(signal: Signal) -> bool:
     values = signal.values[signal.finite, 0]
     steps = np.diff(values)
     return values.size > 2 and bool(steps.size and (steps > 0).mean() > 0.9)
+
+
+def _unusable(signal: Signal, path: str) -> str:
+    """Return why stamps are no clock of the samples."""
+    steps = np.diff(signal.values[signal.finite, 0])
+    repeated, back = float((steps == 0).mean()), float((steps < 0).mean())
+    if back:
+        why = f"are earlier than the one before in {back:.0%} of {len(steps) + 1} rows: they are in no order of time"
+    else:
+        why = (
+            f"repeat the one before in {repeated:.0%} of {len(steps) + 1} rows: their clock is coarser than the samples"
+        )
+    return f"the stamps {signal.name!r} of {path} {why}"
 
 
 def _counts(signal: Signal) -> bool:

@@ -198,7 +198,7 @@ class ImportConfig:
     """Turn files of other recorders into logs, one for each file."""
 
     files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
-    """Files of other recorders: npz, JSON, CSV, MCAP or a ROS 2 bag, or episodes of a LeRobot data set."""
+    """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
     """TOML file that says which signal is which field; default: the pipeline's import.toml, or one is proposed."""
     mjcf: Path | None = None
@@ -210,11 +210,13 @@ class ImportConfig:
     together: bool = False
     """All files are of one recording: a log of all of them instead of one for each."""
     as_told: bool = False
-    """Import as the mapping says even where the data contradicts it."""
+    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
     pipeline: str | None = None
     """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
     format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None
     """Format of the files; default: by their suffixes."""
+    episode: int | None = None
+    """Episode of a LeRobot data set; default: the only one."""
     samples: Annotated[str | None, arg(metavar="A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None
@@ -245,9 +247,7 @@ class ImportConfig:
     @property
     def selection(self) -> slice | None:
         """The range of samples; None: all."""
-        if self.samples is None:
-            return None
-        return slice(*(int(end) if end else None for end in self.samples.split(":")))
+        return slice(*(int(end) if end else None for end in self.samples.split(":"))) if self.samples else None
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ class RobotFlags:
     hold: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Where joints that were not recorded are held: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
     as_told: bool = False
-    """Take the mapping as it is, even where the data contradicts it."""
+    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
 
 
 MODEL_IDENTIFY = IdentifyConfig(

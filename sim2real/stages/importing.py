@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +25,6 @@ from sim2real.stages import console, pipeline
 from sim2real.stages.config import ImportConfig
 
 
-@dataclass(frozen=True)
-class AskedOfModel(Asked):
-    """What a robot's model says of files without a mapping.
-
-    Attributes:
-        slides: Those of the joints that are slides.
-    """
-
-    slides: tuple[str, ...] = ()
-
-
 def run(config: ImportConfig) -> None:
     """Write a log for each file, into a run folder of its own or where the configuration says.
 
@@ -43,13 +32,16 @@ def run(config: ImportConfig) -> None:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
             proposed and something is ambiguous.
     """
-    files = [open_foreign(path, config.format) for path in config.sources]
+    files = [open_foreign(path, config.format, config.episode) for path in config.sources]
     files = [joined(files)] if config.together and len(files) > 1 else files
     mapping = told_mapping(config)
     text = "" if mapping else None
     for file in files:
         if mapping is None:
             mapping, text = proposed(file, asked(config))
+        else:
+            for line in file.notes:
+                console.note(line)
         episode = importer.import_opened(file, mapping, config.selection)
         refuse_contradictions(file.path, episode, config.as_told)
         facts, log, written = importer.facts(episode), config.out, None
@@ -118,7 +110,7 @@ def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz:
     if unknown := [j for j in joints if j not in own]:
         raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
     ranges = np.array([model.joint(j).range for j in joints or own])
-    return AskedOfModel(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
+    return Asked(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
 
 
 def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
@@ -127,19 +119,25 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
     Raises:
         UsageError: When something is ambiguous.
     """
-    found = propose(file, told)
+    try:
+        found = propose(file, told)
+    except UsageError:
+        # What was left out may be the reason.
+        for line in file.notes:
+            console.note(line)
+        raise
     console.note(f"proposed from {file.path.name}, as nobody said what is what:")
     lines, mapping = list(found.evidence), found.mapping
-    if isinstance(told, AskedOfModel) and told.slides:
+    if told.slides:
         mapping, line = in_lengths(mapping, told, file.path)
-        lines = [e for e in lines if "is in radians" not in e or len(told.slides) < len(told.joints)] + [line]
+        lines.append(line)
     for line in lines:
         console.note(f"  {line}")
     names = f"Joints: {', '.join(found.joints)}"
     return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
 
 
-def in_lengths(mapping: ImportMapping, told: AskedOfModel, path: Path) -> tuple[ImportMapping, str]:
+def in_lengths(mapping: ImportMapping, told: Asked, path: Path) -> tuple[ImportMapping, str]:
     """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
 
     Args:

@@ -6,6 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sim2real.log.foreign import open_foreign
+from sim2real.log.importer import import_opened
+from sim2real.log.proposal import propose
+from sim2real.log.quantities import Asked
+
 KINDS = ("sine", "triangle", "chirp", "gait", "multisine")
 
 
@@ -19,6 +24,37 @@ def servo(t, goal, late_s=0.02, wn=25.0, damping=0.9):
             x += v * dt / 5
         q[k] = x
     return q
+
+
+def motion(seconds=10.0, dt=0.005, joints=2):
+    """Return stamps [s], goals of ten tones, and positions [rad] that follow them 95 ms later."""
+    t = dt * np.arange(round(seconds / dt))
+    rng = np.random.default_rng(1)
+    tones, phases = rng.uniform(0.1, 2.0, (joints, 10)), rng.uniform(0, 2 * np.pi, (joints, 10))
+    goal = np.stack(
+        [0.12 * np.sin(2 * np.pi * np.outer(t, w) + p).sum(axis=1) for w, p in zip(tones, phases, strict=True)], 1
+    )
+    return t, goal, np.stack([servo(t, column) for column in goal.T], axis=1)
+
+
+def csv(path, columns, end=""):
+    """Write columns, numbers or words, by name, and return the path."""
+    rows = zip(*(c if isinstance(c, list) else [f"{x:.6f}" for x in c] for c in columns.values()), strict=True)
+    path.write_text("\n".join([",".join(columns), *(",".join(row) + end for row in rows)]) + "\n")
+    return path
+
+
+def imported(path, **asked):
+    """Return the episode that a file becomes without a mapping, and the proposal."""
+    file = open_foreign(path)
+    found = propose(file, Asked("x", **asked))
+    return import_opened(file, found.mapping), found
+
+
+def goal_scales(found):
+    """Return the scale of each joint's goal."""
+    own = found.mapping.nodes["actuator"].fields["goal"]
+    return np.broadcast_to(own.scale, (len(found.joints),))
 
 
 def wave(kind, rng):
@@ -110,7 +146,7 @@ def _spoil(log, written, rng):
         rows = rng.choice(np.arange(5, n - 5), 4, replace=False)
         value, i = -np.pi, int(rng.integers(joints))
         # On a circle, what is close to half a turn on either side is no glitch.
-        rows = [k for k in rows if np.abs((written[k, i] - value + np.pi) % (2 * np.pi) - np.pi) > 1.0]
+        rows = [k for k in rows if np.abs((written[k, i] - value + np.pi) % (2 * np.pi) - np.pi) > 1.5]
         written[rows, i] = value
         log.dropped |= {int(k) for k in rows}
         log.marks.append("glitches")

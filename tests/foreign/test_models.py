@@ -297,5 +297,5 @@ def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
     np.savez(tmp_path / "run.npz", t_s=t, q=q, force_cmd=np.gradient(np.gradient(q, axis=0), axis=0))
     (tmp_path / "robot.xml").write_text(AXIS.format(""))
     asked = importing.asked_of_model(tmp_path / "robot.xml", "axis")
-    with pytest.raises(UsageError, match=r"(?s)taken for degrees, but x slides.*0.001 for mm"):
+    with pytest.raises(UsageError, match=r"(?s)x slides, but .*not in metres.*0.001 for mm"):
         importing.proposed(open_foreign(tmp_path / "run.npz"), asked)

@@ -126,5 +126,5 @@ def test_encodings_that_nobody_here_reads_are_named(tmp_path):
         channel = writer.register_channel("/pose", "protobuf", schema)
         writer.add_message(channel, 0, b"", 0)
         writer.finish()
-    with pytest.raises(UsageError, match="/pose: messages in protobuf"):
+    with pytest.raises(UsageError, match=r"/pose \(Pose\): messages in protobuf"):
         open_foreign(tmp_path / "run.mcap")

@@ -173,7 +173,7 @@ def test_an_episode_of_a_lerobot_data_set(lerobot):
     np.testing.assert_array_equal(episode.outputs["sensor"]["q"], Q[:, 1].astype(np.float32))
     np.testing.assert_array_equal(episode.steps["sensor"].start, 20_000 * np.arange(COUNT))
     np.testing.assert_array_equal(episode.steps["actuator"].start, 20_000 * np.arange(COUNT))
-    assert episode.metadata["stamps"] == {"actuator": "generated", "sensor": "recorded"}
+    assert episode.metadata["stamps"] == {"actuator": "generated", "sensor": "generated"}  # frame_index / fps
 
 
 def test_a_lerobot_data_set_without_pyarrow_is_an_error_that_says_so(lerobot, monkeypatch):

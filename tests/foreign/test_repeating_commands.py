@@ -1,0 +1,107 @@
+"""Commands that repeat: which lag and sign are taken, and what is refused because no data can tell it."""
+
+import numpy as np
+import pytest
+from foreign_robots import csv, goal_scales, imported, servo
+
+from sim2real.errors import UsageError
+from sim2real.log import evidence
+from sim2real.log.following import following
+
+T = np.arange(0, 10, 0.01)
+NOISE = 0.001 * np.random.default_rng(0).standard_normal(len(T))
+SHAPES = {
+    "sine": lambda f, t: 0.5 * np.sin(2 * np.pi * f * t),
+    "sine about a level": lambda f, t: 0.3 + 0.5 * np.sin(2 * np.pi * f * t + 1),
+    "triangle": lambda f, t: 0.4 * np.arcsin(np.sin(2 * np.pi * f * t)),
+    "square": lambda f, t: 0.4 * np.sign(np.sin(2 * np.pi * f * t + 0.3)),
+    "gait": lambda f, t: 0.4 * np.sin(2 * np.pi * f * t + 1) + 0.2 * np.sin(4 * np.pi * f * t),
+    "rest first": lambda f, t: 0.5 * np.sin(2 * np.pi * f * np.maximum(t - 1.0, 0.0)),
+}
+
+
+def log(tmp_path, goal, q):
+    return csv(tmp_path / "run.csv", {"t_s": T, "goal_a_rad": goal, "q_a_rad": q + NOISE})
+
+
+def lag_ms(found):
+    line = next(s for s in found.evidence if "ms later, slope" in s)
+    return int(line.split(" ms later")[0].split()[-1])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("f", [0.4, 0.6, 1.0, 1.25, 2.0, 3.0])
+def test_a_command_that_repeats_keeps_its_sign_and_the_least_lag(tmp_path, shape, f):
+    goal = SHAPES[shape](f, T)
+    _, found = imported(log(tmp_path, goal, servo(T, goal)))
+    assert goal_scales(found) == [1.0]
+    # The servo's delay is 86 ms at low frequencies, and less at high ones.
+    assert 70 <= lag_ms(found) <= 88
+
+
+@pytest.mark.parametrize(
+    ("shape", "f"),
+    [("sine", 0.3), ("gait", 1.0), ("sine about a level", 1.7), ("sine about a level", 2.5), ("rest first", 1.0)],
+)
+def test_a_reversed_sign_is_claimed_where_the_data_tells_it(tmp_path, shape, f):
+    goal = SHAPES[shape](f, T)
+    _, found = imported(log(tmp_path, goal, -servo(T, goal)))
+    assert goal_scales(found) == [-1.0]
+    assert 70 <= lag_ms(found) <= 88
+
+
+@pytest.mark.parametrize(("shape", "f"), [("sine", 0.55), ("sine", 1.0), ("triangle", 1.7), ("square", 2.5)])
+def test_a_sign_that_no_data_can_tell_is_refused_with_both_candidates(tmp_path, shape, f):
+    goal = SHAPES[shape](f, T)
+    path = log(tmp_path, goal, -servo(T, goal))
+    with pytest.raises(
+        UsageError, match=r"cannot tell signs: a follows \d+ ms later, or with the opposite sign \d+ ms"
+    ):
+        imported(path)
+    _, found = imported(path, as_told=True)
+    assert goal_scales(found) == [1.0]
+    assert "they are kept as the file has them" in "\n".join(found.evidence)
+
+
+@pytest.mark.parametrize("f", [0.6, 1.0, 3.0])
+def test_a_mapping_that_is_right_is_not_contradicted(f):
+    goal = SHAPES["sine"](f, T)
+    told = goal[:, None], (servo(T, goal) + NOISE)[:, None]
+    assert not evidence.contradictions((T, T), *told)
+
+
+def test_other_joints_tell_a_sign_that_one_alone_leaves_open(tmp_path):
+    """At 3 Hz a reversed joint that is 280 ms late looks like one that is 113 ms late, unlike its neighbour."""
+    late = 0.28
+    goal = np.stack([SHAPES["sine"](3.0, T), SHAPES["gait"](0.8, T)], axis=1)
+    q = np.stack([-SHAPES["sine"](3.0, T - late), SHAPES["gait"](0.8, T - late)], axis=1)
+    columns = {"t_s": T, "goal_a": goal[:, 0], "goal_b": goal[:, 1], "q_a": q[:, 0] + NOISE, "q_b": q[:, 1] - NOISE}
+    with pytest.raises(UsageError, match="cannot tell signs: a follows 113 ms later, or with the opposite sign 280 ms"):
+        imported(csv(tmp_path / "run.csv", columns))
+
+
+def test_the_order_of_commands_that_look_alike_is_refused_without_names(tmp_path):
+    """Two joints of one gait, a quarter of its time apart, are exchanged as likely as they are not."""
+    goal = np.stack([SHAPES["sine"](1.0, T), SHAPES["sine"](1.0, T - 0.25), SHAPES["sine"](1.0, T - 0.6)], axis=1)
+    q = np.stack([servo(T, column) + NOISE for column in goal.T], axis=1)
+    np.savez(tmp_path / "right.npz", t_s=T, goal=goal, q=q)
+    _, found = imported(tmp_path / "right.npz")
+    assert found.mapping.nodes["actuator"].fields["goal"].source == ("goal",)
+    np.savez(tmp_path / "wrong.npz", t_s=T, goal=goal[:, [1, 2, 0]], q=q)
+    with pytest.raises(UsageError, match=r"cannot tell (the order|signs)"):
+        imported(tmp_path / "wrong.npz")
+
+
+def test_a_drift_tells_the_sign_and_what_is_beside_it_the_lag():
+    waves = [0.3 * np.sin(2 * np.pi * 2.0 * (T - late)) + 0.8 * (T - late) for late in (0.0, 0.2)]
+    found = following(waves[0][:, None], (-waves[1] + NOISE)[:, None], 0.01)
+    assert found.r[0, 0] < -0.9
+    assert float(found.lag_s[0, 0]) == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exchanged_labels_are_refused(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    goal = 0.12 * np.sin(2 * np.pi * np.outer(T, rng.uniform(0.1, 2, 8)) + rng.uniform(0, 6, 8)).sum(axis=1)
+    with pytest.raises(UsageError, match=r"move before they are told to: a by 8\d ms"):
+        imported(csv(tmp_path / "run.csv", {"t_s": T, "goal_a_rad": servo(T, goal), "q_a_rad": goal}))

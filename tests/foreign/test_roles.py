@@ -1,0 +1,131 @@
+"""Columns that are not what they are called: commands that are measurements, gains that are 0 throughout."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_robots import imported, motion
+from mcap_ros2.writer import Writer
+
+from sim2real.errors import UsageError
+from sim2real.log import evidence
+from sim2real.stages import described
+from sim2real.stages.config import RobotFlags
+
+XML = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.05" mass="0.3"/>
+  <body pos="0 0 -0.2"><joint name="b" axis="0 1 0"/><geom size="0.05" mass="0.2"/></body></body></worldbody>
+</mujoco>"""
+STEP = 2 * np.pi / 4096
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return motion()
+
+
+COPIES = {
+    "the state": lambda goal, q: q,
+    "the next state": lambda goal, q: np.roll(q, -1, axis=0),
+    "the state before": lambda goal, q: np.roll(q, 1, axis=0),
+    "the state after three": lambda goal, q: np.roll(q, -3, axis=0),
+    "in degrees": lambda goal, q: np.degrees(q),
+    "turned": lambda goal, q: -q,
+    "rounded": lambda goal, q: np.round(q, 2),
+    "of one joint": lambda goal, q: np.stack([q[:, 0], goal[:, 1]], axis=1),
+}
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_commands_that_are_the_measurements_are_refused(tmp_path, recorded, copy):
+    t, goal, q = recorded
+    np.savez(tmp_path / "run.npz", t_s=t, goal=COPIES[copy](goal, q), q=q)
+    with pytest.raises(UsageError, match=r"are the measurements themselves: goal\[:,0\] is q\[:,0\]"):
+        imported(tmp_path / "run.npz")
+
+
+def test_a_mapping_of_such_commands_is_contradicted(recorded):
+    t, _, q = recorded
+    assert "its commands are its measurements" in evidence.contradictions((t, t), q, q)[0]
+
+
+SCHEMA = """std_msgs/Header header
+string[] name
+float64[] position
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+def bag(path, t, goal, q, ahead_s=0.0):
+    """Write a bag of both topics; ``ahead_s``: of the clock that stamps commands."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        kind = writer.register_msgdef("sensor_msgs/msg/JointState", SCHEMA)
+        for k in range(len(t)):
+            for topic, values, ahead in (("/cmd", goal, ahead_s), ("/joint_states", q, 0.0)):
+                ns = round((1000.0 + t[k]) * 1e9)
+                sec, nanosec = divmod(round((1000.0 + t[k] + ahead) * 1e9), 10**9)
+                header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}
+                row = {"header": header, "name": ["a", "b"], "position": values[k].tolist()}
+                writer.write_message(topic, kind, row, log_time=ns, publish_time=ns)
+        writer.finish()
+    return path
+
+
+def test_topics_that_are_exchanged_are_refused_but_a_clock_that_is_ahead_is_not(tmp_path, recorded):
+    """The recorder's clock is one for both topics: if positions lead by it, too, no clock explains that."""
+    t, goal, q = recorded
+    with pytest.raises(UsageError, match="move before they are told to: a by"):
+        imported(bag(tmp_path / "exchanged.mcap", t, q, goal))
+    _, found = imported(bag(tmp_path / "ahead.mcap", t, goal, q, 0.2))
+    assert found.mapping.nodes["actuator"].stamp_offset == pytest.approx(0.09 - 0.2, abs=0.02)
+    assert imported(bag(tmp_path / "right.mcap", t, goal, q))[1].mapping.nodes["actuator"].stamp_offset == 0.0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda goal, q: (goal, q),
+        lambda goal, q: (goal, np.round(q / STEP) * STEP),
+        lambda goal, q: (np.round(goal / STEP) * STEP, np.round(q / STEP) * STEP),
+    ],
+)
+def test_what_is_measured_and_rounded_is_no_copy(tmp_path, recorded, change):
+    t, goal, q = recorded
+    goal, q = change(goal, q)
+    np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q=q)
+    np.testing.assert_allclose(imported(tmp_path / "run.npz")[0].outputs["actuator"]["goal"], goal)
+
+
+@pytest.mark.parametrize("name", ["kd", "kp", "tau_ff", "dq_des", "torque_enable"])
+def test_what_is_zero_throughout_is_left_out(tmp_path, monkeypatch, recorded, name):
+    t, goal, q = recorded
+    monkeypatch.chdir(tmp_path)
+    Path("robot.xml").write_text(XML)
+    np.savez(
+        "run.npz", t_s=t, goal_rad=goal, q_rad=q, **{name: np.zeros((len(t), 2)) if name != "kd" else np.zeros(len(t))}
+    )
+    episode, found = imported(Path("run.npz"))
+    assert set(episode.outputs["actuator"]) == {"goal"}
+    assert f"left out: '{name}' is 0 throughout" in "\n".join(found.evidence)
+    assert described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description.commands == ("goal",)
+
+
+def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, monkeypatch, recorded):
+    t, goal, q = recorded
+    monkeypatch.chdir(tmp_path)
+    Path("robot.xml").write_text(XML)
+    np.savez("run.npz", t_s=t, goal=goal, q=q, kd=0.0)
+    Path("map.toml").write_text(
+        'pipeline = "robot"\n[nodes.actuator]\nstamps = "t_s"\nfields.goal = { source = "goal", unit = "rad" }\n'
+        'fields.kd = { source = "kd", shape = [1] }\n'
+        '[nodes.sensor]\nstamps = "t_s"\nfields.position = { source = "q", unit = "rad" }\n'
+    )
+    told = RobotFlags(mjcf=Path("robot.xml"), mapping=Path("map.toml"))
+    assert described.from_flags(told, ["run.npz"]).description.commands == ("goal",)
