@@ -4,6 +4,7 @@ import ast
 import functools
 import graphlib
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -115,6 +116,13 @@ def test_no_modules_import_each_other_in_a_circle():
 @pytest.mark.parametrize(("graph", "found"), [({"a": {"b"}, "b": {"a"}}, ["a", "b", "a"]), ({"a": {"b"}}, [])])
 def test_circles_are_seen(graph, found):
     assert sorted(circle(graph)) == sorted(found)
+
+
+def test_no_two_modules_of_tests_have_one_name():
+    """Pytest imports each by its name alone."""
+    paths = sorted(Path(__file__).parent.rglob("test_*.py"))
+    twice = [name for name, count in Counter(path.name for path in paths).items() if count > 1]
+    assert not twice, f"modules of tests of one name: {[p for p in paths if p.name in twice]}"
 
 
 def test_the_house_has_no_other_rooms():

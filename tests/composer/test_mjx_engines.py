@@ -106,7 +106,11 @@ def played(double, actions):
     return jax.jit(play)(jax.random.key(0), actions)
 
 
+@pytest.mark.full
 def test_streams_are_those_of_the_c_engine(played, actions):
+    """One task that writes in every hook; in `make test`, test_random_tasks.py compares tasks with hooks of all kinds,
+    and the tests below what is derived from what a hook writes.
+    """
     start, states = played
     env = composer.Environment(Chain())
     step = env.reset()

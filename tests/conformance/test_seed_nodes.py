@@ -220,7 +220,9 @@ def test_a_policy_of_ours_acts_in_the_agent(tutorial):
     np.testing.assert_allclose(gs.state["agent"].history_act[0], expected, rtol=1e-5)
 
 
+@pytest.mark.full
 def test_the_brax_world_runs(tutorial):
+    """The second world of the tutorial; in `make test` all other tests here run the first one."""
     nodes = robot(tutorial, world="BraxWorld", sensor="SimSensor", actuator="SimActuator")
     timeline = draw(nodes, 0.4)
     episode = record(nodes, timeline)

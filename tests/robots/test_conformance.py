@@ -12,7 +12,9 @@ from sim2real.stages.pipeline import load_pipeline
 pytestmark = pytest.mark.realtime
 
 
-@pytest.mark.parametrize("name", ["pendulum", "arm", "so101", "disk", "xl330", "so101_log"])
+@pytest.mark.parametrize(
+    "name", ["pendulum", "arm", pytest.param("so101", marks=pytest.mark.full), "disk", "xl330", "so101_log"]
+)
 def test_every_pipeline_here_has_a_robot(name, tmp_path):
     pipeline = load_pipeline(name)
     gate = replace(pipeline.record.gate, servo_watchdog_s=0.5)  # a busy machine is not what is tested

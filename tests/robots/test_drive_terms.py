@@ -180,7 +180,9 @@ def by_hands_log(tmp_path_factory):
 PLAY = {"play": 0.03, "tilt_y": 0.15}
 
 
+@pytest.mark.full
 def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
+    """In `make test` each term moves a joint as by hand, and what refinement sees of a delay is known, below."""
     found = by_hands_log.table.decode(refine(by_hands_log, by_hands_log.table.start()[None]).z)
     assert {n: float(found[n]) for n in PLAY} == pytest.approx(PLAY, rel=0.1)
 

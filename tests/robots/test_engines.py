@@ -63,9 +63,14 @@ def episode():
     return pair_log()
 
 
-@pytest.fixture(scope="module", params=[ConvergedRobot, WornRobot], ids=["constant", "worn"])
+@pytest.fixture(
+    scope="module", params=[pytest.param(ConvergedRobot, marks=pytest.mark.full), WornRobot], ids=["constant", "worn"]
+)
 def engines(request, episode):
-    """Programs that return the residuals of two segments in radians, of both engines, in double precision."""
+    """Programs that return the residuals of two segments in radians, of both engines, in double precision.
+
+    What is worn has a term more than what is constant, and is otherwise the same robot.
+    """
     programs = {}
     jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
     try:

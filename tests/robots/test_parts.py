@@ -88,9 +88,10 @@ def test_c_and_mjx_play_the_same_goals_alike(pair, played):
     np.testing.assert_allclose(played.rewards, rewards, atol=5e-5)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
-    """It rubs, and its solver takes a single step."""
+    """It rubs, and its solver takes a single step. `make test` does so with the pair, in the test before."""
     robot = arm.load()
     goals = 0.8 * np.sin(6 * 0.01 * np.arange(50)[:, None] + np.arange(3)).astype(np.float32)
     target = np.array([0.2, 0.1, 0.25])

@@ -151,19 +151,25 @@ def check(case, held, same):
 PHASES = [Phase.explicit, Phase.reuse, Phase.generate]
 
 
-@settings(max_examples=8, derandomize=True, phases=PHASES)
-@given(graphs(jax_hash_node), st.booleans())
-def test_hashes_of_all_that_is_heard_are_equal(case, held):
-    check(case, held, np.testing.assert_array_equal)
+def test_hashes_of_all_that_is_heard_are_equal(repetitions):
+    @settings(max_examples=repetitions(3, 8), derandomize=True, phases=PHASES)
+    @given(graphs(jax_hash_node), st.booleans())
+    def equal(case, held):
+        check(case, held, np.testing.assert_array_equal)
+
+    equal()
 
 
-@settings(max_examples=14, derandomize=True, phases=PHASES)
-@given(
-    graphs(seer, ("zoh", "linear", "linear_real_only", "zoh_mean"), ("zoh", "linear", "linear_real_only")),
-    st.booleans(),
-)
-def test_outputs_are_equal_at_delays_of_every_interpolation(case, held):
-    check(case, held, lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-6, atol=2e-6))
+def test_outputs_are_equal_at_delays_of_every_interpolation(repetitions):
+    @settings(max_examples=repetitions(4, 14), derandomize=True, phases=PHASES)
+    @given(
+        graphs(seer, ("zoh", "linear", "linear_real_only", "zoh_mean"), ("zoh", "linear", "linear_real_only")),
+        st.booleans(),
+    )
+    def equal(case, held):
+        check(case, held, lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-6, atol=2e-6))
+
+    equal()
 
 
 def test_the_program_holds_no_time():

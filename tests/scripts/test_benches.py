@@ -1,4 +1,9 @@
-"""Every bench runs with --quick, and its report says what it is of; figures are not looked at."""
+"""Every bench runs with --quick, and its report says what it is of; figures are not looked at.
+
+Those that train, search or trace MJX for ten seconds are ``full``. In `make test` the others say that ``bench.main``
+makes a report of rows, ``train`` and ``graph`` that a training and a graph can be measured, and
+``test_help_shows_the_flags_of_a_bench`` that each module can be imported and has its flags and its quick ones.
+"""
 
 import ast
 import importlib.util
@@ -85,6 +90,7 @@ def test_train(run):
     assert report["machine"]["devices"]
 
 
+@pytest.mark.full
 def test_scaling(run):
     name = f"scaling/{jax.default_backend()}"
     found = names(run("scaling"))
@@ -92,6 +98,7 @@ def test_scaling(run):
     assert {f"{name}/identify/1_devices/{n}" for n in ("candidates_per_s", "compile_s")} <= found
 
 
+@pytest.mark.full
 def test_randomise(run):
     report = run("randomise", "--ways", "all", "--record-s", 12)  # a length whose programs other tests compile, too
     found = {row["name"]: row["value"] for row in report["rows"]}
@@ -102,6 +109,7 @@ def test_randomise(run):
     assert robot["identified"]["gain"] == pytest.approx(robot["truth"]["gain"], rel=0.3)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_drift(run):
     report = run("drift", "--changes", "friction")
@@ -114,6 +122,7 @@ def test_drift(run):
     assert {c["name"] for c in tested["changes"]} >= {"friction", "payload", "round_trip_delay"}
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_excitation(run):
     report = run("excitation")
@@ -127,6 +136,7 @@ def test_excitation(run):
     assert max(off.values()) < 4.0, "intervals hold the truth, or nearly"
 
 
+@pytest.mark.full
 def test_interop(run):
     pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
     report = run("interop")
@@ -141,6 +151,7 @@ def test_async(run):
     assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
 
 
+@pytest.mark.full
 def test_compose(run, traced):
     found = names(run("compose"))
     assert {"compose/build_20_entities_ms", "compose/reset_ms", "compose/mjx_over_c_float64/contact_free"} <= found
@@ -184,12 +195,13 @@ def test_suite(run):
     rows = {r["name"].removeprefix("suite/"): r["value"] for r in report["rows"]}
     assert (rows["passed"], rows["skipped"], rows["failed"], report["failed"]) == (3, 0, 0, [])
     assert rows["processor_over_cold"] == pytest.approx(rows["processor_s"], abs=0.1), "the yardstick is set to 1 s"
-    assert 0.5 < rows["processor_s"] < 60.0
+    assert 0.1 < rows["processor_s"] < 60.0, "Python and pytest start in a few tenths of a second"
     assert list(report["rooms"]) == ["test_repetitions"]
 
 
+@pytest.mark.full
 def test_identify_time(run):
-    """The second log of the same length finds all programs of the first."""
+    """The second log of the same length finds all programs of the first: so says tests/identify/test_programs.py."""
     rows = {r["name"].removeprefix("identify-time/"): r["value"] for r in run("identify-time")["rows"]}
     assert rows["pendulum/second_log/misses"] == 0
     assert 1.0 < rows["pendulum/second_log/over_cold"] < 300.0, "the yardstick is set to 1 s"
@@ -227,7 +239,9 @@ def disk(tmp_path_factory):
     return path
 
 
+@pytest.mark.full
 def test_identify(run, disk):
+    """Ours beside MuJoCo's sysid, as the league compares them in ``test_league``."""
     pytest.importorskip("mujoco.sysid")
     report = run("identify", "--data", disk)
     assert {"identify/disk/fit_s", "identify/disk/free_run_over_sysid"} <= names(report)
@@ -286,14 +300,17 @@ def test_data_that_is_not_there_is_said_in_words(disk, capsys, data, flags, word
     assert "\nhint: " in told
 
 
-@pytest.mark.parametrize(("name", "flag"), [("graph", "--copies"), ("identify", "--data"), ("train", "--minibatches")])
-def test_help_shows_the_flags_of_a_bench(name, flag, capsys):
+@pytest.mark.parametrize("name", BENCHES)
+def test_help_shows_the_flags_of_a_bench(name, capsys):
     with pytest.raises(SystemExit) as end:
         bench.main([name, "--help"])
     told = capsys.readouterr().out
     assert end.value.code == 0
-    assert flag in told
     assert "--quick" in told
+    module = importlib.import_module(f"benches.{BENCHES[name].module}")
+    assert callable(module.run)
+    flags = {*module.QUICK} - ({"flags"} if name in ("arm", "demo", "so101") else set())  # those are positional
+    assert all(f"--{flag.replace('_', '-')}" in told for flag in flags)
 
 
 def test_help_lists_the_benches(capsys):

@@ -1,7 +1,8 @@
 """A robot that changes between two iterations of a run: the verdict says so, and the run mends it by itself.
 
 Stages and verdicts are real; the robot is a hidden pendulum on a simulated clock, so that no busy machine disturbs it.
-Its first recording, identification and training are those of the run that all tests share.
+Its first recording, identification and training are those of the run that all tests share. In `make test`,
+test_killed.py runs the same plans with stages that only write files, and tests/stages judge and plan on their results.
 """
 
 import importlib
@@ -28,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches import hidden_robots as hidden
 from benches import randomise
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
+pytestmark = [pytest.mark.slow, pytest.mark.full, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 MORE_S = 0.030
 
 

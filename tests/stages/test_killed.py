@@ -112,7 +112,9 @@ def ran(run_dir):
     return done, [(r.number, r.verdict, r.then, len(r.stages)) for r in Iterations.load(run_dir).rows]
 
 
-@pytest.mark.parametrize("verdicts", [("re-identify", "fine"), ("re-train", "fine")])
+@pytest.mark.parametrize(
+    "verdicts", [("re-identify", "fine"), pytest.param(("re-train", "fine"), marks=pytest.mark.full)]
+)
 def test_a_run_that_is_killed_at_any_stage_ends_as_if_it_had_not_been(tmp_path, verdicts):
     whole = Stages(tmp_path / "whole", verdicts)
     expected, calls = ran(whole.run()), len(whole.calls)

@@ -1,4 +1,7 @@
-"""The pendulum after one of two recordings, which differ in every number. As a script, trains and counts programs."""
+"""The pendulum after one of two recordings, which differ in every number. As a script, trains and counts programs.
+
+Between two trainings nothing compiled is left in the process: programs are found in the cache on disk, or not.
+"""
 
 import sys
 from collections import Counter
@@ -33,15 +36,19 @@ def environment(recording: int) -> GraphEnvironment:
 
 
 def main() -> None:
-    """Train after the recording that the command line names; print how many programs were compiled, and found."""
+    """Train after each recording that the command line names; print how many programs were compiled, and found."""
     events: Counter[str] = Counter()
     jax.monitoring.register_event_listener(lambda event, **_: events.update([event.rsplit("/", 1)[-1]]))
-    env = environment(int(sys.argv[1]))
-    config = PPOConfig(
-        num_envs=4, rollout_steps=4, minibatches=2, epochs=1, total_steps=32, evaluations=2, eval_steps=env.length + 1
-    )
-    train(env, config, jax.random.key(0))
-    print(events["cache_misses"], events["cache_hits"])
+    for recording in sys.argv[1:]:
+        jax.clear_caches()
+        events.clear()
+        env = environment(int(recording))
+        config = PPOConfig(
+            num_envs=4, rollout_steps=4, minibatches=2, epochs=1, total_steps=32, evaluations=2,
+            eval_steps=env.length + 1,
+        )  # fmt: skip
+        train(env, config, jax.random.key(0))
+        print(events["cache_misses"], events["cache_hits"])
 
 
 if __name__ == "__main__":

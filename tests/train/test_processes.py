@@ -188,7 +188,7 @@ def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["slurm", "open_mpi"])
+@pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.full), "open_mpi"])
 def test_processes_of_a_launcher_find_each_other(launcher):
     text = "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ended', flush=True)); "
     text += "from sim2real.train.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
