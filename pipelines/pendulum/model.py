@@ -155,7 +155,7 @@ class PendulumWorld(JointWorld):
         del rng, graph_state
         return nominal_params()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return the initial angle and velocity that the parameters name."""
         start = super().init_state(rng, graph_state)
         return Measurement(th=start.position, thdot=start.velocity)
@@ -164,7 +164,7 @@ class PendulumWorld(JointWorld):
         """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
 
-    def integrate(self, params: PendulumParams, state: Measurement, command: Any) -> Measurement:
+    def integrate(self, params: PendulumParams, state: Any, command: Any) -> Any:
         """Return angle and velocity one tick later."""
         moved = super().integrate(params, JointState(state.th, state.thdot), command)
         return Measurement(th=moved.position, thdot=moved.velocity)
@@ -180,11 +180,11 @@ class PendulumWorld(JointWorld):
         """Clip the speed."""
         return state.replace(velocity=jnp.clip(state.velocity, -params.max_speed, params.max_speed))
 
-    def velocity(self, state: Measurement) -> Any:
+    def velocity(self, state: Any) -> Any:
         """Return the angular velocity [rad/s]."""
         return state.thdot
 
-    def with_velocity(self, state: Measurement, velocity: Array) -> Measurement:
+    def with_velocity(self, state: Any, velocity: Array) -> Any:
         """Return the state with another angular velocity [rad/s]."""
         return state.replace(thdot=velocity)
 
