@@ -13,7 +13,7 @@ from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.agent import DirectAgent
-from sim2real.worlds.ode import OdeWorld
+from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 GRAVITY = 9.81  # [m/s^2]
 HISTORY = 4
@@ -49,8 +49,6 @@ class PendulumParams(Base):
         c: Coulomb friction [N m].
         max_speed: Speed limit of the model [rad/s].
         start: Initial angle and velocity, shape ``(2,)`` [rad, rad/s].
-        smooth_rad_s: Speed over which Coulomb friction changes sign: ``tanh(thdot / smooth_rad_s)``. With 0 it is
-            ``sign(thdot)``, which chatters around standstill by c/J times the substep.
     """
 
     J: Any
@@ -62,7 +60,6 @@ class PendulumParams(Base):
     c: Any
     max_speed: Any
     start: Any
-    smooth_rad_s: float = struct.field(pytree_node=False, default=0.02)
 
 
 def nominal_params() -> PendulumParams:
@@ -138,42 +135,58 @@ def causes() -> dict[str, dict[str, float]]:
     return {"payload": payload, "inertia": dict.fromkeys(names, -1.0)}
 
 
-class PendulumWorld(OdeWorld):
-    """The pendulum as an ordinary differential equation, driven by the ``actuator`` input."""
+class PendulumWorld(JointWorld):
+    """The pendulum, driven by the ``actuator`` input; dry friction holds it at rest.
+
+    Its state is the message of the sensor, ``th`` and ``thdot``.
+
+    Args:
+        name: Unique in the graph.
+        rate: Ticks per second [Hz].
+        substep_s: Largest step of the integrator [s].
+        options: Options of ``JointWorld``.
+    """
+
+    def __init__(self, name: str, rate: float, substep_s: float = 0.002, **options: Any) -> None:
+        super().__init__(name, rate, substep_s, **options)
 
     def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> PendulumParams:
         """Return the nominal parameters."""
         del rng, graph_state
         return nominal_params()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Measurement:
+    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return the initial angle and velocity that the parameters name."""
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return Measurement(th=params.start[0], thdot=params.start[1])
+        start = super().init_state(rng, graph_state)
+        return Measurement(th=start.position, thdot=start.velocity)
 
     def command(self, step_state: StepState) -> Any:
         """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
 
-    def derivative(self, params: PendulumParams, state: Measurement, command: Any) -> Measurement:
-        """Return velocity [rad/s] and acceleration [rad/s^2]."""
-        p, th, thdot = params, state.th, state.thdot
-        turn = jnp.tanh(thdot / p.smooth_rad_s) if p.smooth_rad_s > 0 else jnp.sign(thdot)
-        motor = p.K / p.R * (command - p.K * thdot)
-        gravity = p.mass * GRAVITY * p.length * jnp.sin(th)
-        return Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * turn) / p.J)
+    def integrate(self, params: PendulumParams, state: Any, command: Any) -> Any:
+        """Return angle and velocity one tick later."""
+        moved = super().integrate(params, JointState(state.th, state.thdot), command)
+        return Measurement(th=moved.position, thdot=moved.velocity)
 
-    def velocity(self, state: Measurement) -> Any:
+    def forces(self, params: PendulumParams, position: Any, velocity: Any, command: Any) -> Forces:
+        """Return motor and gravity, viscous friction with the back-EMF, and Coulomb friction."""
+        del velocity
+        p = params
+        push = p.K / p.R * command + p.mass * GRAVITY * p.length * jnp.sin(position)
+        return Forces(acceleration=push / p.J, damping=(p.b + p.K**2 / p.R) / p.J, dry=p.c / p.J)
+
+    def confine(self, params: PendulumParams, state: JointState) -> JointState:
+        """Clip the speed."""
+        return state.replace(velocity=jnp.clip(state.velocity, -params.max_speed, params.max_speed))
+
+    def velocity(self, state: Any) -> Any:
         """Return the angular velocity [rad/s]."""
         return state.thdot
 
-    def with_velocity(self, state: Measurement, velocity: Array) -> Measurement:
+    def with_velocity(self, state: Any, velocity: Array) -> Any:
         """Return the state with another angular velocity [rad/s]."""
         return state.replace(thdot=velocity)
-
-    def limit(self, params: PendulumParams, state: Measurement) -> Measurement:
-        """Clip the speed."""
-        return Measurement(th=state.th, thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
 
 
 class Agent(DirectAgent):

@@ -26,6 +26,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.robots.devices import SimActuator, SimSensor
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.runtime.wiring import wire
+from sim2real.worlds.ode import OdeWorld
 
 DURATION_S = 4.0
 CASES = {
@@ -60,12 +61,33 @@ class RandomAgent(MODEL.Agent):
         return self.act(step_state.replace(rng=rng), action)
 
 
-class CostWorld(MODEL.PendulumWorld):
-    """The seed's world: it adds up the cost of the task beside the physics."""
+class CostWorld(OdeWorld):
+    """The seed's world, Runge-Kutta with Coulomb friction by sign: it adds up the cost beside the physics."""
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+        """Return the nominal parameters."""
+        del rng, graph_state
+        return MODEL.nominal_params()
 
     def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Start at the parameters' state, at no cost."""
-        return super().init_state(rng, graph_state), jnp.float32(0.0)
+        start = ((graph_state or GraphState()).params.get(self.name) or self.init_params(rng)).start
+        return MODEL.Measurement(th=start[0], thdot=start[1]), jnp.float32(0.0)
+
+    def command(self, step_state: StepState) -> Any:
+        """Return the voltage during this tick [V]."""
+        return step_state.inputs["actuator"][-1].data.action[0]
+
+    def derivative(self, params: Any, state: Any, command: Any) -> Any:
+        """Return velocity [rad/s] and acceleration [rad/s^2]."""
+        p, th, thdot = params, state.th, state.thdot
+        motor = p.K / p.R * (command - p.K * thdot)
+        gravity = p.mass * MODEL.GRAVITY * p.length * jnp.sin(th)
+        return MODEL.Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * jnp.sign(thdot)) / p.J)
+
+    def limit(self, params: Any, state: Any) -> Any:
+        """Clip the speed."""
+        return state.replace(thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
 
     def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
         """Return the initial angle and velocity."""
@@ -116,8 +138,8 @@ class _WithHiccups(StaticDist):
 
 
 def params() -> Any:
-    """Return the seed's parameters, with its Coulomb friction by sign."""
-    return MODEL.nominal_params().replace(smooth_rad_s=0.0, max_speed=40.0)
+    """Return the seed's parameters."""
+    return MODEL.nominal_params().replace(max_speed=40.0)
 
 
 def graph_program(graph: CompiledGraph) -> Callable[[Any], Any]:

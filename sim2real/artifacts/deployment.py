@@ -60,6 +60,8 @@ class Replay:
         rmse: Model -> root mean square error; None where it diverged. ``as in this log`` has parameters fitted to it.
         promised: That of the identified model on held-out recordings, more where this log moves more; None where that
             is not known.
+        column: The position's name among the columns.
+        free_run: Mean error of the identified model in free runs over held-out recordings; None where there was none.
     """
 
     name: str
@@ -67,6 +69,30 @@ class Replay:
     horizon_s: float
     rmse: Mapping[str, float | None]
     promised: float | None = None
+    column: str = ""
+    free_run: float | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """One measured column over a whole episode, beside all simulations of the same policy.
+
+    Attributes:
+        episode: Number of the episode.
+        column: Name of the column.
+        beside: For a tenth of the episode it is at least this far outside of what the simulations cover up to 0.1 s
+            before and after; angles on the circle.
+        moved: Its range in the first and in the second half.
+        least: Smallest range of any simulation in each half.
+        most: Largest range of any simulation in each half.
+    """
+
+    episode: int
+    column: str
+    beside: float
+    moved: tuple[float, ...]
+    least: tuple[float, ...]
+    most: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -100,6 +126,7 @@ class Deployment(Summed):
         probe: The small steps by which the delay was measured; None where it was not.
         trained: Times on the robot beside those that the policy was trained with.
         replay: The recorded commands, played to the identified and to the nominal model.
+        courses: Measured columns over whole episodes, beside the simulations.
         drift: Which parameters are no longer what was identified; None where that was not tested.
         advice: What to do next; None in older files and after a dry run.
         dry_run: Whether nothing was moved: then there are no scores, no simulation and no gap.
@@ -115,6 +142,7 @@ class Deployment(Summed):
     probe: Recording | None = None
     trained: tuple[Gap, ...] = ()
     replay: tuple[Replay, ...] = ()
+    courses: tuple[Course, ...] = ()
     drift: Drift | None = None
     advice: Advice | None = None
     dry_run: bool = False

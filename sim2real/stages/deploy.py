@@ -91,9 +91,9 @@ def deploy(
     from sim2real.stages.judging import judged
     from sim2real.train.networks import Policy
 
-    world, values = (None, None) if identification is None else (identification.world, identification.values)
+    world = None if identification is None else identification.world
     trained = Policy.from_weights(bundle.weights, bundle.spec)
-    gap = compare(moving_robot(pipeline, world), recordings, trained, values, config.duration_s)
+    gap = compare(moving_robot(pipeline, world), recordings, trained, identification, config.duration_s)
     probe = folder / PROBE
     gap = replace(gap, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
     return replace(judged(gap, pipeline, bundle, identification, folder), summary=tuple(sessions))

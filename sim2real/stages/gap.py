@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from sim2real.artifacts.deployment import Deployment, Gap, Scores
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
@@ -24,15 +25,23 @@ from sim2real.robots.states import as_columns, as_sent
 from sim2real.runtime.bursts import make_room
 from sim2real.runtime.compiled import CompiledGraph
 from sim2real.stages.console import note, progress
+from sim2real.stages.courses import courses
 from sim2real.stages.interruption import patiently
+from sim2real.train.draws import draw_robots
+from sim2real.train.variation import VariationConfig
 
-_SIMULATIONS = 32
+_SIMULATIONS, _OF_EACH = 32, 8
+"""Simulations at least, in all and of each episode."""
 States = tuple[np.ndarray, dict[str, np.ndarray]]
 """Times ``(N,)`` [s], and columns: states ``(N,)``, and what was sent, once a step."""
 
 
 def compare(
-    robot: Robot, recordings: Sequence[Recording], policy: Any, values: Mapping[str, float] | None, duration_s: float
+    robot: Robot,
+    recordings: Sequence[Recording],
+    policy: Any,
+    found: Identification | None,
+    duration_s: float,
 ) -> Deployment:
     """Return how deployments went, beside simulations of the same policy.
 
@@ -43,22 +52,26 @@ def compare(
         robot: The robot.
         recordings: The robot's sessions.
         policy: The policy that ran.
-        values: Identified parameters to simulate with; None: nothing is simulated.
+        found: What to simulate with; None: nothing is simulated. The first simulation of each deployment has the
+            estimates, the others parameters drawn from what the recordings leave open.
         duration_s: How long to simulate [s].
     """
     known = all(r.true_states() is not None for r in recordings)
     real = [_states(recording, robot, known) for recording in recordings]
     seen = robot.roles.world if known else robot.roles.sensor
+    robots = None if found is None else _plausible(found, len(recordings))
     with progress(None, "simulate the same"):
         simulated, timeline = patiently(
-            lambda: _simulate(robot, policy, values, recordings[0].timing, duration_s, len(recordings), seen)
+            lambda: _simulate(robot, policy, robots, recordings[0].timing, duration_s, len(recordings), seen)
         )
     scored, measured = (None, []) if simulated is None else ([s for s, _ in simulated], [m for _, m in simulated])
     episodes, gap = _scored(robot, real, scored)
     gap += _age_rows(robot, [r.episode for r in recordings], timeline)
     columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
-    return Deployment(episodes, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings))
+    sensed = [(r.episode.steps[robot.roles.sensor].begun_s, _sensed(robot, r.episode)) for r in recordings]
+    went = courses(sensed, measured, robot.units)
+    return Deployment(episodes, tuple(gap), dict(robot.units), tuple(columns), tuple(recordings), courses=went)
 
 
 def _states(recording: Recording, robot: Robot, known: bool) -> States:
@@ -68,14 +81,17 @@ def _states(recording: Recording, robot: Robot, known: bool) -> States:
     if known and (true := recording.true_states()) is not None:
         t_s, states = true
         return t_s, {**sent, **states}
-    sensor = robot.roles.sensor
-    return episode.steps[sensor].begun_s, {**sent, **as_columns(episode.outputs[sensor])}
+    return episode.steps[robot.roles.sensor].begun_s, {**sent, **_sensed(robot, episode)}
+
+
+def _sensed(robot: Robot, episode: Episode) -> dict[str, np.ndarray]:
+    return as_columns(episode.outputs[robot.roles.sensor])
 
 
 def _simulate(
     robot: Robot,
     policy: Any,
-    values: Mapping[str, float] | None,
+    robots: Sequence[Mapping[str, float]] | None,
     timing: Timing,
     duration_s: float,
     episodes: int,
@@ -83,13 +99,13 @@ def _simulate(
 ) -> tuple[list[tuple[States, States]] | None, Timeline | None]:
     """Return times [s] and states of the same policy in simulation, from rest, on timelines like the robot's.
 
-    ``seen`` says which states the first are: those of the world, or as the sensor measures them, as late as on the
-    robot; the second are always the sensor's.
+    ``robots`` are the parameters of each simulation. ``seen`` says which states the first are: those of the world, or
+    as the sensor measures them, as late as on the robot; the second are always the sensor's.
     Steps that took longer than a period of the policy are left out: hiccups, after which it would make several steps at
     once, each of which the program would have to hold. What they did on the robot, the ages in the gap report tell.
     None and None where there is nothing to simulate with.
     """
-    if values is None:
+    if robots is None:
         return None, None
     try:
         computation, hiccups = timing.computation(1.0 / robot.rate_hz)
@@ -99,22 +115,34 @@ def _simulate(
     if hiccups:
         left = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
         note(f"the simulation leaves out steps that took longer than a period of the policy: {left}")
-    nodes, _ = robot.training(values, {}, computation, True)
-    timeline = draw(nodes, duration_s, _SIMULATIONS, 0)
+    nodes, _ = robot.training(robots[0], {}, computation, True)
+    count = len(robots)
+    timeline = draw(nodes, duration_s, count, 0)
     make_room(nodes, timeline)
     graph = CompiledGraph(nodes, robot.roles.supervisor, timeline)
     # Each deployment's own trial in turn: its simulation has the same to do.
-    trials = [robot.simulation_params(values, policy, e % episodes) for e in range(_SIMULATIONS)]
+    trials = [robot.simulation_params(values, policy, e % episodes) for e, values in enumerate(robots)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
     recorded = tuple({seen, robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator})
 
     def one(eps: jax.Array, params: Any) -> Any:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
-    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(_SIMULATIONS), params))
+    records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(one))(np.arange(count), params))
     kinds = (seen, robot.roles.sensor)
-    pairs = [tuple(_run(graph, records, robot, e, kind) for kind in kinds) for e in range(_SIMULATIONS)]
+    pairs = [tuple(_run(graph, records, robot, e, kind) for kind in kinds) for e in range(count)]
     return [(scored, measured) for scored, measured in pairs], timeline
+
+
+def _plausible(found: Identification, episodes: int) -> list[dict[str, float]]:
+    """Return parameters of simulations: the estimates for the first of each episode, then what recordings leave open.
+
+    Delays are the estimates in all of them, as the graph is made for those.
+    """
+    drawn = draw_robots(found.values, found, VariationConfig(), 1.0, np.random.default_rng(0))
+    own = [p.name for p in found.parameters if p.kind == "dynamics" and p.name in drawn]
+    others = range(max(_SIMULATIONS, _OF_EACH * episodes) - episodes)
+    return [{**found.values}] * episodes + [{**found.values} | {n: float(drawn[n][i]) for n in own} for i in others]
 
 
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:

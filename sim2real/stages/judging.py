@@ -16,6 +16,7 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
 from sim2real.stages.console import note, progress, table
+from sim2real.stages.courses import off_course
 from sim2real.stages.interruption import patiently
 from sim2real.stages.next_step import LATER, commands
 from sim2real.stages.pipeline import Pipeline
@@ -30,6 +31,8 @@ _LATE = 0.01
 """Share of the steps that may take longer than any in training."""
 _SLACK = 0.1
 """Share of the policy's period by which they may do so: at 50 Hz, 2 ms, less than a servo's own delay varies by."""
+_MOST = 3
+"""Sentences about courses that a verdict has at most."""
 _GOOD, _WORSE = 0.9, 0.1
 """Success that needs no more training; by how much it may be below that in simulation."""
 
@@ -70,15 +73,17 @@ def judged(
 def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
     """Return what a deployment that was tested asks for, the command left out.
 
-    What is wrong with the model comes first, see ``verdict_of``; then a policy that was trained for other times, or
-    that is not good enough.
+    What is wrong with the model comes first, see ``verdict_of``; then whole episodes that differ from their
+    simulations; then a policy that was trained for other times, or that is not good enough.
 
     Args:
-        deployed: With replay, drift and times.
+        deployed: With replay, courses, drift and times.
         bundle: The policy.
     """
     if told := verdict_of(deployed.replay, deployed.drift):
         return told
+    if off := tuple(off_course(deployed)):
+        return Advice("re-identify", (*off[:_MOST], f"commands played again hold {_ahead(deployed)} ahead, though"))
     if told := _of_policy(deployed, bundle):
         return replace(told, reasons=(*told.reasons, "the model holds"))
     return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
@@ -205,6 +210,10 @@ def _change(c: Changed) -> str:
     if c.unit == "":
         return f"{c.name} is {c.now:.2f} times what it was [{c.low95:.2f}, {c.high95:.2f}]"
     return f"{c.name} is {c.now:.4g} {c.unit} [{c.low95:.4g}, {c.high95:.4g}], identified were {c.before:.4g}"
+
+
+def _ahead(deployed: Deployment) -> str:
+    return f"{max(row.horizon_s for row in deployed.replay):g} s"
 
 
 def _also(drifted: Drift) -> list[str]:

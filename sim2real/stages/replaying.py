@@ -76,7 +76,8 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
         own, moved, now = promised.get(position.column), still.get(position.column), rmse.get("hold")
         if own is not None:  # a model's error grows with the motion
             own = max(own, _NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
-        rows.append(Replay(position.name, position.unit, ahead_s, rmse, own))
+        free = _free_run(found, position.column)
+        rows.append(Replay(position.name, position.unit, ahead_s, rmse, own, position.column, free))
     return rows, drifted
 
 
@@ -156,3 +157,10 @@ def _held_out(found: Identification, model: str, ahead_s: float) -> Mapping[str,
     """Return a model's error on the data that identification held out, by field."""
     rows = [p for p in found.prediction if p.model == model and p.held_out and p.horizon_s == ahead_s]
     return {n: e for row in rows for n, e in row.rmse.items() if e is not None}
+
+
+def _free_run(found: Identification, column: str) -> float | None:
+    """Return how far the model was off a position in free runs over held-out data, on average; None where unknown."""
+    rows = [r.rmse for r in found.free_run if r.model == "identified" and r.held_out and r.field == column]
+    errors = [e for e in rows if e is not None]
+    return float(np.mean(errors)) if errors and len(errors) == len(rows) else None

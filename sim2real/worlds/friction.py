@@ -84,3 +84,22 @@ def stopped(velocity: Value, most: Value) -> jax.Array:
     chattering or creeping.
     """
     return jnp.sign(velocity) * jnp.maximum(jnp.abs(velocity) - most, 0.0)
+
+
+def rubbed(velocity: Value, push: Value, most: Value) -> jax.Array:
+    """Return the velocity after a step with dry friction [rad/s].
+
+    Exact for forces that are constant during the step: friction opposes the motion up to the instant at which it
+    stops; from there the joint sticks, or moves the other way for the rest of the step. Were friction to oppose the
+    final motion during the whole step, each reversal would come late by up to a step.
+
+    Args:
+        velocity: Before the step [rad/s].
+        push: What the other forces add in the step [rad/s].
+        most: What friction takes off in the step at most [rad/s].
+    """
+    moving = velocity != 0.0
+    slowed = velocity + push - jnp.sign(velocity) * most
+    reverses = moving & (velocity * slowed < 0.0)
+    rest = jnp.where(reverses, slowed / jnp.where(reverses, slowed - velocity, 1.0), 1.0)  # of the step
+    return jnp.where(moving & ~reverses, slowed, rest * stopped(push, most))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
-from sim2real.worlds.friction import stopped
+from sim2real.worlds.friction import rubbed
 from sim2real.worlds.stepped import SteppedWorld
 
 if TYPE_CHECKING:
@@ -109,8 +109,8 @@ class JointWorld(SteppedWorld):
         def substep(s: JointState, h: float) -> JointState:
             w = s.velocity
             f = self.forces(params, s.position + 0.5 * h * w, w, command)
-            pushed = w * (1.0 - 0.5 * h * f.damping) + h * f.acceleration
-            after = stopped(pushed, h * f.dry) / (1.0 + 0.5 * h * f.damping)
+            damped = w * (1.0 - 0.5 * h * f.damping)
+            after = rubbed(damped, h * f.acceleration, h * f.dry) / (1.0 + 0.5 * h * f.damping)
             return self.confine(params, s.replace(position=s.position + 0.5 * h * (w + after), velocity=after))
 
         return self.over_substeps(substep, state)

@@ -123,7 +123,7 @@ def test_simulated_measurements_are_compared_with_measurements():
     values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))
-    (t_s, world), (at_s, sensor) = gap._simulate(robot, policy, values, Timing.of(episode), 0.6, 1, "world")[0][0]
+    (t_s, world), (at_s, sensor) = gap._simulate(robot, policy, [values], Timing.of(episode), 0.6, 1, "world")[0][0]
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)
     then = np.interp(at_s - late_s, t_s, world["th"])

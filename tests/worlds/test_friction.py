@@ -94,6 +94,18 @@ def test_stopped_takes_away_up_to_the_most_and_never_reverses(speed, most):
         assert after == 0.0
 
 
+@given(speed=speeds, push=st.floats(-20.0, 20.0, width=32), most=st.floats(0.0, 20.0, width=32))
+def test_rubbed_is_the_end_of_a_thousand_small_steps(speed, push, most):
+    after = speed
+    for _ in range(1000):
+        pushed = after + push / 1000
+        after = math.copysign(max(abs(pushed) - most / 1000, 0.0), pushed)
+    found = float(friction.rubbed(jnp.float32(speed), jnp.float32(push), jnp.float32(most)))
+    assert found == pytest.approx(after, abs=2e-3 * (abs(push) + most) + 1e-4)
+    if abs(push) <= most and abs(speed) <= most - abs(push):
+        assert found == 0.0, "it sticks"
+
+
 LIMIT = math.atan(0.3)
 """Slope up to which a block with a coefficient of 0.3 stays."""
 
