@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -23,8 +22,6 @@ BURST = 3
 the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
-_ROUNDING = 1e-6
-"""Share of a tick that is rounding."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
 
@@ -81,10 +78,6 @@ def delay_bounds(
 ) -> dict[str, tuple[float, float, float]]:
     """Return the bounds of the trainable delays for training.
 
-    The upper ones are rounded up to the world's ticks: the lengths of a program's windows and rings follow from them,
-    and an identification from another recording of the robot is to find the program in the compilation cache. The lower
-    ones are not: with less delay a row holds shorter pauses, so that more episodes end early.
-
     Args:
         values: Both delays by name [s].
         tick_s: The world's period [s], over which the sensor interpolates.
@@ -99,8 +92,7 @@ def delay_bounds(
     for name, lead in zip(DELAYS, (0.0, lead_s), strict=True):
         own = np.append(draws.get(name, []), values[name])
         low, high = float(own.min()) - tick_s - spread_s, float(own.max()) + spread_s
-        high = math.ceil((high + lead) / tick_s - _ROUNDING) * tick_s
-        bounds[name] = (values[name] + lead, max(0.0, low), high)
+        bounds[name] = (values[name] + lead, max(0.0, low), high + lead)
     return bounds
 
 

@@ -284,7 +284,8 @@ class _Tables:
                 if sender in self.placer.given:
                     continue
                 room = int(t.age.max(initial=0))
-                if self.reusable and room:  # 2, 4, 8 ...
+                # 2, 4, 8 ...; a robot that was late once reads older messages, another recording of it none.
+                if self.reusable and (room or not connection.blocking):
                     room = max(2, 1 << (room - 1).bit_length())
                 rings[sender] = max(rings[sender], room + connection.total_window)
         return rings

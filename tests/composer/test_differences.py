@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import importlib
 import re
 import warnings
 from pathlib import Path
@@ -197,10 +198,104 @@ def test_mocap_bodies(oracle, ours):
     assert "mocap_pos" not in dir(bound(ours))
 
 
+def test_removed_elements(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement(model="w")
+        bodies = [root.worldbody.add("body", name=name, pos=[0, 0, i]) for i, name in enumerate("ab")]
+        for body in bodies:
+            body.add("freejoint")
+            body.add("geom", size=[0.1])
+        root.equality.add("weld", name="weld", body1=bodies[0], body2=bodies[1])
+        bodies[1].remove()
+        if kit is oracle:
+            assert kit.mjcf.Physics.from_mjcf_model(root).model.eq_obj2id.tolist() == [0]
+        else:
+            with pytest.raises(UsageError, match="equality 'weld' of model 'w' names the body 'b', which was removed"):
+                kit.mjcf.Physics.from_mjcf_model(root)
+
+
+def test_parts_of_paths(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root = model(kit)
+        tendon = root.tendon.add("fixed", name="t")
+        found.append(tendon.add("joint", joint=root.find("joint", "j"), coef=1.0) is tendon)
+    assert found == [False, True]
+
+
+def test_joints_of_frames(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement(model="w")
+        frame = root.attach(model(kit))
+        frame.add("joint", type="slide", axis=[1, 0, 0])
+        if kit is oracle:
+            frame.add("joint", type="slide", axis=[0, 1, 0])
+            with pytest.raises(ValueError, match="repeated name 'arm/' in joint"):
+                kit.mjcf.Physics.from_mjcf_model(root)
+        else:
+            with pytest.raises(UsageError, match=r"frame 'arm/' has a joint 'arm/' already(.|\n)*name"):
+                frame.add("joint", type="slide", axis=[0, 1, 0])
+            frame.add("joint", name="y", type="slide", axis=[0, 1, 0])
+            assert [j.full_identifier for j in frame.find_all("joint")] == ["arm/", "arm/y/", "arm/j"]
+
+
+def test_elements_as_xml(oracle, ours):
+    found = [model(kit).find("joint", "j").to_xml_string().strip() for kit in (oracle, ours)]
+    assert found == ['<joint name="j" class="/"/>', '<joint name="j"/>']
+    with pytest.raises(AttributeError):
+        ours.mjcf.RootElement().default.to_xml_string()
+
+
+def test_unfinished_models(oracle, ours):
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement(model="w")
+        root.worldbody.add("body", name="b").add("joint", name="j")
+        assert '<joint name="j"' in root.to_xml_string()
+        root.actuator.add("motor", name="m")
+        if kit is oracle:
+            assert "<motor" in root.to_xml_string()
+        else:
+            with pytest.raises(ValueError, match="transmission target"):
+                root.to_xml_string()
+
+
+def test_sizes_as_text(oracle, ours):
+    found = []
+    for kit in (oracle, ours):
+        root = kit.mjcf.RootElement()
+        root.size.memory = "1048576"
+        found.append(root.size.memory)
+    assert found == ["1048576", 1048576]
+
+
+def test_printed_elements(oracle, ours):
+    found = [repr(model(kit).find("body", "b")) for kit in (oracle, ours)]
+    assert found == ['MJCF Element: <body name="b">...</body>', "<body 'b'>"]
+
+
+def test_wording_of_errors(oracle, ours):
+    missing, long = '<mujoco><include file="nothing.xml"/></mujoco>', {"pos": [1, 2, 3, 4]}
+    for kit, error, words in (
+        (oracle, OSError, "no more than 3 entries"),
+        (ours, UsageError, "no more than 3 numbers"),
+    ):
+        with pytest.raises(error, match=r"nothing\.xml"):
+            kit.mjcf.from_xml_string(missing)
+        with pytest.raises(ValueError, match=words):
+            kit.mjcf.RootElement().worldbody.add("body", **long)
+
+
 @pytest.mark.parametrize("name", ["insert", "include_copy", "is_same_as", "to_xml", "namescope"])
 def test_tree_surgery(oracle, ours, name):
     assert [hasattr(model(kit), name) for kit in (oracle, ours)] == [True, False]
     assert [hasattr(kit.mjcf, "from_zip") for kit in (oracle, ours)] == [True, False]
+    assert [hasattr(model(kit).worldbody, "spec") for kit in (oracle, ours)] == [True, False]
+    del model(oracle).option
+    model(oracle).default.dclass = "main"
+    with pytest.raises(AttributeError):
+        del model(ours).option
+    with pytest.raises(AttributeError):
+        model(ours).default.dclass = "main"
 
 
 # -- episodes
@@ -291,6 +386,12 @@ def test_mocap_poses(oracle, ours):
 
 
 # -- observables
+
+
+def test_observation_buffers(oracle):
+    assert importlib.import_module("dm_control.composer.observation.obs_buffer").Buffer
+    with pytest.raises(ImportError):
+        importlib.import_module("sim2real.composer.observation.obs_buffer")
 
 
 def test_first_samples(oracle, ours):

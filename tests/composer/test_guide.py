@@ -12,7 +12,7 @@ GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "compose.md"
 def test_every_block_of_the_guide_runs():
     pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
     blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 9
+    assert len(blocks) == 10
     names = {"__name__": "guide"}
     for number, block in enumerate(blocks, start=1):
         exec(compile(block, f"{GUIDE.name}, block {number}", "exec"), names)

@@ -3,6 +3,7 @@
 import copy
 
 import pytest
+from mujoco import mjx
 from test_oracle import differing_arrays, names
 
 from sim2real.composer import mjcf
@@ -85,6 +86,11 @@ def test_changed_worlds_are_those_of_dm_control(oracle, change):
     assert_equal(*found)
 
 
+def test_tendons_across_models_are_there_on_mjx():
+    model = mjx.put_model(world(mjcf)[0].compile())
+    assert (model.ntendon, model.nu, model.nsensor, model.neq) == (6, 5, 7, 5)
+
+
 def test_a_copy_names_its_own_elements():
     top, *_ = world(mjcf)
     twin = copy.deepcopy(top)
@@ -130,6 +136,42 @@ def test_text_follows_a_model_that_is_renamed_after_its_elements():
     robot.model = "x"
     assert top.find("actuator", "m").joint.full_identifier == "x/kk"
     assert top.compile().actuator("m").trnid[0] == top.compile().joint("x/kk").id
+
+
+@pytest.mark.parametrize("order", [("reftype", "refname"), ("refname", "reftype")])
+def test_references_are_set_one_after_the_other(oracle, order):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        top, left, right = world(lib)
+        motor = top.actuator.add("motor", name="m", joint=left.find("joint", "j"))
+        motor.joint = right.find("joint", "k")
+        same = top.equality.add("joint", name="e", joint1=left.find("joint", "j"))
+        same.joint2 = right.find("joint", "j")
+        place = top.sensor.add("framepos", name="p", objtype="site", objname=left.find("site", "s"))
+        for name in order if lib is mjcf else ("reftype", "refname"):
+            setattr(place, name, {"reftype": "body", "refname": right.find("body", "c")}[name])
+        found.append(compiled(lib, top))
+    assert_equal(*found)
+
+
+SERVOS = ROBOT.replace('<motor name="m" joint="k"/>', '<position name="m" joint="k" kp="3"/>')
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_an_element_that_is_laid_down_anew_names_what_it_named(oracle, copied):
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        robot = lib.from_xml_string(SERVOS)
+        j, k = robot.find("joint", "j"), robot.find("joint", "k")
+        j.name, k.name, j.name = "x", "j", "k"
+        robot = copy.deepcopy(robot) if copied else robot
+        robot.find("actuator", "m").kp = 5
+        robot.find("sensor", "place").reftype = "xbody"
+        robot.find("sensor", "place").refname = robot.find("body", "c")
+        top = lib.RootElement(model="w")
+        top.attach(robot)
+        found.append(compiled(lib, top))
+    assert_equal(*found)
 
 
 def test_text_that_names_nothing_is_refused():

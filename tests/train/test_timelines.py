@@ -9,6 +9,7 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, BaseWorld
 from sim2real.graph.schedule import draw
 from sim2real.robots.loop import delay_bounds, simulated_loop
 from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.wiring import wire
 from sim2real.train.timelines import Recorded, Stretches, draw_timelines
 
 RATE_HZ, SECONDS, CALM_S = 50.0, 40, 0.001
@@ -118,3 +119,19 @@ def test_without_a_recording_timelines_are_as_the_nodes_say(loop):
 def test_longer_episodes_begin_like_shorter_ones():
     stretches = Stretches(4)
     np.testing.assert_array_equal(stretches.begins(3, 9)[:, :4], stretches.begins(3, 4))
+
+
+def test_recordings_of_one_robot_have_rings_of_one_length():
+    """Whether the least delay is nothing or 0.2 ms: a program that is to serve both has room for both."""
+    rings = []
+    for delay_s in (0.012, 0.0122):
+        times = recorded(25, 0.004)
+        bounds = delay_bounds({"sensor_delay": delay_s, "actuator_delay": 0.0104}, 0.01, 0.002)
+        own = [BaseNode(n, RATE_HZ, delay=0.002, delay_dist=times.computation[n]) for n in NAMES]
+        nodes = simulated_loop(*own, BaseWorld("world", 100.0), bounds)
+        times.transport_to(nodes)
+        timeline = draw_timelines(nodes, "agent", 1.0, 4, 3, times).timeline
+        rings.append([wire(nodes, "agent", timeline, reusable=reusable).rings for reusable in (False, True)])
+    (one, same), (other, again) = rings
+    assert one != other
+    assert same == again

@@ -110,6 +110,8 @@ def _lay_down(model: Tree[Handle], element: Handle) -> None:
     """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
     native, kind, said = element._native, element.kind, element.recorded()
     values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
+    if ("reftype" in values) != ("refname" in values):  # a program sets one after the other
+        values = {k: v for k, v in values.items() if k not in ("reftype", "refname")}
     is_shortcut = kind == "actuator" and said.tag != "general"
     if is_shortcut and model.records.has_defaults:  # they set these altogether, whatever the class says
         translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
@@ -172,7 +174,7 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
         translate.reset(native, element.class_defaults, (translate.native_name(kind, key),))
         model.touch()
         return
-    _catch_up(element, said.values)
+    _catch_up(element, said.values, key)
     native_only = {k: said.values.pop(k) for k in list(said.values) if k not in known and k not in ("name", "dclass")}
     foreign = _foreign(model, said.values.get("dclass"))
     translate.reset(native, getattr(foreign.native, kind) if foreign else element.class_defaults)
@@ -186,8 +188,12 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
         said.values.update(native_only)
 
 
-def _catch_up(element: Handle, said: dict[str, Any]) -> None:
-    """Take over the numbers that an element holds now: arrays may have been written into."""
+def _catch_up(element: Handle, said: dict[str, Any], key: str | None) -> None:
+    """Take over what an element holds now: arrays may have been written into, what it names may be called otherwise."""
+    for name in REFERENCES.get(element.kind, ()):
+        target = references.held(element, name) if name in said and name != key else None
+        if target is not None:
+            said[name] = target
     for name in said:
         if name in ("name", "dclass") or name in REFERENCES.get(element.kind, ()):
             continue
@@ -296,6 +302,7 @@ def remove(model: Tree[Handle], element: Handle) -> None:
     """
     native = element._native
     if element.kind == "inertial":
+        translate.reset(native, translate.blank("body"), ("mass", "ipos", "iquat", "inertia", "fullinertia"))
         native.explicitinertial = False
         model.touch()
         return

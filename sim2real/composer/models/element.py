@@ -170,10 +170,10 @@ class Element(Handle):
         value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value
         if name in ("dclass", "childclass"):
             builder.reclass(self.root, self, name, value)
-        elif name in REFERENCES.get(kind, ()) and hasattr(self._native, translate.native_name(kind, name)):
+        elif name in REFERENCES.get(kind, ()) and self._holds(name):
             refer(self, translate.native_name(kind, name), value)
             said.note(name, value)
-        elif value is not None and translate.is_plain(self._native, kind, name, value):
+        elif value is not None and name != "refname" and translate.is_plain(self._native, kind, name, value):
             translate.assign(self._native, kind, name, value)
             said.note(name, value)
             self.root.touch()
@@ -185,6 +185,13 @@ class Element(Handle):
             except Exception:
                 said.note(name, before)
                 raise
+
+    def _holds(self, name: str) -> bool:
+        """Return whether the ``MjSpec`` has an attribute by itself, rather than what several in MJCF stand for."""
+        native = self._native
+        if name == "refname" and native.reftype == mj.mjtObj.mjOBJ_UNKNOWN:  # until its type is laid down as well
+            return False
+        return hasattr(native, translate.native_name(self.kind, name))
 
     def __delattr__(self, name: str) -> None:
         setattr(self, name, None)

@@ -83,7 +83,14 @@ class Model(Tree[Element]):
         model_dir: str | os.PathLike[str] = "",
         resolve_references: bool = True,
     ) -> Model:
-        """Return a model from an open MJCF file; the arguments are those of ``from_xml_string``."""
+        """Return a model from an open MJCF file.
+
+        Args:
+            file: The file.
+            assets: As in ``from_xml_string``.
+            model_dir: As in ``from_xml_string``.
+            resolve_references: As in ``from_xml_string``.
+        """
         return cls.from_xml_string(file.read(), assets, model_dir=model_dir, resolve_references=resolve_references)
 
     @classmethod

@@ -79,6 +79,11 @@ def referenced(element: Handle, name: str) -> Handle | str | None:
     return None if isinstance(text, Handle) and text.is_removed else text
 
 
+def held(element: Handle, name: str) -> Handle | None:
+    """Return the element that an attribute names, where that is held as an element; it may have been deleted."""
+    return element.root.references.get((element._native, _native_key(element, name)))
+
+
 def _native_key(element: Handle, name: str) -> str:
     """Return the attribute of the ``MjSpec`` that holds what an attribute in MJCF names, as MuJoCo's parser puts it."""
     values = element.recorded().values

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,11 +12,8 @@ from sim2real.composer.models.targets import targets
 from sim2real.composer.models.translate import mj
 from sim2real.composer.models.tree import Handle, Tree
 
-if TYPE_CHECKING:
-    from sim2real.composer.models.element import Element
 
-
-def to_xml_string(element: Element, prefix_root: Tree[Any] | None, self_only: bool, pretty_print: bool) -> str:
+def to_xml_string(element: Any, prefix_root: Tree[Any] | None, self_only: bool, pretty_print: bool) -> str:
     """Return an element as MJCF.
 
     Args:
@@ -34,10 +31,10 @@ def to_xml_string(element: Element, prefix_root: Tree[Any] | None, self_only: bo
 _ORDER = ("inertial", "joint", "geom", "site", "camera", "light", "body")
 
 
-def _node(element: Element, top: Tree[Any], self_only: bool) -> ElementTree.Element:
+def _node(element: Any, top: Tree[Any], self_only: bool) -> ElementTree.Element:
     said = element.recorded().values
     node = ElementTree.Element(element.tag)
-    if element.name and not element.is_worldbody:
+    if element.name and not element.is_worldbody and element.kind != "inertial":
         node.set("name", element.root.identify(element, relative_to=top))
     for key in said:
         value = said[key] if key.startswith("file") else getattr(element, key)
