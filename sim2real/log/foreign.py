@@ -234,7 +234,9 @@ def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
         elif values.dtype.kind in "Mm":
             missing, values = np.isnat(values), values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64)
             values = np.where(missing, np.nan, values) if missing.any() else values
-        if values.dtype == object:  # JSON and Parquet have None for a missing value, which becomes NaN
+        if values.dtype == object and values.ndim == 1 and any(isinstance(v, str) for v in values):
+            values = np.array(["" if v is None else v for v in values], dtype=str)  # words among numbers
+        elif values.dtype == object:  # JSON and Parquet have None for a missing value, which becomes NaN
             values = np.asarray(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None

@@ -99,13 +99,18 @@ def checked_positions(
     leapt = np.zeros(len(t_s), bool)
     leapt[rows[~kept]] = True
     if leapt.any():
-        k, i = rows[~kept][0], int(leaps[~kept][0].argmax())
-        said.append(
-            f"{int(leapt.sum())} samples hold readings that leap away and back, as {measured.sources[i]!r} does to "
-            f'{measured.values[k, i]:.4g} in sample {k}: no joint can. implausible = "drop" leaves them out'
-        )
+        said.append(_on_leaps(measured, rows[~kept], leaps[~kept]))
         values[leapt] = np.nan
     return CheckedPositions(replace(measured, values=values), to_rad, turn * bool(over.any()), hinges, leapt, said)
+
+
+def _on_leaps(measured: Signal, rows: np.ndarray, leaps: np.ndarray) -> str:
+    """Return what to say of these rows, in which readings leap."""
+    k, i = rows[0], int(leaps[0].argmax())
+    return (
+        f"{len(rows)} samples hold readings that leap away and back, as {measured.sources[i]!r} does to "
+        f'{measured.values[k, i]:.4g} in sample {k}: no joint can. implausible = "drop" leaves them out'
+    )
 
 
 def turned_commands(command: Signal, checked: CheckedPositions) -> tuple[Signal, float]:
@@ -177,16 +182,8 @@ def radian(
         )
     if others:
         return others[0]
-    if asked.ranges is not None and len(asked.ranges) == q.shape[1]:
-        low, high = asked.ranges.T
-        known = high > low
-        room = 0.1 * (high - low)
-        inside = {u: ((q / u > low - room) & (q / u < high + room))[:, known] for u in (1.0, DEGREES)}
-        share = {u: float(rows.mean()) if known.any() else 1.0 for u, rows in inside.items()}
-        if share[1.0] < 0.9 < share[DEGREES]:
-            return DEGREES, f"as radians {1 - share[1.0]:.0%} of it would lie outside of the joints' ranges"
-        if share[DEGREES] < 0.9 < share[1.0]:
-            return 1.0, f"as degrees {1 - share[DEGREES]:.0%} of it would lie outside of the joints' ranges"
+    if told := _by_ranges(q, asked):
+        return told
     most = float(np.abs(q).max())
     speed = float(np.quantile(np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None], 0.99))
     if most <= _MOST_RAD and (speed <= _FAST_RAD_S or most <= _SMALL_RAD):
@@ -243,6 +240,22 @@ def _names_of(file: ForeignFile, signal: Signal) -> list[str]:
     return [
         own[int(p)] if p.isdigit() and int(p) < len(own) else s for p, s in zip(places, signal.sources, strict=True)
     ]
+
+
+def _by_ranges(q: np.ndarray, asked: Asked) -> tuple[float, str] | None:
+    """Return how many units a radian is where positions fit the joints' ranges in one unit only, and what to say."""
+    if asked.ranges is None or len(asked.ranges) != q.shape[1]:
+        return None
+    low, high = asked.ranges.T
+    known = high > low
+    room = 0.1 * (high - low)
+    inside = {u: ((q / u > low - room) & (q / u < high + room))[:, known] for u in (1.0, DEGREES)}
+    share = {u: float(rows.mean()) if known.any() else 1.0 for u, rows in inside.items()}
+    if share[1.0] < 0.9 < share[DEGREES]:
+        return DEGREES, f"as radians {1 - share[1.0]:.0%} of it would lie outside of the joints' ranges"
+    if share[DEGREES] < 0.9 < share[1.0]:
+        return 1.0, f"as degrees {1 - share[DEGREES]:.0%} of it would lie outside of the joints' ranges"
+    return None
 
 
 def _refuse_turns(measured: Signal, over: np.ndarray, angle_rad: np.ndarray, asked: Asked, path: str) -> None:

@@ -48,6 +48,18 @@ def test_words_in_json_and_in_arrays_of_words(tmp_path, recorded):
     np.testing.assert_array_equal(imported(tmp_path / "run.npz")[0].outputs["sensor"]["position"], q)
 
 
+def test_words_beside_numbers_that_are_missing(tmp_path, recorded):
+    t, goal, q = recorded
+    cells = [None if i % 50 == 3 else x for i, x in enumerate(spoilt(q[:, 0], "null"))]
+    (tmp_path / "run.json").write_text(json.dumps({"t_s": t.tolist(), "goal": goal[:, 0].tolist(), "q": cells}))
+    whole = sum(cell not in (None, "null") for cell in cells)
+    assert imported(tmp_path / "run.json")[0].outputs["sensor"]["position"].shape == (whole, 1)
+    cells[7] = "ERR"
+    (tmp_path / "run.json").write_text(json.dumps({"t_s": t.tolist(), "goal": goal[:, 0].tolist(), "q": cells}))
+    with pytest.raises(UsageError, match=r"sample 7 of 'q' in .* holds 'ERR', no number"):
+        imported(tmp_path / "run.json")
+
+
 def test_a_word_in_a_position_is_refused_with_its_line(tmp_path, recorded):
     path = csv(tmp_path / "run.csv", columns(recorded, q_a=spoilt(recorded[2][:, 0], "ERR")))
     with pytest.raises(UsageError, match=r"line 7 of .*column 'q_a' holds 'ERR'"):
@@ -118,3 +130,16 @@ def test_velocities_in_another_order_go_by_their_names(tmp_path, recorded):
     assert imported(path)[1].mapping.nodes["sensor"].fields["velocity"].source == ("dq_a", "dq_b")
     path = csv(tmp_path / "run.csv", columns(recorded, dq_a=0 * t, dq_b=velocity[:, 1]))
     assert "velocity" not in imported(path)[1].mapping.nodes["sensor"].fields
+
+
+def test_cells_of_another_recorder_with_decimal_commas(tmp_path, recorded):
+    """Missing numbers, words and a column without a name, in a table with semicolons."""
+    t, _goal, q = recorded
+    table = columns(recorded, q_a=spoilt(q[:, 0], "null"), phase=["warm"] * len(t))
+    rows = [";".join(["7", *(str(x).replace(".", ",") for x in row)]) for row in zip(*table.values(), strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join([";".join(["", *table]), *rows]))
+    episode, found = imported(tmp_path / "run.csv")
+    assert len(episode.outputs["sensor"]["position"]) == sum(cell != "null" for cell in table["q_a"])
+    said = "\n".join(found.evidence)
+    assert "left out, as they hold no numbers: phase" in said
+    assert "left out: columns without a name: 1" in said

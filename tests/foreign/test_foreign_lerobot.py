@@ -257,3 +257,20 @@ def test_what_a_data_set_says_of_itself_may_be_anything(tmp_path, info, named):
             open_foreign(root)
     else:
         assert open_foreign(root).signal("action").shape == (COUNT, 5)
+
+
+def test_turns_and_leaps_of_a_data_set_in_degrees(tmp_path):
+    """Turns are counted and a reading that leaps is left out before the steps of the encoders are looked at."""
+    goal, q = (arm(x) for x in degrees(0, 60))
+    turned = [np.where(np.arange(5) == 4, np.mod(x + 340, 360) - 180, x) for x in (goal, q)]
+    turned[1][50, 0] = -180.0
+    root = data_set(tmp_path, {"data/chunk-000/file-000.parquet": episode_table(0, *turned)}, names=NAMES[:5])
+    episode, found = proposed(root)
+    position = np.degrees(episode.outputs["sensor"]["position"])
+    kept = np.arange(COUNT) != 50
+    off = position - q[kept]
+    np.testing.assert_allclose(np.abs(off) - [0, 0, 0, 0, 200 - 40 * (off[0, 4] > 0)], 0, atol=1e-3)
+    said = "\n".join(found.evidence)
+    assert "its steps are those of encoders" in said
+    assert "turns are counted" in said
+    assert "leap away and back" in said
