@@ -98,3 +98,12 @@ def test_contradictions_are_named(recorded, change, said):
 def test_a_clock_that_is_ahead_is_named(recorded):
     t, goal, q = recorded
     assert "before it is told to" in evidence.contradictions((t + 0.2, t), goal, q)[0]
+
+
+def test_the_grid_of_dated_stamps_does_not_drift():
+    """Dates in float64 are rounded to 0.24 us, and the median step is off by half of that."""
+    t = (1_700_000_000_000_000_000 + 5_000_000 * np.arange(20_000)) * 1e-9
+    values = np.arange(20_000.0)[:, None]
+    held, joined, period = following.on_grid(t, values, t, values)
+    assert period == pytest.approx(0.005, abs=1e-10)
+    np.testing.assert_allclose(held, joined, atol=1e-3)
