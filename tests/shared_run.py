@@ -70,6 +70,12 @@ def deployed(run_dir: Path, *given: Any) -> dict[str, Any]:
     return write(log, log.parent / TRUTH, played)
 
 
+def recorded(log: Path, seed: int) -> Path:
+    """Record the simulated robot under another random excitation; return the log."""
+    write(log, log.parent / TRUTH, hidden.play(ROBOT, hidden.excited(RECORD_S, seed), RECORD_S, seed))
+    return log
+
+
 def write(log: Path, truth: Path, played: hidden.Played) -> dict[str, Any]:
     """Write a session's log and the account of its true motion; return the summary that ends the log."""
     outputs = {

@@ -68,6 +68,8 @@ class IdentifyConfig(FitConfig):
     """Where the search begins: the parameters.json or partial.json of an earlier one; default: at the data sheet."""
     hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log that is held out: only predicted, not fitted; one flag a log."""
+    force: bool = False
+    """Take a log that is given twice all the same: held out and fitted, or fitted two times."""
     settle_s: float = 0.3
     """First part of a held-out segment, to which its initial state is fitted; the rest is predicted [s]."""
     horizon_s: float = 1.0
@@ -289,24 +291,6 @@ MODEL_IDENTIFY = IdentifyConfig(
     max_delay_s=0.05,
 )
 """How a robot of a model is identified: rough values are known, so there is no search; starts are read off the log."""
-
-
-@dataclass(frozen=True)
-class ValidateConfig:
-    """Score what was identified on later logs."""
-
-    parameters: Annotated[Positional[Path | None], arg(metavar="PARAMETERS")] = None
-    """parameters.json, or the folder of an identification."""
-    log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """Log that was not identified from, one flag a log."""
-    horizon_s: float = 0.0
-    """How far ahead is predicted [s]; 0: as far as the identification was judged."""
-    free_run_s: float = 10.0
-    """Longest simulation from a single initial state [s]."""
-    mapping: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Mapping of logs of another recorder; default: the pipeline's, or one is proposed."""
-    json: bool = False
-    """Print JSON instead of tables."""
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from sim2real.stages.arguments import AnyRecording, config_of, recordings_of, ro
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress
 from sim2real.stages.cutting import reach, spans, split_of
+from sim2real.stages.fitted_logs import require_apart
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline
@@ -85,6 +86,7 @@ def identify(
         require_units(log, robot)
     units = {**robot.units, **logs[0].units}
     model = robot.identifiable(config.max_delay_s)
+    require_apart(fitted, logs[len(fitted) :], model, config.force)
     table = _table(model, config).with_begin(begin or {})
     best = best or Best()
     names = [f"log {i + 1}: {log.path.stem}" for i, log in enumerate(fitted)]
@@ -169,7 +171,10 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
     logs = [open_recording(path, pipeline, robot) for path in paths]
     fitted = len(logs) - len(config.hold_out)
-    _table(robot.identifiable(config.max_delay_s), config)  # a wrong flag is refused before a folder is made
+    model = robot.identifiable(config.max_delay_s)
+    _table(model, config)  # a wrong flag is refused before a folder is made
+    if not config.force:
+        require_apart(logs[:fitted], logs[fitted:], model, False)
     begin = _begin(config.begin, pipeline) if config.begin else None
     # Logs that are too short are refused before a folder is made.
     spans([log.episode for log in logs], fitted, config, config.settle_s + config.horizon_s)

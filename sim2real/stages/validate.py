@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.manifest import plain
+from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import Rows, Shown
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
@@ -25,16 +26,19 @@ from sim2real.log.mapping import load_mapping
 from sim2real.robots.base import RecordedRobot
 from sim2real.stages import arguments, described, identified, left_out
 from sim2real.stages.arguments import AnyIdentification, AnyRecording, config_of, identification_of, recordings_of
-from sim2real.stages.config import IdentifyConfig, ValidateConfig
+from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress, shown, table
 from sim2real.stages.cutting import reach
+from sim2real.stages.fitted_logs import require_new
 from sim2real.stages.pipeline import Pipeline
 from sim2real.stages.recordings import open_recording
+from sim2real.stages.validate_config import ValidateConfig
 
 _PARAMETERS = "parameters.json"
 _KEPT = 1.25
 """Up to this many times the error that the identification promised, the promise is kept."""
 _FREE = "free run"
+_ACCEPTED = "accepted"
 
 
 def run(config: ValidateConfig) -> bool:
@@ -47,7 +51,7 @@ def run(config: ValidateConfig) -> bool:
         Whether every position is predicted better than by every baseline.
 
     Raises:
-        UsageError: When there are no parameters, no log, or a log was identified from.
+        UsageError: When there are no parameters, no log, or a log was fitted.
     """
     if config.parameters is None or not config.log:
         raise UsageError(
@@ -56,7 +60,7 @@ def run(config: ValidateConfig) -> bool:
     found = Identification.load(config.parameters)
     pipeline = pipeline_of(config.parameters, found, config)
     logs = [open_recording(Path(path), pipeline) for path in config.log]
-    result = score(found, pipeline, [log.episode for log in logs], config)
+    result = score(found, pipeline, logs, config)
     result = {"parameters": shown(config.parameters), "logs": list(config.log), **result}
     print(json.dumps(plain(result), indent=1)) if config.json else show(result)
     return bool(result["better"])
@@ -74,6 +78,9 @@ class Validation(Shown):
         promise_kept: Whether the promised errors were kept; None where none was made.
         rmse: Root mean square error of all positions at the horizon.
         free_run_rmse: The same in free runs.
+        identified: The verdict of the identification.
+        why: Its reasons.
+        fitted: Sentences about logs that were fitted, which are no test.
     """
 
     pipeline: str
@@ -83,11 +90,19 @@ class Validation(Shown):
     promise_kept: bool | None
     rmse: float
     free_run_rmse: float
+    identified: str = _ACCEPTED
+    why: Sequence[str] = ()
+    fitted: Sequence[str] = ()
 
     def about(self) -> dict[str, Any]:
         """Return what to say about it: name -> value."""
         kept = {None: "none was made", True: "yes", False: "no"}[self.promise_kept]
-        found = {"pipeline": self.pipeline, "better than baselines": "yes" if self.better else "no"}
+        found = {
+            "pipeline": self.pipeline,
+            "identification": self.identified,
+            "better than baselines": "yes" if self.better else "no",
+        }
+        found |= {"fitted": "; ".join(self.fitted)} if self.fitted else {}
         return found | {"promise kept": kept, f"rmse {self.horizon_s:g} s ahead": self.rmse}
 
     def rows(self) -> Rows:
@@ -117,7 +132,7 @@ def validate(
     if found.pipeline != pipeline.name:
         raise UsageError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}")
     logs = recordings_of(recording, pipeline)
-    return Validation(**score(found, pipeline, [log.episode for log in logs], config_of(config, ValidateConfig())))
+    return Validation(**score(found, pipeline, logs, config_of(config, ValidateConfig())))
 
 
 def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pipeline:
@@ -135,26 +150,28 @@ def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pi
 
 
 def score(
-    found: Identification, pipeline: Pipeline, episodes: Sequence[Episode], config: ValidateConfig
+    found: Identification, pipeline: Pipeline, logs: Sequence[Recording], config: ValidateConfig
 ) -> dict[str, Any]:
     """Return errors on logs that nothing was fitted to, as JSON takes them.
 
     Args:
         found: What was identified.
         pipeline: The robot.
-        episodes: The logs.
+        logs: The logs.
         config: How far ahead.
 
     Raises:
-        UsageError: When each recording has parameters of its own: of a new one they are not known.
+        UsageError: When a log was fitted, or each recording has parameters of its own: of a new one they are not known.
     """
     robot = left_out.having(pipeline.load(), [p.name for p in found.parameters])
     fitting = replace(pipeline.identify, settle_s=found.settle_s)
     model = robot.identifiable(fitting.max_delay_s)
     if own := [p.name for p in model.parameters if p.free and p.per_recording]:
         raise UsageError(f"{', '.join(own)} differ from recording to recording: of a new log they are not known")
+    episodes = [log.episode for log in logs]
     for episode in episodes:
         check_log(episode, model)
+    fitted = require_new(found, logs, model, config.force)
     known = {p.name: p.estimate for p in found.parameters}
     if lacking := [p.name for p in model.parameters if p.name not in known]:
         raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
@@ -186,6 +203,9 @@ def score(
     kept = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
     return {
         "pipeline": pipeline.name,
+        "identified": found.verdict.status,
+        "why": list(found.verdict.reasons),
+        "fitted": fitted,
         "horizon_s": horizon_s,
         "positions": rows,
         "better": not any(row["beaten_by"] for row in rows.values()),
@@ -215,8 +235,12 @@ def show(result: dict[str, Any]) -> None:
         note(f"verdict: no improvement on this log: beaten are {listed}")
     elif result["promise_kept"] is False:
         note(f"verdict: better than the baselines, but more than {_KEPT:g} times as far off as was promised")
+    elif result["fitted"]:
+        note("verdict: none: a log that was fitted is no test")
     else:
         note("verdict: holds on this log")
+    if result["identified"] != _ACCEPTED:
+        note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
 
 
 def _row(s: Score, promised: float | None, free_run: float, moves: bool) -> dict[str, Any]:

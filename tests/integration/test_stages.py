@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_robots import PATIENT, TINY, manifest_of
-from shared_run import copied
+from shared_run import copied, recorded
 
 import sim2real
 from sim2real import cli
@@ -169,8 +169,13 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     checked = sim2real.check("pendulum", run.recording)
     assert {p["name"] for p in checked.parameters} >= {"gain", "friction", "round_trip_delay"}
     assert "friction" in checked._repr_html_()
-    scored = sim2real.validate("pendulum", run_copy / "identify", run.recording)
+    scored = sim2real.validate("pendulum", run_copy / "identify", recorded(tmp_path / "later.mcap", 7))
     assert scored.positions["th"]["rmse"]["identified"] > 0.0
+    assert scored.identified == run.identification.verdict.status
+    with pytest.raises(UsageError, match="which these parameters were identified from"):
+        sim2real.validate("pendulum", run_copy / "identify", run.recording)
+    forced = sim2real.validate("pendulum", run_copy / "identify", run.recording, {"force": True})
+    assert "identified from" in forced.fitted[0]
 
 
 def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):
