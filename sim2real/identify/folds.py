@@ -23,6 +23,10 @@ MOVES = 10.0
 """A joint moves where its positions spread over so many deviations of a measurement."""
 
 
+_INSIDE = 0.01
+"""How far inside of its bounds a parameter begins to be fitted [widths of the bounds]."""
+
+
 @dataclass(frozen=True)
 class Fold:
     """A part of the recordings that is left out.
@@ -111,7 +115,12 @@ def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
 
 
 def leave_out(
-    found: Fit, parts: Sequence[Fold], settle_s: float, choose: bool, free_run_s: float = 0.0
+    found: Fit,
+    parts: Sequence[Fold],
+    settle_s: float,
+    choose: bool,
+    free_run_s: float = 0.0,
+    among: np.ndarray | None = None,
 ) -> list[LeftOut]:
     """Identify without each part, from the estimate of all, and predict it.
 
@@ -121,26 +130,112 @@ def leave_out(
         settle_s: First part of what is predicted, to which its initial state is fitted [s].
         choose: Whether the data that is left chooses the optional terms of the model; else all are kept.
         free_run_s: Longest stretch that is simulated in one go [s]; 0 leaves it out.
+        among: Shape ``(T,)``, bool: the terms to choose from; default: all.
+    """
+    table, stats = found.problem.table, _statistics(found, parts)
+    every = np.ones(len(table.terms), bool)
+    kept = [terms.choose(stats.without(k), table, among).kept if choose else every for k in range(len(parts))]
+    ends = [_refit(found, parts, stats, k, own, choose) for k, own in enumerate(kept)]
+    return _predicted(found, parts, stats, kept, ends, settle_s, free_run_s)
+
+
+def compare_sets(
+    found: Fit, parts: Sequence[Fold], sets: Sequence[np.ndarray], settle_s: float, free_run_s: float
+) -> list[list[LeftOut]]:
+    """Identify without each part with some sets of terms, and predict it: for each set what ``leave_out`` returns.
+
+    The descent of a set begins at the end of the set before, too: with more terms no fit is worse, once it converged.
+
+    Args:
+        found: The estimate of all, with all terms.
+        parts: What is left out, one at a time.
+        sets: Shape ``(T,)`` each, bool: which terms are kept; each holds the one before.
+        settle_s: First part of what is predicted, to which its initial state is fitted [s].
+        free_run_s: Longest stretch that is simulated in one go [s].
+    """
+    stats, rows = _statistics(found, parts), []
+    ends: list[np.ndarray] = []
+    for own in sets:
+        before = ends or [None] * len(parts)
+        ends = [_descend(found, parts, stats, k, own, z) for k, z in enumerate(before)]
+        rows.append(_predicted(found, parts, stats, [own] * len(parts), ends, settle_s, free_run_s))
+    return rows
+
+
+def _statistics(found: Fit, parts: Sequence[Fold]) -> terms.Statistics:
+    return terms.statistics(found.problem, linearise(found.problem, found.z), masks(found.problem, parts))
+
+
+def _refit(
+    found: Fit, parts: Sequence[Fold], stats: terms.Statistics, k: int, kept: np.ndarray, narrow: bool
+) -> np.ndarray:
+    """Return the estimate with some terms without a part ``(P,)``; ``narrow``: by way of that without terms, too."""
+    first = _descend(found, parts, stats, k, np.zeros(len(kept), bool)) if narrow and kept.any() else None
+    return _descend(found, parts, stats, k, kept, first)
+
+
+def _descend(
+    found: Fit,
+    parts: Sequence[Fold],
+    stats: terms.Statistics,
+    k: int,
+    kept: np.ndarray,
+    smaller: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the estimate with some terms without a part ``(P,)``.
+
+    Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
+
+    Args:
+        found: The estimate of all.
+        parts: The parts.
+        stats: Their loss around it.
+        k: Number of the part.
+        kept: Shape ``(T,)``, bool: which terms are part of the model.
+        smaller: Shape ``(P,)``: the estimate with fewer terms without the same part, from which to begin as well.
     """
     problem, table = found.problem, found.problem.table
-    touched = masks(problem, parts)
-    stats = terms.statistics(problem, linearise(problem, found.z), touched)
-    values, kept = [], []
-    for k, mask in enumerate(touched):
-        chosen = terms.choose(stats.without(k), table).kept if choose else np.ones(len(table.terms), bool)
-        own = table.of_terms(chosen)
-        # Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
-        start = table.at_scale(stats.x + stats.step(table, chosen, k, bounded=True))
-        rest = problem.part(problem.train[mask], own)
-        z = refine(problem, start[None], rest, settle=False).z
-        values.append({n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), own).items()})
-        kept.append(tuple(n for n, there in zip(table.terms, chosen, strict=True) if there))
+    starts = [table.at_scale(stats.x + stats.step(table, kept, k, bounded=True))]
+    if smaller is not None:
+        place = {name: i for i, name in enumerate(table.terms)}
+        x = table.scale(smaller)[0]
+        for i, column in enumerate(table.columns):
+            p = column.parameter
+            if p.term:  # where it is absent; a little inside of a bound, at which the slope is 0
+                off, inside = p.to_scale(min(max(p.without, p.low), p.high)), _INSIDE * table.span[i]
+                added = kept[place[p.term]] and abs(x[i] - off) < inside
+                x[i] = np.clip(off, table.low[i] + inside, table.high[i] - inside) if added else x[i]
+        starts.append(table.at_scale(x))
+    own = masks(problem, [parts[k]])[0]
+    rest = problem.part(problem.train[own], table.of_terms(kept))
+    return refine(problem, np.stack(starts), rest, settle=False).z
+
+
+def _predicted(
+    found: Fit,
+    parts: Sequence[Fold],
+    stats: terms.Statistics,
+    kept: Sequence[np.ndarray],
+    ends: Sequence[np.ndarray],
+    settle_s: float,
+    free_run_s: float,
+) -> list[LeftOut]:
+    """Return how far estimates without each part, ``(P,)`` each, are off on that part."""
+    problem, table = found.problem, found.problem.table
+    values = [
+        {
+            n: np.asarray(v, np.float64)
+            for n, v in table.decode(jnp.asarray(z, jnp.float32), table.of_terms(own)).items()
+        }
+        for z, own in zip(ends, kept, strict=True)
+    ]
+    names = [tuple(n for n, there in zip(table.terms, own, strict=True) if there) for own in kept]
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
     own = np.einsum("kpp->kp", stats.information)
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
     ahead = _ahead(found.windows, parts, stacked, settle_s)
     free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
-    return [LeftOut(*row) for row in zip(parts, values, kept, shares, ahead, free, strict=True)]
+    return [LeftOut(*row) for row in zip(parts, values, names, shares, ahead, free, strict=True)]
 
 
 def _ahead(

@@ -7,7 +7,7 @@ algebra; a term that matters little is close to where it is left out, and there 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from sim2real.identify.uncertainty import Linearised
 
 _RESAMPLED = 1000
 """How often recordings are drawn anew."""
+_FAR, _DIVERGED = 3.0, 1e100
+"""A set whose error is so many times that of one of its subsets is never chosen; the mean square of what diverged."""
 _RARE = 0.02
 """A model that is chosen less often is no alternative."""
 
@@ -136,7 +138,7 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
     )
 
 
-def choose(stats: Statistics, table: ParameterTable) -> Selection:
+def choose(stats: Statistics, table: ParameterTable, among: np.ndarray | None = None) -> Selection:
     """Leave out terms one after the other, each time the one that is missed least, and say where to stop.
 
     Chosen is the smallest model that is worse than the best one by no more than one standard error of the difference
@@ -147,9 +149,10 @@ def choose(stats: Statistics, table: ParameterTable) -> Selection:
     Args:
         stats: The loss of at least two parts.
         table: The parameters, those of all terms free.
+        among: Shape ``(T,)``, bool: the terms to choose from, the others are left out; default: all.
     """
     names = table.terms
-    kept = np.ones(len(names), bool)
+    kept = np.ones(len(names), bool) if among is None else among.copy()
     path, scores, order = [kept.copy()], [_left_out(stats, table, kept)], []
     aside: list[tuple[np.ndarray, np.ndarray]] = []
     while kept.any():
@@ -164,10 +167,7 @@ def choose(stats: Statistics, table: ParameterTable) -> Selection:
         path.append(kept.copy())
         scores.append(score)
         order.append(names[least])
-    means = np.array([s.mean() for s in scores])
-    best = scores[int(np.argmin(means))]
-    excess, error = _excess(np.array(scores), best)
-    smallest = int(np.flatnonzero(excess <= error)[-1])
+    smallest, best, excess, error = _smallest(np.array(scores))
     models = np.array([path[smallest], *path[:smallest], *path[smallest + 1 :], *(m for _, m in aside)])
     every = np.array([scores[smallest], *scores[:smallest], *scores[smallest + 1 :], *(s for s, _ in aside)])
     share = votes(every, models.sum(axis=1)) * np.less_equal(*_excess(every, best))
@@ -198,6 +198,50 @@ def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
         within = excess <= error
         chosen[np.lexsort((mean, size, ~within))[0]] += 1.0
     return chosen / chosen.sum()
+
+
+def narrowed(choice: Selection, table: ParameterTable, scores: np.ndarray, errors: np.ndarray) -> Selection:
+    """Return a choice after the chosen set, and smaller ones, were fitted and judged on what was left out.
+
+    The quadratic functions of ``choose`` are those around the widest model's estimate. Where that did not converge, or
+    far from it, they are wrong: on a linear axis they made a set of two terms out of one that was ten times better.
+
+    Args:
+        choice: What they chose.
+        table: The parameters.
+        scores: Shape ``(M, K)``: mean squares on each part, of the sets of ``below``, the smallest first.
+        errors: Shape ``(M, E)``: root mean square errors of each set, of any kinds.
+    """
+    order = slice(None, None, -1)  # the largest first
+    sets, errors = np.array(below(choice, table))[order], np.nan_to_num(errors[order], nan=np.inf)
+    chosen = _smallest(np.nan_to_num(scores[order], nan=_DIVERGED, posinf=_DIVERGED))[0]
+    for smaller in range(chosen + 1, len(sets)):
+        if np.any(errors[chosen] > _FAR * errors[smaller]):
+            chosen = smaller
+    if not chosen:
+        return choice
+    return replace(choice, kept=sets[chosen], near=sets[chosen][None], weight=np.ones(1))
+
+
+def below(choice: Selection, table: ParameterTable) -> list[np.ndarray]:
+    """Return the chosen set and the smaller ones to which it was reduced, ``(T,)`` each, the smallest first."""
+    kept, found = choice.kept.copy(), [choice.kept.copy()]
+    for name in choice.order:
+        if kept[table.terms.index(name)]:
+            kept[table.terms.index(name)] = False
+            found.append(kept.copy())
+    return found[::-1]
+
+
+def _smallest(scores: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the smallest model within a standard error of the best, the best's scores ``(K,)``, excesses and errors.
+
+    Args:
+        scores: Shape ``(M, K)``: mean squares on each part, of the largest model first.
+    """
+    best = scores[int(np.argmin(scores.mean(axis=1)))]
+    excess, error = _excess(scores, best)
+    return int(np.flatnonzero(excess <= error)[-1]), best, excess, error
 
 
 def _excess(scores: np.ndarray, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,6 +35,7 @@ from sim2real.identify.verdict import Position, Score, judge, scores
 from sim2real.log.schema import unit_of
 from sim2real.stages import left_out
 from sim2real.stages.console import note, table
+from sim2real.stages.free_run import Lack
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,12 @@ def document(
 
 
 def judged(
-    document: Identification, found: Findings, units: Mapping[str, str], max_delay_s: float, outside: Sequence[str]
+    document: Identification,
+    found: Findings,
+    units: Mapping[str, str],
+    max_delay_s: float,
+    outside: Sequence[str],
+    lack: Lack,
 ) -> Identification:
     """Return the document with its verdict, whose ``next`` are the flags with which to identify again.
 
@@ -146,6 +152,7 @@ def judged(
         units: Field -> unit.
         max_delay_s: For which delays the model is made [s].
         outside: Where held-out data goes beyond what was fitted: sentences.
+        lack: What free runs show.
     """
     judged_on = positions(found.fit.problem, units)
     rows = scores(document.prediction, judged_on)
@@ -164,7 +171,9 @@ def judged(
     )
     horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
     worth = left_out.sentences(document.left_out, judged_on, horizon_s)
-    told = Judgement(verdict.status, (*worth, *verdict.reasons), verdict.flags)
+    status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
+    flags = " ".join(f for f in (verdict.flags, lack.flags) if f)
+    told = Judgement(status, (*worth, *verdict.reasons, *lack.reasons), flags)
     return replace(document, verdict=told, held_out=tuple(scored(rows)))
 
 

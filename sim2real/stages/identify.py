@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identify import ensemble, prediction
 from sim2real.identify.aggregate import aggregate
 from sim2real.identify.each import identify_each
-from sim2real.identify.fit import Fit, Told, as_numbers, fit, refit
+from sim2real.identify.fit import Fit, Told, as_numbers, refit
 from sim2real.identify.links import links, measured
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.noise import noises
@@ -36,8 +36,9 @@ from sim2real.stages import advice, identified, left_out
 from sim2real.stages.arguments import AnyRecording, config_of, recordings_of, robot_first
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.console import note, progress
-from sim2real.stages.cutting import reach, spans, split_of
+from sim2real.stages.cutting import spans
 from sim2real.stages.fitted_logs import require_apart
+from sim2real.stages.free_run import Lack, fitted_to, free_runs, lacking, with_one_more
 from sim2real.stages.interruption import patiently
 from sim2real.stages.partial import Best, left_behind
 from sim2real.stages.pipeline import Pipeline
@@ -96,7 +97,7 @@ def identify(
     best.fitted(found.z, found.loss)
     with progress(None, "identify: left-out parts") as bar:
         judged = config.folds and found.converged  # errors of other fits promise nothing of this one
-        without = patiently(lambda: left_out.examined(every, config, names)) if judged else ()
+        without = patiently(lambda: left_out.examined(every, config, names, choice)) if judged else ()
         bar.set_description_str("identify: intervals")
         findings = patiently(lambda: identified.Findings.of(found, without))
         found = findings.fit
@@ -111,9 +112,12 @@ def identify(
         each = patiently(lambda: _each(found)) if config.each and len(fitted) > 1 else ()
         own = patiently(lambda: links(found.problem, found.z)) if config.links else ()
         document = replace(document, left_out=without, terms=terms, links=own)
+        bar.set_description_str("identify: free runs")
+        base = in_world(pipeline.load(), config.world)
+        lack = patiently(lambda: _lack(document, base, episodes, windows, config, found))
     outside = beyond(model, episodes, windows, config.settle_s + config.horizon_s)
     return replace(
-        identified.judged(document, findings, units, config.max_delay_s, outside),
+        identified.judged(document, findings, units, config.max_delay_s, outside, lack),
         logs=tuple(Source(log.path.name, sha256(log.path)) for log in logs),
         units=units,
         world=config.world,
@@ -143,10 +147,11 @@ def _with_terms(
     """Return the fit with all optional terms, that with those that are needed, and how they were chosen."""
     best.restart(table.for_recordings(len(episodes)))
     with _told("identify", best) as told:
-        found = patiently(lambda: _fit(model, episodes, len(names), windows, config, table, told, _begins))
+        found = patiently(lambda: fitted_to(model, episodes, len(names), windows, config, table, told, _begins))
     if config.terms != "auto":
         return found, found, None
-    choice = left_out.chosen(found, config, names)
+    with progress(None, "identify: sets of terms"):
+        choice = patiently(lambda: left_out.chosen(found, config, names))
     terms = choice.names(found.problem.table)
     # What a flag holds stays held, whatever term it belongs to; what is left out is what it is without its term.
     fewer = table.with_terms(terms).with_fixed(config.fix)
@@ -154,7 +159,7 @@ def _with_terms(
     again = replace(config, generations=0)
     best.restart(fewer.for_recordings(len(episodes)))
     with _told(f"identify with {', '.join(terms) or 'no term'}", best) as told:
-        narrow = patiently(lambda: _fit(model, episodes, len(names), windows, again, fewer, told))
+        narrow = patiently(lambda: fitted_to(model, episodes, len(names), windows, again, fewer, told))
     return found, narrow, choice
 
 
@@ -246,7 +251,7 @@ def _predicted(
     models = {"identified": found.values, **_baselines(found), "nominal": _nominal(model)}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    runs, free = _free_runs(found, episodes, fitted, config, models)
+    runs, free = free_runs(found, episodes, fitted, config, models)
     return replace(
         document,
         samples=samples,
@@ -260,18 +265,28 @@ def _predicted(
     )
 
 
-def _fit(
-    model: IdentifiableModel,
+def _lack(
+    document: Identification,
+    robot: RecordedRobot,
     episodes: Sequence[Episode],
-    fitted: int,
     windows: Sequence[Span],
     config: IdentifyConfig,
-    table: ParameterTable,
-    told: Told | None = None,
-    begins: Callable[[Problem], None] | None = None,
-) -> Fit:
-    longer = [s for s in spans(episodes, fitted, config, config.long_s) if s.fitted] if config.long_s else []
-    return fit(model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, told, begins)
+    found: Fit,
+) -> Lack:
+    """Return what free runs show, after another fit where a term that the robot offers may mend them."""
+    wider = with_one_more(robot, document.terms, config)
+    fitted = len({s.recording for s in windows if s.fitted})
+
+    def attempt() -> list[FreeRun]:
+        assert wider is not None
+        model, own = wider[0].identifiable(config.max_delay_s), wider[1]
+        begin = {n: v for n, v in found.values.items() if not isinstance(v, list)}
+        table = _table(model, own).with_begin(begin)
+        another = fitted_to(model, episodes, fitted, windows, own, table)
+        return free_runs(another, episodes, fitted, own, {"identified": another.values})[0]
+
+    judged = found.converged and wider is not None
+    return lacking(document, identified.positions(found.problem, robot.units), attempt if judged else None)
 
 
 def _begins(problem: Problem) -> None:
@@ -293,22 +308,6 @@ def _baselines(found: Fit) -> dict[str, Any]:
 def _nominal(model: IdentifiableModel) -> dict[str, float]:
     """Return the data sheet's values, without delays."""
     return {p.name: p.nominal for p in model.parameters}
-
-
-def _free_runs(
-    found: Fit, episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, models: Mapping[str, Any]
-) -> tuple[list[FreeRun], dict[str, np.ndarray]]:
-    """Simulate what is held out of each log in one go; return its errors and its columns."""
-    splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
-    ends = [reach(episode, config)[1] for episode in episodes]
-    least_s = config.settle_s + config.horizon_s
-    held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
-    if not held_out or not config.free_run_s:
-        return [], {}
-    length_s = min(config.free_run_s, min(ends[s.recording] - s.begin_s for s in held_out))
-    problem = found.windows.recut(held_out, length_s)
-    columns = prediction.samples(problem, models, config.settle_s)
-    return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns
 
 
 def _each(found: Fit) -> tuple[Quantity, ...]:

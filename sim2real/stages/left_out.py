@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import stdtrit
@@ -12,8 +12,9 @@ from sim2real.artifacts.identification import Left
 from sim2real.errors import UsageError
 from sim2real.identify import terms
 from sim2real.identify.fit import Fit
-from sim2real.identify.folds import folds_of, leave_out, masks
+from sim2real.identify.folds import compare_sets, folds_of, leave_out, masks
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.prediction import labels
 from sim2real.identify.uncertainty import Uncertainty, between_parts, linearise
 from sim2real.identify.verdict import Position
 from sim2real.robots.base import RecordedRobot
@@ -86,26 +87,45 @@ def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> terms.Se
         config: How many parts.
         names: Of the recordings; each is left out by itself.
     """
-    problem = found.problem
-    parts = masks(problem, folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE))
-    return terms.choose(terms.statistics(problem, linearise(problem, found.z), parts), problem.table)
+    problem, table = found.problem, found.problem.table
+    parts = folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE)
+    choice = terms.choose(terms.statistics(problem, linearise(problem, found.z), masks(problem, parts)), table)
+    sets = terms.below(choice, table)
+    if len(sets) == 1:
+        return choice
+    rows = compare_sets(found, parts, sets, config.settle_s, config.free_run_s)
+    sigma = dict(zip(labels(problem), (s for _, s, _ in problem.fields), strict=True))
+    scores = np.array([[_mean_square(row.ahead, sigma) for row in own] for own in rows])
+    free = np.array([[_mean_square(row.free, sigma) for row in own] for own in rows])
+    errors = np.sqrt(np.stack([scores.mean(axis=1), free.mean(axis=1)], axis=1))
+    return terms.narrowed(choice, table, scores, errors)
 
 
-def examined(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> tuple[Left, ...]:
+def _mean_square(errors: Mapping[str, float | None], sigma: Mapping[str, float]) -> float:
+    """Return the mean square of errors over the deviations of a measurement; 0 where nothing moved."""
+    found = [(e / sigma[name]) ** 2 for name, e in errors.items() if e is not None]
+    return float(np.mean(found)) if found else 0.0
+
+
+def examined(
+    found: Fit, config: IdentifyConfig, names: Sequence[str], choice: terms.Selection | None = None
+) -> tuple[Left, ...]:
     """Return what is identified without each part of the recordings, and how far it is off there.
 
     Args:
         found: The fit; with ``--terms auto`` the one with all optional terms, as each part's absence chooses anew.
         config: How.
         names: Of the recordings; each is left out by itself.
+        choice: The terms of the model, of which each part's absence chooses some; None: nothing is chosen.
     """
     segments = len(found.problem.train)
     if segments < _LEAST:
         note(f"{segments} segments are too few to leave parts out of the fit")
         return ()
-    least = _LEAST_TO_CHOOSE if config.terms == "auto" else 2
+    least = 2 if choice is None else _LEAST_TO_CHOOSE
     parts = folds_of(found.problem, min(config.folds, segments // 2), names, least)
-    rows = leave_out(found, parts, config.settle_s, config.terms == "auto", config.free_run_s)
+    among = None if choice is None else choice.kept
+    rows = leave_out(found, parts, config.settle_s, choice is not None, config.free_run_s, among)
     return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
 
 

@@ -36,6 +36,7 @@ _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
     "hit a bound": ("doubt", "Hit a bound: an estimate lies where the search was not allowed to go further"),
     "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
+    "lacks a term": ("doubt", "Lacks a term: free runs are far off, and one more term mends them"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
 _STRONG = 0.9

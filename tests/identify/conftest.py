@@ -17,6 +17,8 @@ from sim2real.stages.excitation import excitation
 from sim2real.stages.pipeline import load_pipeline
 
 SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
+LEAD_S = 0.00025
+"""Half a time step of the plant: MuJoCo moves a joint as if forces had acted that earlier, see ``DrivenWorld``."""
 DURATION_S, RATE_HZ, SEGMENT_S = 20.0, 50.0, 1.3
 
 
@@ -77,7 +79,7 @@ def fitted():
     values = {n: float(v) for n, v in problem.table.decode(jnp.asarray(found.z)).items()}
     return SimpleNamespace(
         episode=episode,
-        truth={**truth, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": ACTUATOR_DELAY_S},
+        truth={**truth, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": ACTUATOR_DELAY_S - LEAD_S},
         problem=problem,
         found=found,
         values=values,

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.terms import Statistics, choose, votes
+from sim2real.identify.terms import Selection, Statistics, below, choose, narrowed, votes
 
 PARTS, ROWS, NOISE = 6, 200, 0.1
 
@@ -154,3 +154,40 @@ def test_a_bounded_step_is_that_of_a_solver_with_bounds():
     np.testing.assert_allclose(step, best, atol=1e-9)
     assert step[0] == pytest.approx(-0.3)
     assert whole.step(table, np.ones(0, bool))[0] < -0.3
+
+
+def three_terms():
+    """All three terms chosen, with the order in which they would go: idle, once, real."""
+    one = np.ones(3, bool)
+    return Selection(one, ("idle", "once", "real"), np.zeros(4), np.zeros(4), one[None], np.ones(1))
+
+
+def test_the_sets_below_a_choice_go_down_to_none():
+    assert [m.tolist() for m in below(three_terms(), TABLE)] == [
+        [False, False, False], [True, False, False], [True, False, True], [True, True, True],
+    ]  # fmt: skip
+    none = replace(three_terms(), kept=np.zeros(3, bool))
+    assert [m.tolist() for m in below(none, TABLE)] == [[False, False, False]]
+
+
+@pytest.mark.parametrize(
+    ("scores", "errors", "kept"),
+    [
+        # Mean squares of each set on three parts, the smallest set first; errors up to the horizon and in one go.
+        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), None, 3),
+        (([9, 9, 9], [1.1, 0.9, 1.1], [2, 0.4, 1], [1, 1, 1]), None, 1),  # within a standard error of the best
+        (([9, 9, 9], [1, 1, 1], [100, 100, 100], [400, 1, 400]), None, 1),  # refits that ended anywhere
+        (([9, 9, 9], [1, 1, 1], [np.nan, 1, 1], [np.inf, 1, 1]), None, 1),  # refits that diverged
+        # Ahead the largest is best; in one go it is far off, and a smaller one is not.
+        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 2), (1.4, 25), (1, 25)), 1),
+        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 9), (1.4, 25), (1, 25)), 3),
+        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 2), (1.4, 1), (1, np.inf)), 2),
+    ],
+)
+def test_a_choice_is_narrowed_to_what_refits_on_other_parts_bear_out(scores, errors, kept):
+    scores = np.array(scores, float)
+    errors = np.sqrt(scores.mean(axis=1))[:, None] if errors is None else np.array(errors, float)
+    found = narrowed(three_terms(), TABLE, scores, errors)
+    assert found.kept.sum() == kept
+    np.testing.assert_array_equal(found.near[0], found.kept)
+    assert found.weight.sum() == pytest.approx(1.0)

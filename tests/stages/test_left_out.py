@@ -146,7 +146,7 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         tables.append((config.generations, table))
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
-    monkeypatch.setattr(identify, "_fit", fit)
+    monkeypatch.setattr(identify, "fitted_to", fit)
     monkeypatch.setattr(identify.left_out, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
     identify._with_terms(None, [], [], config, table, ["log"], Best())
