@@ -48,7 +48,7 @@ def asynchronous_log(rng):
 
 @pytest.fixture(scope="module", params=["free", "rest"])
 def fitted(request, repetitions):
-    """Problem, and at each noise's estimate ``(N, P)`` the linearisation; initial states unknown, or known and at rest."""
+    """Problem, and at each noise's estimate ``(N, P)`` the linearisation: starts unknown, or known and at rest."""
     model = load_pipeline("pendulum").load().identifiable(MAX_DELAY_S)
     episode = asynchronous_log(np.random.default_rng(1))
     spans = [Span(0, 1.0 + i * SEGMENT_S) for i in range(SEGMENTS)]
