@@ -67,8 +67,12 @@ import os, signal, sys, time
 from pathlib import Path
 from sim2real.artifacts.run_folder import open_stage
 with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
-    if sys.argv[2] == "forked" and os.fork() == 0:
-        os.execvp("sleep", ["sleep", "30"])  # what a stage has started may outlive it
+    if sys.argv[2] == "forked":
+        read, write = os.pipe()
+        if os.fork() == 0:
+            os.execvp("sleep", ["sleep", "30"])  # what a stage has started may outlive it
+        os.close(write)
+        os.read(read, 1)  # until the child is another program: before that, it holds all that its parent has open
     print(stage.folder, flush=True)
     time.sleep(60)
 """
