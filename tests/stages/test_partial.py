@@ -37,7 +37,7 @@ def interrupted(pipeline, root, monkeypatch, ending, told=True):
                 tell("search", 0.25, loss, own.encode(values))
         raise ending
 
-    monkeypatch.setattr(identify, "_fit", fit)
+    monkeypatch.setattr(identify, "fitted_to", fit)
     config = replace(pipeline.identify, log=(str(LOG),))
     with pytest.raises(type(ending)):
         identify.run(pipeline, config, root, None)
