@@ -154,8 +154,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
         total += abs(error) <= 1.96 * uncertainty.sum_of(spread, delays)
         off.append(error)
     shares = {n: covered[names.index(n)] for n in GROUPS} | {"round trip": total}
-    # Where friction sticks, the residuals bend at each stop. With unknown initial states the gain scatters by 1.16 times
-    # its standard error, which holds the truth in 90 % in place of 95 %; all others are as they should be.
+    # Where friction sticks, the residuals bend at each stop. With unknown initial states the gain scatters by 1.16
+    # times its standard error, and its interval holds the truth in 90 % in place of 95 %.
     least = 352 if problem.config.initial_state == "free" else 368
     assert all(least <= n <= 392 for n in shares.values()), {n: int(v) for n, v in shares.items()}
     # Each delay by itself may be anywhere that a shift of time can reach: its interval holds the truth more often.
