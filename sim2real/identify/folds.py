@@ -157,7 +157,7 @@ def compare_sets(
     ends: list[np.ndarray] = []
     for own in sets:
         before = ends or [None] * len(parts)
-        ends = [_descend(found, parts, stats, k, own, z) for k, z in enumerate(before)]
+        ends = [_descend(found, parts, stats, k, own, z, coarse=True) for k, z in enumerate(before)]
         rows.append(_predicted(found, parts, stats, [own] * len(parts), ends, settle_s, free_run_s))
     return rows
 
@@ -170,7 +170,8 @@ def _refit(
     found: Fit, parts: Sequence[Fold], stats: terms.Statistics, k: int, kept: np.ndarray, narrow: bool
 ) -> np.ndarray:
     """Return the estimate with some terms without a part ``(P,)``; ``narrow``: by way of that without terms, too."""
-    first = _descend(found, parts, stats, k, np.zeros(len(kept), bool)) if narrow and kept.any() else None
+    none = np.zeros(len(kept), bool)
+    first = _descend(found, parts, stats, k, none, coarse=True) if narrow and kept.any() else None
     return _descend(found, parts, stats, k, kept, first)
 
 
@@ -181,6 +182,7 @@ def _descend(
     k: int,
     kept: np.ndarray,
     smaller: np.ndarray | None = None,
+    coarse: bool = False,
 ) -> np.ndarray:
     """Return the estimate with some terms without a part ``(P,)``.
 
@@ -193,6 +195,7 @@ def _descend(
         k: Number of the part.
         kept: Shape ``(T,)``, bool: which terms are part of the model.
         smaller: Shape ``(P,)``: the estimate with fewer terms without the same part, from which to begin as well.
+        coarse: Whether the descent ends where it gains little: sets are compared by percents.
     """
     problem, table = found.problem, found.problem.table
     starts = [table.at_scale(stats.x + stats.step(table, kept, k, bounded=True))]
@@ -208,7 +211,7 @@ def _descend(
         starts.append(table.at_scale(x))
     own = masks(problem, [parts[k]])[0]
     rest = problem.part(problem.train[own], table.of_terms(kept))
-    return refine(problem, np.stack(starts), rest, settle=False).z
+    return refine(problem, np.stack(starts), rest, coarse=coarse, settle=False).z
 
 
 def _predicted(
