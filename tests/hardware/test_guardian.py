@@ -267,10 +267,10 @@ def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
         bus.read_state()
         time.sleep(0.005)
     asked = bus.counters.transactions + bus.counters.retries
-    bus.close()  # which asks twice more, or so
+    bus.close()  # beside those that are counted, the opening looks for a second servo of the id, and this asks a few
     robot.stop()
     kinds = robot.truth().rows["kind"]
-    assert 50 < np.count_nonzero(np.isin(kinds, (Kind.SAMPLE, Kind.REPLY))) <= asked + 4
+    assert 50 < np.count_nonzero(np.isin(kinds, (Kind.SAMPLE, Kind.REPLY))) <= asked + 5
 
 
 def test_it_needs_little_and_so_starts_soon():
