@@ -131,7 +131,7 @@ def lacking(
     said = f"in free runs of {seconds:.3g} s on held-out data {worst.name} {how}"
     if share <= _FAR or attempt is None:
         return Lack((said,))
-    again = [number(r.rmse) for r in attempt() if _is(r, worst)]
+    again = [number(r.rmse) for r in attempt() if _is(r, worst) and r.model == "identified"]
     left = float(np.mean(again)) if again else math.inf
     if not left < _MENDS * error:
         return Lack((said, f"the term {TERM} does not mend that"))

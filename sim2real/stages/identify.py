@@ -280,9 +280,8 @@ def _lack(
     def attempt() -> list[FreeRun]:
         assert wider is not None
         model, own = wider[0].identifiable(config.max_delay_s), wider[1]
-        begin = {n: v for n, v in found.values.items() if not isinstance(v, list)}
-        table = _table(model, own).with_begin(begin)
-        another = fitted_to(model, episodes, fitted, windows, own, table)
+        # From the beginning, as the command would: a fit that lacks the term has bent its other parameters.
+        another = fitted_to(model, episodes, fitted, windows, own, _table(model, own))
         return free_runs(another, episodes, fitted, own, {"identified": another.values})[0]
 
     judged = found.converged and wider is not None

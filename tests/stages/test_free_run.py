@@ -45,7 +45,7 @@ def fails():
     ],
 )  # fmt: skip
 def test_the_worst_free_run_is_named_and_mended_where_a_term_does(runs, again, said, flags):
-    attempt = (lambda: [run("x[0]", again)]) if isinstance(again, float) else again
+    attempt = (lambda: [run("x[0]", again), run("x[0]", 0.2, model="hold")]) if isinstance(again, float) else again
     found = lacking(document(*runs), [AXIS, ARM], attempt)
     assert found.flags == flags
     assert len(found.reasons) == len(said)
@@ -53,5 +53,5 @@ def test_the_worst_free_run_is_named_and_mended_where_a_term_does(runs, again, s
 
 
 def test_terms_that_were_identified_stay():
-    found = lacking(document(run("x[0]", 0.05), terms=("load",)), [AXIS], lambda: [run("x[0]", 0.001)])
+    found = lacking(document(run("x[0]", 0.05), terms=("load",)), [AXIS], lambda: [run("x[0]", 0.001), run("x[0]", 0.2, model="hold")])
     assert found.flags == "--terms load,direction"
