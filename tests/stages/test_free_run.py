@@ -53,5 +53,9 @@ def test_the_worst_free_run_is_named_and_mended_where_a_term_does(runs, again, s
 
 
 def test_terms_that_were_identified_stay():
-    found = lacking(document(run("x[0]", 0.05), terms=("load",)), [AXIS], lambda: [run("x[0]", 0.001), run("x[0]", 0.2, model="hold")])
+    found = lacking(
+        document(run("x[0]", 0.05), terms=("load",)),
+        [AXIS],
+        lambda: [run("x[0]", 0.001), run("x[0]", 0.2, model="hold")],
+    )
     assert found.flags == "--terms load,direction"
