@@ -113,7 +113,7 @@ class OutsideEvaluator:
     def _few(self, data: Data) -> Data:
         """Return the data with the segments in which the channels move most, in turn, and one of each recording.
 
-        A search needs no more to come near; to simulate all of an arm's 23 segments took it 2.3 times as long.
+        A search needs no more to come near; to simulate all of an arm's 23 segments took it 2.6 times as long.
         """
         live = np.flatnonzero(np.asarray(data.weight) > 0.0)
         segments = np.asarray(data.fitted)[live]

@@ -160,8 +160,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     shares = {n: covered[names.index(n)] for n in GROUPS} | {"round trip": total}
     # As often as 95 % of so many draws do, within 2.76 standard deviations: of 400, 368 to 392.
     usual, spread = 0.95 * len(off), 2.76 * np.sqrt(0.0475 * len(off))
-    # Where friction sticks, the residuals bend at each stop. With unknown initial states the gain scatters by 1.16 of
-    # its standard errors, and its interval holds the truth in 90 % in place of 95 %; all others are as they should be.
+    # With unknown initial states the gain varies 1.16 times as much as its standard errors say, and its interval holds
+    # the truth in 90 % of cases in place of 95 %, since the pendulum sticks at standstill. The cause is not proven.
     least = usual - spread - (0.04 * len(off) if problem.config.initial_state == "free" else 0.0)
     assert all(least <= n <= usual + spread for n in shares.values()), {n: int(v) for n, v in shares.items()}
     # Each delay by itself may be anywhere that a shift of time can reach: its interval holds the truth more often.
