@@ -251,15 +251,16 @@ def _info(command: str, arguments: list[str]) -> None:
 
 def _files(command: str, arguments: list[str]) -> None:
     """``sim2real import FILE...``, ``validate PARAMETERS --log NEW`` and ``new NAME ROBOT.xml``."""
-    from sim2real.stages import config, flags, validate_config
+    from sim2real.stages import flags
+    from sim2real.stages.config import ImportConfig, NewConfig
+    from sim2real.stages.validate_config import ValidateConfig
 
     kind, stage, text, *examples = {
-        "import": ("Import", "importing", "", "import data.npz --mjcf robot.xml", "info LOG"),
-        "validate": ("Validate", "validate", _WORSE, "validate runs/NAME/TIME/identify/parameters.json --log new.mcap"),
-        "new": ("New", "new", "", "new go2 go2.xml --log run.csv", "identify go2"),
+        "import": (ImportConfig, "importing", "", "import data.npz --mjcf robot.xml", "info LOG"),
+        "validate": (ValidateConfig, "validate", _WORSE, "validate runs/NAME/TIME/identify --log new.mcap"),
+        "new": (NewConfig, "new", "", "new go2 go2.xml --log run.csv", "identify go2"),
     }[command]
-    where = validate_config if command == "validate" else config
-    own, epilog = getattr(where, f"{kind}Config")(), _epilog(*(f"sim2real {example}" for example in examples))
+    own, epilog = kind(), _epilog(*(f"sim2real {example}" for example in examples))
     asked = flags.parse(own, arguments, f"sim2real {command}", _summary(own) + text, epilog)
     compilation_cache.enable()
     if importlib.import_module(f"sim2real.stages.{stage}").run(asked) is False:  # imports JAX
