@@ -54,7 +54,8 @@ def call(site, tmp_path_factory):
 
     def run(*arguments):
         command = [sys.executable, *map(str, arguments)]
-        env = {**os.environ, "PYTHONPATH": str(site)}
+        ours = {"PYTEST_ADDOPTS"}  # options of this suite, which the package's own tests do not know
+        env = {name: value for name, value in os.environ.items() if name not in ours} | {"PYTHONPATH": str(site)}
         done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
         return done.stdout
