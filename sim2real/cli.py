@@ -46,7 +46,6 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   info      about the installation, a pipeline, a log or a run
   check     judge what a recording, or a planned one, can tell about the parameters
   validate  score what was identified on a later log
-  design    the commands of the next recording, for what is still uncertain
   latency   where the milliseconds go between motion and motion: host, bus and device
   import    turn files of other recorders into logs, and say what is what in them
   new       write the files of a pipeline for a robot of which there is a model
@@ -334,7 +333,6 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "report": _view,
     "info": _info,
     "latency": _stage,
-    "design": _stage,
     "check": _check,
     **dict.fromkeys(("import", "validate", "new"), _files),
     **dict.fromkeys(("log", "export"), _act),

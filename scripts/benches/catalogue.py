@@ -60,17 +60,6 @@ BENCHES = {
             "pipelines/so101",
         ),
     ),
-    "excitation": Bench(
-        "excitation",
-        "intervals after a designed excitation against those after the usual one",
-        (
-            *_GRAPH,
-            "sim2real/identify",
-            *(f"sim2real/stages/{part}.py" for part in ("design", "motions", "planned", "planner")),
-            *(f"pipelines/{robot}" for robot in ("arm", "so101")),
-            *(f"scripts/benches/{part}.py" for part in ("hidden_robots", "simulated_recordings")),
-        ),
-    ),
     "faults": Bench(
         "faults",
         "what goes wrong while a policy runs: how soon the motor is safe, the log, and what is said",

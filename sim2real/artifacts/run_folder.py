@@ -32,7 +32,7 @@ from sim2real.artifacts.manifest import (
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
-TESTS = ("latency", "explain", "design")
+TESTS = ("latency", "explain")
 """What has a folder in a run as stages have, but no other stage takes up."""
 DRY = "dry run"
 """Status of a stage that ended well but moved nothing: later stages do not use it."""

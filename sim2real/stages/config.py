@@ -25,10 +25,8 @@ class RecordConfig:
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     duration_s: float = 40.0
     """Length of the recording [s]."""
-    excitation: Literal["multisine", "chirp", "steps", "designed"] = "multisine"
-    """Command signal; 'designed' plays what `sim2real design` made for what is still uncertain."""
-    design: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder of the design that is played; default: the newest of the pipeline."""
+    excitation: Literal["multisine", "chirp", "steps"] = "multisine"
+    """Command signal."""
     amplitude: float = 1.8
     """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
     low_hz: float = 0.2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim2real.artifacts.design import Design
 from sim2real.errors import UsageError
 from sim2real.stages.config import RecordConfig
 
@@ -15,7 +14,7 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
     ``multisine`` is a sum of twelve sines with random phases between ``low_hz`` and ``high_hz``; ``chirp`` sweeps
     between these in 10 s, and back; ``steps`` has random levels, each held for half a period of a random frequency
     between them. All grow from zero during the first 0.5 s and stay within the amplitude. Several commands are
-    independent. ``designed`` is as long as its design, and within the gate's limits that it was made for.
+    independent.
 
     Args:
         config: Kind of excitation, duration, amplitude, frequencies and seed.
@@ -23,11 +22,8 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
         commands: Number of commands.
 
     Raises:
-        UsageError: When the highest frequency is above half the rate of steps, or a design is missing.
-        Sim2RealError: When the design cannot be read, or is of another robot.
+        UsageError: When the highest frequency is above half the rate of steps.
     """
-    if config.excitation == "designed":
-        return _designed(config, rate_hz, commands)
     if config.high_hz > rate_hz / 2:
         raise UsageError(
             f"high_hz = {config.high_hz} Hz is above half the command rate of {rate_hz:g} Hz",
@@ -38,20 +34,6 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
     make = {"multisine": _multisine, "chirp": _chirp, "steps": _steps}[config.excitation]
     signals = np.stack([make(t, config.low_hz, config.high_hz, rng) for _ in range(commands)], axis=1)
     played = config.amplitude * np.clip(signals, -1.0, 1.0) * np.minimum(1.0, t / 0.5)[:, None]
-    return played[:, 0] if commands == 1 else played
-
-
-def _designed(config: RecordConfig, rate_hz: float, commands: int) -> np.ndarray:
-    if config.design is None:
-        raise UsageError("a designed excitation needs its design", hint="--design DIR: what `sim2real design` wrote")
-    found = Design.load(config.design)
-    if (found.rate_hz, found.commands.shape[1]) != (rate_hz, commands):
-        raise UsageError(
-            f"{config.design} has {found.commands.shape[1]} commands at {found.rate_hz:g} Hz, this robot takes "
-            f"{commands} at {rate_hz:g} Hz",
-            hint="design for this robot: `sim2real design PIPELINE`",
-        )
-    played = found.commands - found.rest
     return played[:, 0] if commands == 1 else played
 
 

@@ -16,7 +16,6 @@ from weakref import WeakKeyDictionary
 
 from sim2real.errors import UsageError
 from sim2real.stages.config import DeployConfig, IdentifyConfig, LatencyConfig, RecordConfig, TrainConfig
-from sim2real.stages.design_config import DesignConfig
 
 if TYPE_CHECKING:
     from sim2real.log.mapping import ImportMapping
@@ -66,11 +65,6 @@ class Pipeline:
     def latency(self) -> LatencyConfig:
         """Defaults of the test of latency."""
         return LatencyConfig.of(self.record, self.identify)
-
-    @property
-    def design(self) -> DesignConfig:
-        """Defaults of the design of an excitation."""
-        return DesignConfig(duration_s=self.record.duration_s, record=self.record)
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
-from sim2real.artifacts.run_folder import StageFolder, newest, open_stage
+from sim2real.artifacts.run_folder import StageFolder, open_stage
 from sim2real.robots.base import Robot
 from sim2real.stages.arguments import AnyPath, config_of, folder_of
 from sim2real.stages.config import RecordConfig
@@ -40,12 +39,11 @@ def record(
     config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
     signal = excitation(config, robot.rate_hz, len(robot.action))
-    seconds = config.duration_s if config.excitation != "designed" else len(signal) / robot.rate_hz
-    note(f"recording {seconds:g} s of {config.excitation} on {config.port}")
+    note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
     log, truth = folder / LOG, folder / TRUTH
     with opened(robot, config, truth) as session:
         nodes = robot.recording_nodes(session, signal)
-        run_episode(pipeline, robot, session, nodes, {}, log, seconds, config, "record")
+        run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
     return Recording.load(log, truth)
 
 
@@ -59,11 +57,8 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)
-    if config.excitation == "designed" and config.design is None:
-        config = replace(config, design=newest(root, pipeline.name, "design", run_dir).folder)
     excitation(config, robot.rate_hz, len(robot.action))  # what cannot be played is refused before a folder is made
-    inputs = {} if config.design is None else {"design": config.design}
-    with open_stage(root, pipeline.name, "record", config, inputs, run_dir, config.dry_run) as stage:
+    with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
@@ -77,7 +72,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
             show_withheld([summary])
         stage.summary(
             {
-                "seconds": recording.episode.duration_s if config.excitation == "designed" else config.duration_s,
+                "seconds": config.duration_s,
                 "lost replies": summary["lost_replies"],
                 "late replies": summary["late_replies"],
                 "odd measurements": len(summary["suspects"]),

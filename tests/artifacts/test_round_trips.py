@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.design import Design
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Identification, Matrix
@@ -33,7 +32,7 @@ from sim2real.log.toml_text import toml_value
 from sim2real.robots.mjcf_parameters import ParameterPattern
 from sim2real.robots.mjcf_robot import RobotConfig
 
-FILES = (Design, Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
+FILES = (Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
 ODD = [
     "\U0001f600",
     "\x7f",

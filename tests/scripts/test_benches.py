@@ -123,20 +123,6 @@ def test_drift(run):
 
 
 @pytest.mark.full
-@pytest.mark.slow
-def test_excitation(run):
-    report = run("excitation")
-    (robot,) = report["robots"]
-    rows = {r["name"].removeprefix("excitation/pendulum/seed0/"): r["value"] for r in report["rows"]}
-    assert rows["median_interval"] == np.median(list(robot["ratios"].values())) > 0.0
-    assert set(robot["ratios"]) == {"gain", "gravity", "damping", "friction", "round_trip_delay"}
-    assert 0.0 < rows["highest_speed"] < 1.0
-    assert rows["cut_by_gate"] == 0
-    off = robot["designed"]["off"]
-    assert max(off.values()) < 4.0, "intervals hold the truth, or nearly"
-
-
-@pytest.mark.full
 def test_interop(run):
     pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
     report = run("interop")
