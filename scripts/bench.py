@@ -76,9 +76,9 @@ def told(flags: Mapping[str, Any]) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one bench."""
     module, options = parse(arguments)
-    from sim2real.artifacts.manifest import plain, versions
+    from sim2real.artifacts.run.manifest import plain, versions
     from sim2real.errors import Sim2RealError
-    from sim2real.stages.console import table
+    from sim2real.stages.terminal.console import table
 
     flags = {n: v for n, v in vars(options).items() if n not in ("bench", "quick", "json", "commit")}
     about = {"bench": options.bench, "quick": options.quick, "flags": flags}

@@ -10,12 +10,17 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from sim2real import moved
+
 if TYPE_CHECKING:
     from sim2real.artifacts.bundle import Bundle as Bundle
     from sim2real.artifacts.deployment import Deployment as Deployment
     from sim2real.artifacts.identification import Identification as Identification
     from sim2real.artifacts.recording import Recording as Recording
     from sim2real.artifacts.timing import Timing as Timing
+    from sim2real.commands.export_model import export as export
+    from sim2real.commands.functions import report as report
+    from sim2real.commands.functions import run as run
     from sim2real.errors import DeadlineExceeded as DeadlineExceeded
     from sim2real.errors import HardwareLost as HardwareLost
     from sim2real.errors import SafetyStop as SafetyStop
@@ -42,19 +47,16 @@ if TYPE_CHECKING:
     from sim2real.graph.schedule import draw as draw
     from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
     from sim2real.runtime.clock import Clock as Clock
-    from sim2real.runtime.compiled import CompiledGraph as CompiledGraph
-    from sim2real.stages.check import check as check
-    from sim2real.stages.deploy import deploy as deploy
-    from sim2real.stages.exporting import export as export
-    from sim2real.stages.functions import report as report
-    from sim2real.stages.functions import run as run
-    from sim2real.stages.identify import identify as identify
-    from sim2real.stages.pipeline import Pipeline as Pipeline
-    from sim2real.stages.pipeline import load_pipeline as load_pipeline
-    from sim2real.stages.record import record as record
-    from sim2real.stages.train import train as train
-    from sim2real.stages.validate import validate as validate
-    from sim2real.train.networks import Policy as Policy
+    from sim2real.runtime.compilation.compiled import CompiledGraph as CompiledGraph
+    from sim2real.stages.check.stage import check as check
+    from sim2real.stages.deploy.stage import deploy as deploy
+    from sim2real.stages.identify.stage import identify as identify
+    from sim2real.stages.pipeline.pipeline import Pipeline as Pipeline
+    from sim2real.stages.pipeline.pipeline import load_pipeline as load_pipeline
+    from sim2real.stages.record.stage import record as record
+    from sim2real.stages.train.stage import train as train
+    from sim2real.stages.validate.stage import validate as validate
+    from sim2real.train.networks.policy import Policy as Policy
     from sim2real.view.graphs import plot_graph as plot_graph
     from sim2real.view.graphs import plot_timeline as plot_timeline
 
@@ -139,17 +141,17 @@ _HOMES = {
     "sim2real.graph.schedule": ("draw",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
-    "sim2real.runtime.compiled": ("CompiledGraph",),
-    "sim2real.stages.check": ("check",),
-    "sim2real.stages.deploy": ("deploy",),
-    "sim2real.stages.exporting": ("export",),
-    "sim2real.stages.functions": ("report", "run"),
-    "sim2real.stages.identify": ("identify",),
-    "sim2real.stages.pipeline": ("Pipeline", "load_pipeline"),
-    "sim2real.stages.record": ("record",),
-    "sim2real.stages.train": ("train",),
-    "sim2real.stages.validate": ("validate",),
-    "sim2real.train.networks": ("Policy",),
+    "sim2real.runtime.compilation.compiled": ("CompiledGraph",),
+    "sim2real.stages.check.stage": ("check",),
+    "sim2real.stages.deploy.stage": ("deploy",),
+    "sim2real.commands.export_model": ("export",),
+    "sim2real.commands.functions": ("report", "run"),
+    "sim2real.stages.identify.stage": ("identify",),
+    "sim2real.stages.pipeline.pipeline": ("Pipeline", "load_pipeline"),
+    "sim2real.stages.record.stage": ("record",),
+    "sim2real.stages.train.stage": ("train",),
+    "sim2real.stages.validate.stage": ("validate",),
+    "sim2real.train.networks.policy": ("Policy",),
     "sim2real.view.graphs": ("plot_graph", "plot_timeline"),
 }
 _ROOMS = ("identify", "train")
@@ -168,7 +170,7 @@ class _Package(ModuleType):
 
 
 class _Room(ModuleType):
-    """A room whose modules are also attributes of the function of its name: ``sim2real.identify.links``."""
+    """A room whose modules are also attributes of the function of its name: ``sim2real.identify.delays.links``."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, value)
@@ -178,6 +180,7 @@ class _Room(ModuleType):
 
 
 sys.modules[__name__].__class__ = _Package
+moved.install()
 
 
 def room(name: str) -> None:

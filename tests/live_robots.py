@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
 
 TINY = [
     *("--identify.generations=10", "--identify.population=8", "--identify.refine=1", "--identify.folds=0"),

@@ -27,12 +27,12 @@ from sketches import sketched
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
-from sim2real.artifacts.run_folder import finished, open_stage
+from sim2real.artifacts.run.run_folder import finished, open_stage
 from sim2real.graph.episode import MessageRecord, StepRecord
-from sim2real.hardware.truth import Kind, TruthLog
+from sim2real.hardware.emulation.truth import Kind, TruthLog
 from sim2real.log.writer import McapRecorder
-from sim2real.stages import deploy
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.deploy import stage as deploy_stage
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 RECORD_S, VOLTS = 12.0, 2.0
 ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
@@ -56,8 +56,8 @@ def make(root: Path) -> Path:
             stage.output(name, path)
     run_dir = stage.run_dir
     with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
-        patch.setattr(deploy, "opened", lambda *_: nullcontext())
-        patch.setattr(deploy, "_episode", lambda *given: deployed(run_dir, *given))
+        patch.setattr(deploy_stage, "opened", lambda *_: nullcontext())
+        patch.setattr(deploy_stage, "_episode", lambda *given: deployed(run_dir, *given))
         assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0
     return run_dir
 

@@ -12,8 +12,8 @@ from types import ModuleType
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts import run_folder
 from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.artifacts.run import run_folder
 from sim2real.stages.config import RecordConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -36,23 +36,23 @@ def calls(monkeypatch, tmp_path):
                 folder.summary({"seed": config.seed})
             return folder.result
 
-        module = ModuleType(f"sim2real.stages.{stage}")
+        module = ModuleType(f"sim2real.stages.{stage}.stage")
         module.run = run
         return module
 
     for stage in run_folder.STAGES:
-        monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}", stand_in(stage))
+        monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}.stage", stand_in(stage))
     return seen
 
 
 def fail_with(monkeypatch, error):
-    module = ModuleType("sim2real.stages.record")
+    module = ModuleType("sim2real.stages.record.stage")
 
     def run(*_):
         raise error
 
     module.run = run
-    monkeypatch.setitem(sys.modules, "sim2real.stages.record", module)
+    monkeypatch.setitem(sys.modules, "sim2real.stages.record.stage", module)
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -214,7 +214,7 @@ def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
 
 
 def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_path):
-    recording, page = ModuleType("sim2real.view.recording"), ModuleType("sim2real.view.page")
+    recording, page = ModuleType("sim2real.view.rerun_recording"), ModuleType("sim2real.view.page.page")
     seen = []
     recording.view = lambda run_dir, save, draw=None: seen.append((run_dir, save))
     page.report = lambda run_dir: run_dir / "report.html"
@@ -334,7 +334,7 @@ import sys, time
 from pathlib import Path
 from types import ModuleType
 from sim2real import cli
-from sim2real.artifacts import run_folder
+from sim2real.artifacts.run import run_folder
 
 def run(pipeline, config, root, run_dir):
     with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
@@ -346,7 +346,7 @@ def run(pipeline, config, root, run_dir):
             time.sleep(0.3)
             print("log closed", flush=True)
 
-module = ModuleType("sim2real.stages.record")
+module = ModuleType("sim2real.stages.record.stage")
 module.run = run
 sys.modules[module.__name__] = module
 sys.exit(cli.main(["record", "pendulum"]))

@@ -18,12 +18,12 @@ IMPORTED_AS = {
     "pyserial": "serial", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip
 MAY_IMPORT = {
-    "view": {"sim2real.view.recording", "pipelines.arm.scene", "pipelines.pendulum.scene"},
+    "view": {"sim2real.view.rerun_recording", "pipelines.arm.scene", "pipelines.pendulum.scene"},
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.composer.interop.copies", "sim2real.composer.interop.counted"},
     "mixture": {"sim2real.graph.fitting"},
-    "parquet": {"sim2real.log.lerobot"},
-    "tensorboard": {"sim2real.stages.events"},
+    "parquet": {"sim2real.log.importing.files.lerobot"},
+    "tensorboard": {"sim2real.stages.train.tensorboard"},
     "warp": set(),  # MJX imports Warp itself
 }
 """Extra -> modules that import its packages. A scene is called by ``view.recording``, which has checked by then."""
@@ -71,7 +71,11 @@ def imported() -> dict[str, set[str]]:
 @pytest.fixture(scope="module")
 def reached(imported) -> set[str]:
     """What the command line leads to: its own imports, the stages, which it imports by name, and the pipelines."""
-    left = [m for m in imported if m == "sim2real.cli" or m.startswith(("sim2real.stages.", "pipelines"))]
+    left = [
+        m
+        for m in imported
+        if m == "sim2real.cli" or m.startswith(("sim2real.stages.", "sim2real.commands.", "pipelines"))
+    ]
     found: set[str] = set()
     while left:
         if (module := left.pop()) not in found:

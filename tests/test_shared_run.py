@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import shared_run
 
-from sim2real.artifacts.run_folder import STAGES, finished
+from sim2real.artifacts.run.run_folder import STAGES, finished
 
 
 def test_every_stage_has_finished(finished_run_dir):

@@ -1,7 +1,7 @@
 """A three-joint arm of position-controlled servos, hanging from a gantry: it reaches for targets."""
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.train.config import PPOConfig
 
 # Goals in rad. Faster changes than the servos' profile of 5 rad/s are smoothed there, not here.

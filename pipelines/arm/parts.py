@@ -6,8 +6,8 @@ from typing import Any
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.robots.datasheet import DataSheet
-from sim2real.robots.parts import Servo, ServoDriven
+from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.parts import Servo, ServoDriven
 
 JOINTS = ("pan", "shoulder", "elbow")
 SHEET = DataSheet(stall=1.4, damping=0.23, armature=0.0045, friction=0.03, p_gain=800, profile_rad_s=5.0)

@@ -13,12 +13,12 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.graph.base import Array
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.robots import standard
-from sim2real.robots.hardware import Embedded
-from sim2real.robots.messages import JointReading
-from sim2real.robots.payload import Hand
+from sim2real.robots.control_loop.hardware import Embedded
+from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.servo_robot import ServoRobot, Servos
+from sim2real.robots.servo import parameters
+from sim2real.robots.servo.payload import Hand
+from sim2real.robots.servo.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, LINK_M, SHEET, Arm
 from .task import CLOSE_M, HIGH, LOW, Reach, tip_of
@@ -36,7 +36,7 @@ class ArmRobot(ServoRobot):
         speed=2.0,
     )
     probe = Probe(step=0.12, lag_s=0.0115)
-    causes = standard.causes(JOINTS)
+    causes = parameters.causes(JOINTS)
     hand = Hand("elbow", (0.0, 0.0, -LINK_M), most_kg=0.3, least_kg=-0.044)  # the tip; the link has 55 g
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"))
     features = (

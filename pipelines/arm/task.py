@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.robots.parts import GoalTask
+from sim2real.robots.servo.parts import GoalTask
 
 from .parts import GANTRY_M, LINK_M, SHOULDER_M, Arm, Gantry
 

@@ -1,7 +1,7 @@
 """The unbalanced disk: a recorded DC motor with an eccentric mass, to be identified from its voltage and angle."""
 
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 PIPELINE = Pipeline(
     name="disk",

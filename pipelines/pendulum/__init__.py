@@ -1,7 +1,7 @@
 """The disk pendulum: an eccentric mass on a DC motor, swung up by a policy."""
 
 from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 GATE = GateLimits(freeze_rad_s=0.5)
 """It swings freely: nothing but a frozen encoder stops it dead; friction alone brakes it by 0.2 rad/s a sample."""

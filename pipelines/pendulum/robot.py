@@ -12,23 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Reading
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.gate import GateConfig
 from sim2real.hardware.joint import Joint
+from sim2real.hardware.safety.config import GateLimits
+from sim2real.hardware.safety.gate import GateConfig
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.agent import AgentParams
-from sim2real.robots.hardware import Embedded, ServoSession
-from sim2real.robots.loop import DelayParams
-from sim2real.robots.loop_robot import LoopRobot
+from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.control_loop.loop import DelayParams
+from sim2real.robots.control_loop.loop_robot import LoopRobot
+from sim2real.robots.control_loop.training_task import Draw
 from sim2real.robots.probe import Probe
-from sim2real.robots.training import Draw
+from sim2real.robots.servo.agent import AgentParams
 
 from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, causes, dynamics, from_groups
 from .plant import SUPPLY_V

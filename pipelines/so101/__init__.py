@@ -1,7 +1,7 @@
 """The SO-101, LeRobot's arm of six Feetech servos: it reaches for targets, opening its jaw as it is told."""
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.train.config import PPOConfig
 
 # rad, rad/s, rad/s. Each joint's own limits are narrower; they keep the arm off the table: see robot.py.

@@ -13,8 +13,8 @@ from typing import Any
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.robots.datasheet import StsSheet
-from sim2real.robots.parts import Servo, ServoDriven
+from sim2real.robots.servo.datasheet import StsSheet
+from sim2real.robots.servo.parts import Servo, ServoDriven
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """LeRobot's names, in the order of the servos' ids."""

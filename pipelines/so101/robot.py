@@ -16,18 +16,18 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.errors import UsageError
 from sim2real.graph.base import Array
-from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Device
 from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.registry import load_device
+from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.parameters import Parameter
-from sim2real.robots import standard
-from sim2real.robots.hardware import Embedded, ServoSession
-from sim2real.robots.messages import JointReading
-from sim2real.robots.payload import Hand
+from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.servo_robot import ServoRobot, Servos
+from sim2real.robots.servo import parameters
+from sim2real.robots.servo.payload import Hand
+from sim2real.robots.servo.servo_robot import ServoRobot, Servos
 
 from .parts import JOINTS, SHEET, TIP_M, TRAVEL_RAD, Arm
 from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
@@ -62,7 +62,7 @@ class SO101Robot(ServoRobot):
         device="feetech",
     )
     probe = Probe(step=0.12, lag_s=-0.004)
-    causes = standard.causes(JOINTS)
+    causes = parameters.causes(JOINTS)
     hand = HAND
     aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
     features = (
@@ -89,7 +89,7 @@ class SO101Robot(ServoRobot):
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified: servos of one model, each with friction and brake of its own."""
-        found = standard.parameters(SHEET, JOINTS, own=("damping", "friction")) + standard.offsets(JOINTS)
+        found = parameters.parameters(SHEET, JOINTS, own=("damping", "friction")) + parameters.offsets(JOINTS)
         full, about = SHEET.full_rad, "error from which on it pushes no harder"
         limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
         # A search that begins at the data sheet's limit, which no motion reaches, often stays there.

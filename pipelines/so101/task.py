@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sim2real.robots.parts import GoalTask
+from sim2real.robots.servo.parts import GoalTask
 
 from .parts import SHAPES, STEP_S, TIP_M, Arm, Table
 

@@ -1,7 +1,7 @@
 """The SO-101 arm: six recorded position servos, to be identified from goals and positions."""
 
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 PIPELINE = Pipeline(
     name="so101_log",

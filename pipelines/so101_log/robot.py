@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.node import BaseNode
-from sim2real.identify.leaves import get_leaf
 from sim2real.identify.model import Channel
+from sim2real.identify.parameter_paths import get_leaf
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.recorded import LoggedRobot
+from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.worlds.recorded import RecordedActuator
 
 from .model import JOINTS, ArmWorld, Goal, Sensor, nominal

@@ -1,7 +1,7 @@
 """A recorded DYNAMIXEL XL330 that lifts a mass on an arm: identify motor, gears and friction from its motions."""
 
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 PIPELINE = Pipeline(
     name="xl330",

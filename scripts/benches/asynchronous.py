@@ -10,10 +10,10 @@ import jax
 
 from benches.figures import row
 from sim2real.graph.node import BaseNode
-from sim2real.robots.devices import SimActuator, SimSensor
+from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 WARM_S = 0.5
 """The wall clock runs so long before it is measured [s]."""

@@ -50,9 +50,9 @@ BENCHES = {
             *_GRAPH,
             "sim2real/identify",
             "sim2real/train",
-            "sim2real/stages/judging.py",
-            "sim2real/stages/next_step.py",
-            "sim2real/stages/replaying.py",
+            "sim2real/stages/deploy/verdict.py",
+            "sim2real/stages/deploy/next_command.py",
+            "sim2real/stages/estimation/replay.py",
             "scripts/benches/hidden_robots.py",
             "scripts/benches/drift_pendulum.py",
             "scripts/benches/drift_arms.py",
@@ -90,7 +90,7 @@ BENCHES = {
         (
             *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
             *("sim2real/artifacts", "sim2real/log", "pipelines/disk", "pipelines/xl330", "pipelines/so101"),
-            *("sim2real/composer/c", "sim2real/stages/config.py", "sim2real/stages/described.py"),
+            *("sim2real/composer/physics/c", "sim2real/stages/config.py", "sim2real/stages/pipeline/from_model.py"),
             *(f"scripts/benches/league_{part}.py" for part in ("bam", "mujoco", "ours", "sets")),
             *(
                 f"scripts/benches/{part}.py"
@@ -103,7 +103,7 @@ BENCHES = {
         "delays, losses and drift of emulated links, found from the motion",
         (
             *(f"sim2real/identify/{part}.py" for part in ("hidden", "likelihood", "links", "losses")),
-            *("sim2real/artifacts/links.py", "scripts/benches/emulated_links.py"),
+            *("sim2real/artifacts/estimation/links.py", "scripts/benches/emulated_links.py"),
         ),
     ),
     "log": Bench("log", "what recording costs a control loop, what a crash costs, reading a range", ("sim2real/log",)),
@@ -114,7 +114,7 @@ BENCHES = {
             *_GRAPH,
             "sim2real/identify",
             "sim2real/train",
-            "sim2real/stages/prepared.py",
+            "sim2real/stages/train/training_setup.py",
             "scripts/benches/hidden_robots.py",
         ),
     ),

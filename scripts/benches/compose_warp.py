@@ -97,7 +97,7 @@ def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
     from sim2real import composer
     from sim2real.graph import Base, BaseNode
     from sim2real.graph.schedule import draw
-    from sim2real.runtime.compiled import CompiledGraph
+    from sim2real.runtime.compilation.compiled import CompiledGraph
 
     @struct.dataclass
     class Angles(Base):
@@ -164,7 +164,7 @@ def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]
 
 def left(data: Any) -> Any:
     """Return what is looked at of a state: positions, whether something had no room, rows of constraints."""
-    from sim2real.composer.mjx.warp import overflowed
+    from sim2real.composer.physics.mjx.warp.warp import overflowed
 
     return data.qpos, overflowed(data), data._impl.nefc
 

@@ -12,8 +12,8 @@ from benches import stages
 from benches.figures import row
 from sim2real.artifacts.recording import Recording
 from sim2real.robots.roles import ROLES
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.truth import true_values
+from sim2real.stages.identify.true_values import true_values
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SETTLE_S = 0.3
 QUICK = {

@@ -103,7 +103,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
         number: Its number.
         options: Flags of the bench.
     """
-    from sim2real.stages.pipeline import load_pipeline
+    from sim2real.stages.pipeline.pipeline import load_pipeline
 
     begin = time.process_time()
     robot, pipeline = ROBOTS[options.robot].draw(number), load_pipeline(options.robot)
@@ -136,8 +136,8 @@ def one_change(
         options: Flags of the bench.
     """
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.judging import verdict_of
-    from sim2real.stages.replaying import tested
+    from sim2real.stages.deploy.verdict import verdict_of
+    from sim2real.stages.estimation.replay import tested
 
     now, first = robot.changed(change), 1 + CHANGES.index(change) * (options.episodes + 2)
     logs = [folder / f"{change}_{e}.mcap" for e in range(options.episodes + 1)]
@@ -188,8 +188,8 @@ def restored(
     """
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
-    from sim2real.stages.next_step import logs_to_identify, terms_to_identify
-    from sim2real.stages.once_more import MOST, for_longer, lacking, repeated
+    from sim2real.commands.retry import MOST, for_longer, lacking, repeated
+    from sim2real.stages.deploy.next_command import logs_to_identify, terms_to_identify
 
     if said["verdict"] != "re-identify":
         return {"success": said["success"], "from": "not done"}
@@ -235,7 +235,7 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     """
     import sim2real
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.once_more import MOST, repeated, with_wider_bounds
+    from sim2real.commands.retry import MOST, repeated, with_wider_bounds
 
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)

@@ -22,13 +22,13 @@ import numpy as np
 from benches import hidden_robots as hidden
 from benches.drift_pendulum import DELAY_S, FRICTION
 from sim2real.graph.base import StepState
-from sim2real.hardware.gate import SafetyGate
+from sim2real.hardware.emulation.truth import TruthLog
 from sim2real.hardware.plant import OperatingMode, PlantClock, load_plant
-from sim2real.hardware.truth import TruthLog
-from sim2real.robots.agent import AgentParams, AgentState
-from sim2real.robots.messages import JointReading
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.hardware.safety.gate import SafetyGate
+from sim2real.robots.control_loop.messages import JointReading
+from sim2real.robots.servo.agent import AgentParams, AgentState
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 TARGET_S, APPROACH_HZ = 4.0, 4.0
 """How long each target stands; how fast a goal nears it."""

@@ -32,12 +32,12 @@ import numpy as np
 from benches.figures import row
 from sim2real import cli
 from sim2real.errors import ERROR, HARDWARE_LOST, SAFETY_STOP, Sim2RealError
-from sim2real.hardware import emulator
+from sim2real.hardware.emulation import emulator
+from sim2real.hardware.emulation.truth import Kind, Truth, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, Truth, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.policy import PolicyContract, save_bundle
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SAFE_S = 0.2
 KILLED, STOPPED, NAN = "killed", "stopped", "nan"
@@ -128,7 +128,7 @@ def swinging_bundle(folder: Path) -> Path:
 def _server() -> Any:
     """Return what processes are forked from: it has imported what takes as long as a run, and computed nothing."""
     server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["sim2real.stages.deploy", "sim2real.hardware.dynamixel.emulation", "mujoco"])
+    server.set_forkserver_preload(["sim2real.stages.deploy.stage", "sim2real.hardware.dynamixel.emulation", "mujoco"])
     return server
 
 

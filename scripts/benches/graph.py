@@ -23,9 +23,9 @@ from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
-from sim2real.robots.devices import SimActuator, SimSensor
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.runtime.wiring import wire
+from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compilation.wiring import wire
 from sim2real.worlds.ode import OdeWorld
 
 DURATION_S = 4.0

@@ -13,7 +13,7 @@ from benches.graph_shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
 
 
 def arm(links: int) -> tuple[Any, dict[str, BaseNode]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 MODEL = load_pipeline("pendulum").load("model")
 EPISODES = 32

@@ -21,15 +21,15 @@ import numpy as np
 from benches import figures, recordings
 from benches.recordings import PAST, SPECS
 from sim2real.graph.episode import Episode
-from sim2real.identify import prediction
-from sim2real.identify.aggregate import aggregate
 from sim2real.identify.fit import Fit, as_numbers, fit, refit, run_search
-from sim2real.identify.problem import Problem
-from sim2real.identify.refine import refine
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import uncertainty
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.refine import refine
+from sim2real.identify.uncertainty.aggregate import aggregate
+from sim2real.identify.uncertainty.uncertainty import uncertainty
+from sim2real.identify.validation import prediction
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SETTLE_S = 0.3
 """How much of the past the initial state of the disk's free run is estimated from [s]."""

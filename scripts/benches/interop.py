@@ -20,10 +20,10 @@ from benches.figures import row
 from benches.train import environment
 from sim2real.interop import brax_env
 from sim2real.interop.environment import RobotEnvironment
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.prepared import contract_of
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.training_setup import contract_of
 from sim2real.train.config import PPOConfig
-from sim2real.train.ppo import train
+from sim2real.train.ppo.trainer import train
 
 QUICK = {"steps": 256, "envs": 8, "evaluations": 2, "timelines": 2, "episode_s": 0.5, "hidden": [4], "minibatches": 2}
 

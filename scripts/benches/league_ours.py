@@ -18,13 +18,14 @@ from benches.league_sets import DISK_BLOCK, DISK_BLOCKS, Fold
 from benches.sysid import Recording
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify import prediction
 from sim2real.identify.fit import fit as fit_model
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.stages import described, left_out
-from sim2real.stages.config import RobotFlags
-from sim2real.stages.recordings import open_recording
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation import prediction
+from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
@@ -86,8 +87,8 @@ def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:
     with tempfile.TemporaryDirectory() as folder:
         logs = _written(fold.fitted, Path(folder), gains)
         with contextlib.redirect_stderr(io.StringIO()):  # it says what it takes each column for, fold after fold
-            pipeline = described.from_flags(RobotFlags(mjcf=_model(fold.fitted, Path(folder))), [str(p) for p in logs])
-        robot = left_out.offering(pipeline.load(), "auto" if name in CHOOSES else "own")
+            pipeline = from_model.from_flags(RobotFlags(mjcf=_model(fold.fitted, Path(folder))), [str(p) for p in logs])
+        robot = held_out_parts.offering(pipeline.load(), "auto" if name in CHOOSES else "own")
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
     case = identify.Case(name, config, robot, robot.identifiable(config.max_delay_s))
@@ -108,10 +109,10 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     """Identify with the optional terms that the recordings choose, as ``--terms auto`` does."""
     c, episodes = replace(case.config, terms="auto"), list(fitted.values())
     model, length = case.model, c.settle_s + c.horizon_s
-    table = left_out.widest(model.parameters, c.terms)
+    table = held_out_parts.widest(model.parameters, c.terms)
     spans = identify.windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table)
-    terms = left_out.chosen(every, c, list(fitted)).names(table)
+    terms = held_out_parts.chosen(every, c, list(fitted)).names(table)
     fewer = table.with_terms(terms)
     fewer = fewer.with_nominal({p.name: every.values[p.name] for p in fewer if p.free})
     return fit_model(model, episodes, spans, length, c, fewer)

@@ -14,9 +14,9 @@ import numpy as np
 
 from benches import emulated_links as emulated
 from benches.figures import row
-from sim2real.artifacts.links import Link
-from sim2real.identify.likelihood import Seen
-from sim2real.identify.links import describe, find
+from sim2real.artifacts.estimation.links import Link
+from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.links import describe, find
 
 QUICK = {"seconds": 4.0, "logs": 5, "log_s": 4.0}
 STEP_S, LONGEST_S = 0.001, 0.06

@@ -28,7 +28,7 @@ from benches.figures import medians, row
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.reader import TruncatedLogWarning, read_log
-from sim2real.log.recover import recover
+from sim2real.log.recovery import recover
 from sim2real.log.writer import McapRecorder
 
 JOINTS = 6

@@ -100,7 +100,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
     """
     import sim2real
     from sim2real.errors import Sim2RealError
-    from sim2real.stages.pipeline import load_pipeline
+    from sim2real.stages.pipeline.pipeline import load_pipeline
 
     wear = hidden.Wear(**{f.name: getattr(options, f.name) for f in fields(hidden.Wear)})
     robot, pipeline = hidden.Hidden.draw(number, wear), load_pipeline("pendulum")

@@ -10,9 +10,9 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.log.importer import import_file
-from sim2real.log.mapping import load_mapping
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.log.importing.importer import import_file
+from sim2real.log.importing.mapping import load_mapping
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101_log": "so101"}
 SPECS = {

@@ -18,16 +18,16 @@ from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.rig import Rig
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, PolicyRunner
 from sim2real.policy.bundle import make_runner
-from sim2real.robots.agent import DirectAgent
-from sim2real.robots.hardware import ServoActuator, ServoSensor
-from sim2real.robots.loop import control_nodes
-from sim2real.robots.messages import Goals, JointReading
-from sim2real.robots.policy_node import PolicyNode
+from sim2real.robots.control_loop.hardware import ServoActuator, ServoSensor
+from sim2real.robots.control_loop.loop import control_nodes
+from sim2real.robots.control_loop.messages import Goals, JointReading
+from sim2real.robots.control_loop.policy_node import PolicyNode
+from sim2real.robots.servo.agent import DirectAgent
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime
 

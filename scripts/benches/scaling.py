@@ -15,13 +15,13 @@ from benches.figures import row
 from benches.train import environment
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.search import search
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.search import search
 from sim2real.log.reader import read_log
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
-from sim2real.train.ppo import TrainResult, train
+from sim2real.train.ppo.trainer import TrainResult, train
 
 EVALUATIONS = 6
 """Speed is the median over what lies between them; the first has what happens once."""

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from benches.hidden_robots import COUNT_RAD, SPEED_COUNT_RAD_S, one_after_another, write_log
-from sim2real.hardware.config import GateLimits
 from sim2real.hardware.device import Reading, Transaction
-from sim2real.hardware.gate import SafetyGate
 from sim2real.hardware.plant import OperatingMode, Plant, load_plant
-from sim2real.hardware.plausibility import Plausibility
-from sim2real.robots.loop_robot import LoopRobot
-from sim2real.robots.servo_robot import ServoRobot
-from sim2real.stages.pipeline import Pipeline
+from sim2real.hardware.safety.config import GateLimits
+from sim2real.hardware.safety.gate import SafetyGate
+from sim2real.hardware.safety.plausibility import Plausibility
+from sim2real.robots.control_loop.loop_robot import LoopRobot
+from sim2real.robots.servo.servo_robot import ServoRobot
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 _HISTORY_S = 0.1
 

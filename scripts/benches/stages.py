@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benches.figures import row
-from sim2real.artifacts.run_folder import STAGES, StageFolder, finished
+from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
 
 
 def add_flags(parser: argparse.ArgumentParser, seeds: list[int]) -> None:

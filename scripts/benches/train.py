@@ -11,11 +11,11 @@ import numpy as np
 from benches.figures import row
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
-from sim2real.train.env import GraphEnvironment
-from sim2real.train.ppo import TrainResult, train
+from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.ppo.trainer import TrainResult, train
 
 SPREAD, SPREAD_S, DRAWS = 0.02, 0.002, 1024
 """Copies differ in each of the dynamics by this share, in the delay by up to so many seconds, in so many draws."""

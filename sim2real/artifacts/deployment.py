@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sim2real.artifacts.drift import Drift
+from sim2real.artifacts.estimation.drift import Drift
 from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sim2real.artifacts.estimation.links import Link
+from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.links import Link
-from sim2real.artifacts.noise import Noise
-from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.quantity import Quantity
-from sim2real.artifacts.run_folder import Source
+from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import Rows, Shown
 from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError

@@ -15,7 +15,7 @@ from sim2real.artifacts.paths import shown
 from sim2real.artifacts.summary import Summed
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
-from sim2real.hardware.truth import Truth, read_truth
+from sim2real.hardware.emulation.truth import Truth, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
 LOG, TRUTH = "session.mcap", "truth.bin"

@@ -11,7 +11,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.arena import Arena as Arena
-from sim2real.composer.c.physics import Physics as Physics
 from sim2real.composer.constants import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.define import abstract_observable as abstract_observable
 from sim2real.composer.define import cached_property as cached_property
@@ -28,6 +27,7 @@ from sim2real.composer.initializer import Initializer as Initializer
 from sim2real.composer.initializers.prop_initializer import PropPlacer as PropPlacer
 from sim2real.composer.models.model import Model as Model
 from sim2real.composer.observables import Observables as Observables
+from sim2real.composer.physics.c.physics import Physics as Physics
 from sim2real.composer.robot import Robot as Robot
 from sim2real.composer.task import NullTask as NullTask
 from sim2real.composer.task import Task as Task
@@ -36,13 +36,13 @@ from sim2real.composer.variation.base import Variation as Variation
 if TYPE_CHECKING:
     from sim2real.composer.interop.brax_env import BraxEnv as BraxEnv
     from sim2real.composer.interop.vector_env import MjxVectorEnv as MjxVectorEnv
-    from sim2real.composer.mjx.environment import MjxEnvironment as MjxEnvironment
+    from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
     from sim2real.composer.world import ComposedWorld as ComposedWorld
 
 _LAZY = {
     "BraxEnv": "sim2real.composer.interop.brax_env",
     "ComposedWorld": "sim2real.composer.world",
-    "MjxEnvironment": "sim2real.composer.mjx.environment",
+    "MjxEnvironment": "sim2real.composer.physics.mjx.environment",
     "MjxVectorEnv": "sim2real.composer.interop.vector_env",
 }
 

@@ -6,8 +6,8 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.entity import Entity
-from sim2real.composer.models import parse
 from sim2real.composer.models.element import Element
+from sim2real.composer.models.mjcf import parse
 from sim2real.composer.models.model import Model
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.arrays import multiply_quaternions, namespace, rotate
 from sim2real.composer.errors import NotAttachedError
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.model import Model
 from sim2real.composer.models.traversal import get_attachment_frame, get_frame_freejoint
 from sim2real.composer.observables import Observables
+from sim2real.composer.physics.arrays import multiply_quaternions, namespace, rotate
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

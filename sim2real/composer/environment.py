@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import dm_env
 import numpy as np
 
-from sim2real.composer.c.compiled import Compiler
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.hooks import Hooks
 from sim2real.composer.observation.updater import Updater
+from sim2real.composer.physics.c.compiled import Compiler
 from sim2real.composer.reward import split_reward
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
     from sim2real.composer.entity import Entity
+    from sim2real.composer.physics.c.physics import Physics
     from sim2real.composer.types import Hook
 
 _log = logging.getLogger(__name__)

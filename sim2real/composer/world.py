@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.c.rollouts import Start, StepLaw, check_steps
-from sim2real.composer.mjx import constants, open_loop, stepping
-from sim2real.composer.mjx.environment import MjxEnvironment, State
-from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer.physics.c.rollouts import Start, StepLaw, check_steps
+from sim2real.composer.physics.mjx import constants, open_loop, stepping
+from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
+from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
 from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError

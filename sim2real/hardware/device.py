@@ -1,6 +1,6 @@
 """The contract of a device: motors that can be measured and commanded, whatever they are connected by.
 
-`sim2real.hardware.rig.Rig` puts the safety gate in front of any device; `sim2real.hardware.testing` tests one.
+`sim2real.hardware.safety.rig.Rig` puts the safety gate in front of any device; `sim2real.hardware.testing` tests one.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any, Final, Protocol, runtime_checkable
 
 from sim2real.errors import UsageError
-from sim2real.hardware.truth import Kind, TruthLog
+from sim2real.hardware.emulation.truth import Kind, TruthLog
 
 STATE_PERIOD_S: Final = 0.005
 

@@ -28,12 +28,12 @@ import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Device, Reading
-from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.planned import BusEmulation
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.emulated_bus import BusEmulation
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.rig import Rig
-from sim2real.hardware.truth import Kind
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 Started = Callable[..., tuple[EmbeddedRobot, Device]]
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from sim2real import room
 
 if TYPE_CHECKING:
-    from sim2real.identify.minimum import minimise as minimise
+    from sim2real.identify.search.minimum import minimise as minimise
 
 __all__ = ["minimise"]
 
@@ -15,7 +15,7 @@ room(__name__)
 def __getattr__(name: str) -> Any:
     """Import a public function on first use."""
     if name in __all__:
-        from sim2real.identify import minimum
+        from sim2real.identify.search import minimum
 
         return getattr(minimum, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

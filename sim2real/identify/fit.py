@@ -13,12 +13,12 @@ from sim2real.graph.episode import Episode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem import Problem
-from sim2real.identify.programs import OnCompile
-from sim2real.identify.refine import Refined, refine, remaining
-from sim2real.identify.search import SearchResult, search
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import Uncertainty, centred, uncertainty
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.programs import OnCompile
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.refine import Refined, refine, remaining
+from sim2real.identify.search.search import SearchResult, search
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of the bounds."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.identify.leaves import get_leaf, set_leaf
+from sim2real.identify.parameter_paths import get_leaf, set_leaf
 from sim2real.identify.parameters import ParameterTable
 
 

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
+from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
-from sim2real.identify.leaves import set_leaf
+from sim2real.identify.parameter_paths import set_leaf
 
 _ABOVE = 0.1
 """Share of the bounds' width by which a search begins above a lower bound."""

@@ -11,8 +11,8 @@ from sim2real.composer.interop.moment import Moment
 from sim2real.errors import UsageError
 from sim2real.interop.entries import entries_of
 from sim2real.policy.contract import PolicyContract
-from sim2real.train.env import GraphEnvironment
-from sim2real.train.policy_steps import PolicySteps
+from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.environment.policy_steps import PolicySteps
 
 
 class Copy(NamedTuple):

@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sim2real.artifacts.run_folder import STAGES, attempts
+from sim2real.artifacts.run.run_folder import STAGES, attempts
 from sim2real.interop.environment import RobotEnvironment
-from sim2real.robots.base import Robot
-from sim2real.stages.config import TrainConfig
-from sim2real.stages.parameters import open_identification
-from sim2real.stages.pipeline import Pipeline, available, load_pipeline, pipeline_of
-from sim2real.stages.prepared import contract_of, find_parameters, prepare
-from sim2real.stages.targets import find_run
+from sim2real.robots.contract import Robot
+from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.pipeline.open_parameters import open_identification
+from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline, pipeline_of
+from sim2real.stages.train.config import TrainConfig
+from sim2real.stages.train.training_setup import contract_of, find_parameters, prepare
 
 if TYPE_CHECKING:
     from sim2real.interop.robot_brax import RobotBraxEnv

@@ -1,13 +1,13 @@
 """Logs: one MCAP file per session, written while the robot runs and readable after a crash."""
 
-from sim2real.log.importer import import_file as import_file
-from sim2real.log.mapping import ImportMapping as ImportMapping
-from sim2real.log.mapping import load_mapping as load_mapping
+from sim2real.log.importing.importer import import_file as import_file
+from sim2real.log.importing.mapping import ImportMapping as ImportMapping
+from sim2real.log.importing.mapping import load_mapping as load_mapping
 from sim2real.log.reader import TruncatedLogWarning as TruncatedLogWarning
 from sim2real.log.reader import read_attachment as read_attachment
 from sim2real.log.reader import read_log as read_log
 from sim2real.log.reader import read_session as read_session
 from sim2real.log.reader import summary as summary
-from sim2real.log.recover import Recovery as Recovery
-from sim2real.log.recover import recover as recover
+from sim2real.log.recovery import Recovery as Recovery
+from sim2real.log.recovery import recover as recover
 from sim2real.log.writer import McapRecorder as McapRecorder

@@ -13,7 +13,7 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
 from sim2real.log.cdr import read_text
-from sim2real.log.contents import Contents, Range, in_words, walk
+from sim2real.log.file_contents import Contents, Range, in_words, walk
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields, units_of_fields
 
 # Positions of an event's level, and of its name before alignment [bytes].

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
-from sim2real.log import document
+from sim2real.log import metadata as document
 from sim2real.log.cdr import CdrField, Layout, text
 from sim2real.log.schema import (
     EVENTS_SCHEMA,

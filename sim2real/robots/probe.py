@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError
 from sim2real.hardware.device import Reading
-from sim2real.hardware.rig import Rig
+from sim2real.hardware.safety.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
 """Time between two samples; how long a step is watched."""

@@ -1,4 +1,4 @@
-"""For tests of robots: ``check_robot`` tells whether a robot keeps what ``sim2real.robots.base`` asks of it.
+"""For tests of robots: ``check_robot`` tells whether a robot keeps what ``sim2real.robots.contract`` asks of it.
 
     def test_it_is_a_robot(tmp_path):
         check_robot(load_pipeline("mine").load(), tmp_path)
@@ -20,15 +20,15 @@ import numpy as np
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
-from sim2real.hardware.config import GateLimits
+from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, read_truth
+from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.model import IdentifiableModel
-from sim2real.robots import states
-from sim2real.robots.base import RecordedRobot, Robot, checked
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.train.env import TrainingTask
-from sim2real.train.tasks import EndingTask, PrivilegedTask, terms_of
+from sim2real.robots import score_columns
+from sim2real.robots.contract import RecordedRobot, Robot, checked
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.train.environment.graph_environment import TrainingTask
+from sim2real.train.environment.tasks import EndingTask, PrivilegedTask, terms_of
 
 _EPISODE_S = 0.2
 
@@ -113,13 +113,13 @@ def check_simulation(robot: Robot) -> None:
     _include(nodes, set(jax.eval_shape(task.params, jax.random.key(0))), "nodes with parameters")
     found = {name: _ran(records[name]) for name in recorded}
     fields = {field for row in robot.joints.values() for field in row.values()}
-    measured = states.as_columns(found[roles.sensor])
+    measured = score_columns.as_columns(found[roles.sensor])
     _include(measured, fields, "fields of joints")
     _include(found[roles.actuator], {robot.command}, "fields of a command")
     _include(robot.units, {*found[roles.sensor], robot.command}, "units")
     width = found[roles.actuator][robot.command].reshape(len(found[roles.actuator][robot.command]), -1).shape[1]
     _hold(width == len(robot.action), f"a command has {width} entries, and there are {len(robot.action)} actions")
-    _check_score(robot, measured, states.as_sent(robot, found[roles.supervisor], found[roles.actuator]))
+    _check_score(robot, measured, score_columns.as_sent(robot, found[roles.supervisor], found[roles.actuator]))
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:

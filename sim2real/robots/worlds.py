@@ -20,13 +20,13 @@ from sim2real.graph.node import BaseNode
 from sim2real.hardware.entries import WORLDS
 from sim2real.hardware.registry import load_entry
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.base import RecordedRobot
-from sim2real.robots.loop import DELAYS, DelayParams
-from sim2real.robots.loop_robot import LoopRobot
-from sim2real.robots.recorded import LoggedRobot
-from sim2real.robots.training import Draw
-from sim2real.train.env import TrainingTask
-from sim2real.train.tasks import EndingTask
+from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.control_loop.loop import DELAYS, DelayParams
+from sim2real.robots.control_loop.loop_robot import LoopRobot
+from sim2real.robots.control_loop.training_task import Draw
+from sim2real.robots.from_model.recorded import LoggedRobot
+from sim2real.train.environment.graph_environment import TrainingTask
+from sim2real.train.environment.tasks import EndingTask
 from sim2real.worlds.recorded import RecordedActuator
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)

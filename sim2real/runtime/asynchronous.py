@@ -22,12 +22,12 @@ from sim2real.graph.windows import check_bursts
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import noted
-from sim2real.runtime.handover import Reply
 from sim2real.runtime.init import collect, init_graph_state
 from sim2real.runtime.simulated import SimulatedRun
 from sim2real.runtime.statistics import NodeStatistics
 from sim2real.runtime.stepper import Stepper
-from sim2real.runtime.wallclock import WallClockRun
+from sim2real.runtime.wall_clock.handover import Reply
+from sim2real.runtime.wall_clock.wall_clock import WallClockRun
 
 _INTERRUPTED_S = 1.0
 """Time that the nodes' ``stop`` may take when a start is interrupted, e.g. by Ctrl-C [s]."""

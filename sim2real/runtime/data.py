@@ -11,8 +11,8 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
+from sim2real.runtime.compilation.wiring import EMPTY_AGE_S
 from sim2real.runtime.init import default_output
-from sim2real.runtime.wiring import EMPTY_AGE_S
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Array

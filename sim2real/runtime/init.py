@@ -14,7 +14,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.node import BaseNode, phase_ticks
 from sim2real.graph.rules import waits_for_schedule
-from sim2real.runtime.bounds import DelayBounds, bounds_of
+from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
 
 OUTPUTS = "outputs"
 """Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""

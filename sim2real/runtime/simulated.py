@@ -20,9 +20,9 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge
 from sim2real.runtime.data import Message, NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout, named
-from sim2real.runtime.handover import Reply
 from sim2real.runtime.statistics import NodeStatistics, StepLog
 from sim2real.runtime.stepper import Result, Stepper, overwritten
+from sim2real.runtime.wall_clock.handover import Reply
 
 _NEVER = 2**62
 

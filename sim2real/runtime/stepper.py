@@ -15,8 +15,8 @@ from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Recorder, StepStateRecorder
 from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.runtime.data import NodeData
-from sim2real.runtime.handover import Reply
 from sim2real.runtime.match import matched
+from sim2real.runtime.wall_clock.handover import Reply
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Array, Number

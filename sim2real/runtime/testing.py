@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.graph.node import BaseNode
 from sim2real.graph.testing.nodes import hash_step
-from sim2real.runtime.wiring import SlotTable, Wiring
+from sim2real.runtime.compilation.wiring import SlotTable, Wiring
 
 Windows = dict[str, tuple[list[int], list[int]]]
 """Input name -> (seq of each message in the window, value of each), oldest first."""

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.mjx.import_mjx import mjx
-from sim2real.composer.models.translate import mj
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.physics.mjx.import_mjx import mjx
 
 if TYPE_CHECKING:
     from sim2real.composer.types import MjModel

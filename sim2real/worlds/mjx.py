@@ -12,9 +12,10 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 
-from sim2real.composer.c.rollouts import Start, StepLaw, check_steps
-from sim2real.composer.mjx import gate, stepping, warp
-from sim2real.composer.mjx.import_mjx import mjx
+from sim2real.composer.physics.c.rollouts import Start, StepLaw, check_steps
+from sim2real.composer.physics.mjx import gate, stepping
+from sim2real.composer.physics.mjx.import_mjx import mjx
+from sim2real.composer.physics.mjx.warp import warp
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
@@ -22,7 +23,7 @@ from sim2real.graph.node import BaseWorld
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from sim2real.composer.mjx.warp import WarpEngine
+    from sim2real.composer.physics.mjx.warp.warp import WarpEngine
     from sim2real.composer.types import MjModel
 
 

@@ -6,6 +6,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 
+from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import (
     Determined,
     Estimate,
@@ -20,8 +21,7 @@ from sim2real.artifacts.identification import (
     Refinement,
     Search,
 )
-from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.run_folder import Source
+from sim2real.artifacts.run.run_folder import Source
 from sim2real.errors import Sim2RealError
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.artifacts.latency import Latency, measured
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Messages, Steps
+from sim2real.stages.latency.result import Latency, measured
 
 CHAIN = ("sensor", "agent", "actuator")
 COUNT = 50

@@ -18,19 +18,19 @@ from hypothesis import strategies as st
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Identification, Matrix
-from sim2real.artifacts.iterations import Iterations
-from sim2real.artifacts.latency import Latency
-from sim2real.artifacts.manifest import plain, read_manifest, write_manifest
-from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.manifest import plain, read_manifest, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.log.mapping import FieldMapping, ImportMapping, NodeMapping, load_mapping, to_toml
+from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapping, load_mapping, to_toml
 from sim2real.log.toml_text import toml_value
-from sim2real.robots.mjcf_parameters import ParameterPattern
-from sim2real.robots.mjcf_robot import RobotConfig
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import RobotConfig
+from sim2real.stages.latency.result import Latency
 
 FILES = (Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
 ODD = [

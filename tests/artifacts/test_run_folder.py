@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.artifacts import locks, run_folder
-from sim2real.artifacts.manifest import git_state, plain, read_manifest, sha256, write_manifest
+from sim2real.artifacts.run import locks, run_folder
+from sim2real.artifacts.run.manifest import git_state, plain, read_manifest, sha256, write_manifest
+from sim2real.commands import info
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
-from sim2real.stages import info
 from sim2real.stages.config import RecordConfig, TrainConfig
 
 
@@ -65,7 +65,7 @@ class Clock:
 DIES = """
 import os, signal, sys, time
 from pathlib import Path
-from sim2real.artifacts.run_folder import open_stage
+from sim2real.artifacts.run.run_folder import open_stage
 with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
     if sys.argv[2] == "forked":
         read, write = os.pipe()

@@ -32,7 +32,7 @@ class Numbers(np.random.RandomState):
     def start(self):
         import jax
 
-        from sim2real.composer.mjx.random import JaxRandomState
+        from sim2real.composer.physics.mjx.random import JaxRandomState
 
         state = JaxRandomState(jax.random.key(self.key))
         for name in DRAWS:

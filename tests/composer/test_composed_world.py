@@ -16,7 +16,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
 
 CART = """
 <mujoco model="cart"><option timestep="0.01"/>

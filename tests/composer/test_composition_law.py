@@ -6,9 +6,10 @@ import pytest
 from test_oracle import differing_arrays, names
 
 from sim2real.composer import mjcf
-from sim2real.composer.models import compose, late, schema
-from sim2real.composer.models.references import REFERENCES
-from sim2real.composer.models.targets import FIXED, targets
+from sim2real.composer.models.composition import compose, recreate
+from sim2real.composer.models.mjcf import schema
+from sim2real.composer.models.mjcf.references import REFERENCES
+from sim2real.composer.models.mjcf.targets import FIXED, targets
 from sim2real.errors import UsageError
 
 NAMING = re.compile(
@@ -232,7 +233,7 @@ def test_our_tables_have_every_attribute_of_the_schema():
 def test_an_element_that_is_lost_is_refused(monkeypatch):
     top = mjcf.from_xml_string(PART)
     top.attach(mjcf.from_xml_string(PART))
-    real = late.count
-    monkeypatch.setattr(late, "count", lambda spec: real(spec) | {"geom": min(7, real(spec)["geom"])})
+    real = recreate.count
+    monkeypatch.setattr(recreate, "count", lambda spec: real(spec) | {"geom": min(7, real(spec)["geom"])})
     with pytest.raises(UsageError, match="loses elements when it is composed: 7 of 8 of kind geom are left"):
         top.compile()

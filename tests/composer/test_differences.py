@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from sim2real.composer import engine, mjcf
-from sim2real.composer.mjx.physics import MjxPhysics
+from sim2real.composer import mjcf
+from sim2real.composer.physics import engine
+from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.variation import PhysicsVariator, noises
 from sim2real.errors import UsageError
 

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real.composer.mjx import mjx
+from sim2real.composer.physics.mjx import mjx
 
 
 def _chain(links: int) -> mujoco.MjModel:

@@ -9,13 +9,13 @@ from flax import struct
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.mjx import constants
 from sim2real.composer.observation.observable import Generic, MJCFFeature
+from sim2real.composer.physics.mjx import constants
 from sim2real.composer.variation import PhysicsVariator, distributions, noises
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
 
 pytestmark = pytest.mark.full  # compiles kernels; starting without them is tested in test_warp_start.py
 STEPS, SUBSTEPS = 50, 2

@@ -7,8 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real.composer import engine, mjcf
-from sim2real.composer.c.rendering import Graphics
+from sim2real.composer import mjcf
+from sim2real.composer.physics import engine
+from sim2real.composer.physics.c.rendering import Graphics
 from sim2real.errors import UsageError
 
 SCENE = """
@@ -112,7 +113,7 @@ def test_a_context_of_another_thread_is_left_to_opengl(physics, fake, monkeypatc
         raise RuntimeError("current in another thread")
 
     monkeypatch.setattr(fake, "make_current", refuse)
-    monkeypatch.setattr("sim2real.composer.c.rendering._ABANDONED", [])
+    monkeypatch.setattr("sim2real.composer.physics.c.rendering._ABANDONED", [])
     physics.free()
     assert fake.made == 1  # MuJoCo's would free the objects of whichever context is current
 

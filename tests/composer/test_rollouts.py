@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real.composer.c import rollouts
-from sim2real.composer.c.rollouts import Rollouts, Start
+from sim2real.composer.physics.c import rollouts
+from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
 
 XML = """

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.mjx import warp
+from sim2real.composer.physics.mjx.warp import warp
 from sim2real.errors import UsageError
 
 BALL = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'

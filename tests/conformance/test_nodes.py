@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.graph import BaseNode
 from sim2real.graph.testing import HashInJax, HashInPython, NodeConformance, Value, contracting_node
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 def heard(node, sender):

@@ -7,10 +7,10 @@ from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.testing import Played, RuntimeConformance, jax_hash_node
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compilation.wiring import wire
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.testing import interpret_hashes
-from sim2real.runtime.wiring import wire
 
 KEY = jax.random.key(0)
 

@@ -23,8 +23,8 @@ from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.train.architectures import MLP, init_mlp
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.train.networks.architectures import MLP, init_mlp
 
 SEEDS = Path(os.environ.get("SIM2REAL_SEEDS", Path(__file__).parents[3] / "shared" / "seeds"))
 TUTORIAL = sorted(SEEDS.glob("001_*.txt"))
@@ -35,7 +35,7 @@ IMPORTS = {
     "from rex.base import GraphState, StepState": "from sim2real.graph import GraphState, StepState",
     "from rex.node import BaseNode": "from sim2real.graph import BaseNode",
     "from rex.node import BaseWorld": "from sim2real.graph import BaseWorld",
-    "from rex.jax_utils import tree_dynamic_slice": "from sim2real.graph.tree import tree_dynamic_slice",
+    "from rex.jax_utils import tree_dynamic_slice": "from sim2real.identify.search.pytrees import tree_dynamic_slice",
     "from rex.ppo import Policy": "from sim2real import Policy",
 }
 RATE_HZ, DURATION_S = 50.0, 3.0

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim2real.log.foreign import open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
 
 KINDS = ("sine", "triangle", "chirp", "gait", "multisine")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101")
 read = PIPELINE.load("robot").read

@@ -6,10 +6,10 @@ from foreign_robots import csv, goal_scales, imported, servo
 
 from sim2real.errors import UsageError
 from sim2real.log import ImportMapping, import_file, load_mapping
-from sim2real.log.foreign import open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.mapping import to_toml
-from sim2real.stages.importing import asked_of_model, proposed
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.mapping import to_toml
+from sim2real.stages.import_logs.stage import asked_of_model, proposed
 
 T = np.arange(0, 16, 0.01)
 GOAL = 0.8 * T + 0.4 * np.sin(2 * T) + 0.3 * np.sin(5.3 * T)

@@ -9,13 +9,13 @@ import pytest
 from made_bags import CONTROLLER, GOAL, IMAGE, NUMBERS, STAMPS_NS, STATE, T0_NS, Q
 
 from sim2real import cli
-from sim2real.artifacts.run_folder import newest
+from sim2real.artifacts.run.run_folder import newest
 from sim2real.errors import UsageError
 from sim2real.log import read_log
-from sim2real.log.foreign import open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
 
 SET_BACK = 402_500_000
 COUNT = len(Q)

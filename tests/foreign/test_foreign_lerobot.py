@@ -8,10 +8,10 @@ import pytest
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import ImportMapping, import_file, read_log
-from sim2real.log.foreign import open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
 
 pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 pq = pytest.importorskip("pyarrow.parquet")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.log.foreign import open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.names import meaning
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.signal_names import meaning
 
 BEGIN_S = 1_714_564_800  # 2024-05-01 12:00:00 UTC
 ROWS = "0.0,1.5,2\n0.1,2.5,3\n"

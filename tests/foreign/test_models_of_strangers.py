@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.log.foreign import open_foreign
-from sim2real.robots import model_file
-from sim2real.robots.mjcf import driven, read_model
-from sim2real.robots.mjcf_parameters import ParameterPattern
-from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.stages import described, importing
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.robots.from_model import model_file
+from sim2real.robots.from_model.mjcf import driven, read_model
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.stages.import_logs import stage as import_logs_stage
+from sim2real.stages.pipeline import from_model
 
 FOUR_BAR = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="crank"><joint name="crank" axis="0 1 0" damping=".01"/>
@@ -86,10 +87,10 @@ def test_a_mimic_follower_adds_its_inertia(tmp_path, mimic, inertia, start):
 
 def test_what_was_not_recorded_is_printed(tmp_path, capsys):
     (tmp_path / "jaw.urdf").write_text(urdf('<mimic joint="drive" multiplier="-1"/>'))
-    described.note_held(RobotConfig(tmp_path / "jaw.urdf", ("drive",), ("goal",)))
+    from_model.note_held(RobotConfig(tmp_path / "jaw.urdf", ("drive",), ("goal",)))
     assert "not recorded, free: follow, which an equality without a name moves" in capsys.readouterr().err
     (tmp_path / "jaw.urdf").write_text(urdf(""))
-    described.note_held(RobotConfig(tmp_path / "jaw.urdf", ("drive",), ("goal",), hold=("follow=0.5",)))
+    from_model.note_held(RobotConfig(tmp_path / "jaw.urdf", ("drive",), ("goal",), hold=("follow=0.5",)))
     assert "not recorded, held: follow at 0.5 rad, named" in capsys.readouterr().err
 
 
@@ -102,7 +103,7 @@ def test_meshes_that_only_contacts_need_are_left_out(tmp_path, mesh, more, capsy
     path = tmp_path / "arm.urdf"
     path.write_text(meshed(mesh, more=more))
     assert read_model(path).body("l").mass[0] == 0.1
-    described.note_held(RobotConfig(path, ("j",), ("goal",)))
+    from_model.note_held(RobotConfig(path, ("j",), ("goal",)))
     assert mesh in capsys.readouterr().err
 
 
@@ -224,7 +225,7 @@ def test_models_within_the_budget_are_read(tmp_path, text):
 
 def test_a_name_with_a_line_break_matches_a_pattern(tmp_path):
     (tmp_path / "robot.xml").write_text(model(joint="a&#10;[[terms]]"))
-    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=described.usual_terms(("goal",)))
+    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=from_model.usual_terms(("goal",)))
     assert len(MjcfRobot(config).dynamics()) == 4
 
 
@@ -284,8 +285,8 @@ def test_logs_of_slides_are_in_metres_and_newtons(tmp_path, capsys, file, text, 
         tmp_path / "run.npz", **{"t_s": t, file: q, "force_cmd_n": 1000 * np.gradient(np.gradient(q, axis=0), axis=0)}
     )
     (tmp_path / "robot.xml").write_text(text)
-    asked = importing.asked_of_model(tmp_path / "robot.xml", "axis", joints)
-    mapping, written = importing.proposed(open_foreign(tmp_path / "run.npz"), asked)
+    asked = import_logs_stage.asked_of_model(tmp_path / "robot.xml", "axis", joints)
+    mapping, written = import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)
     assert (mapping.units["sensor"]["position"], mapping.units["actuator"]["torque"]) == units
     assert (units[0] == "m") == ("is in radians" not in written)
     assert (units[0] == "m") == ("x slides" in capsys.readouterr().err)
@@ -296,6 +297,6 @@ def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
     q = 120.0 * np.sin(2 * np.pi * 0.7 * t + np.sin(1.3 * t))[:, None]
     np.savez(tmp_path / "run.npz", t_s=t, q=q, force_cmd=np.gradient(np.gradient(q, axis=0), axis=0))
     (tmp_path / "robot.xml").write_text(AXIS.format(""))
-    asked = importing.asked_of_model(tmp_path / "robot.xml", "axis")
+    asked = import_logs_stage.asked_of_model(tmp_path / "robot.xml", "axis")
     with pytest.raises(UsageError, match=r"(?s)x slides, but .*not in metres.*0.001 for mm"):
-        importing.proposed(open_foreign(tmp_path / "run.npz"), asked)
+        import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)

@@ -5,8 +5,8 @@ import pytest
 from foreign_robots import csv, goal_scales, imported, servo
 
 from sim2real.errors import UsageError
-from sim2real.log import evidence
-from sim2real.log.following import following
+from sim2real.log.importing import evidence
+from sim2real.log.importing.command_response import following
 
 T = np.arange(0, 10, 0.01)
 NOISE = 0.001 * np.random.default_rng(0).standard_normal(len(T))

@@ -8,9 +8,9 @@ from foreign_robots import imported, motion
 from mcap_ros2.writer import Writer
 
 from sim2real.errors import UsageError
-from sim2real.log import evidence
-from sim2real.stages import described
-from sim2real.stages.config import RobotFlags
+from sim2real.log.importing import evidence
+from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 XML = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.05" mass="0.3"/>
   <body pos="0 0 -0.2"><joint name="b" axis="0 1 0"/><geom size="0.05" mass="0.2"/></body></body></worldbody>
@@ -114,7 +114,7 @@ def test_what_is_zero_throughout_is_left_out(tmp_path, monkeypatch, recorded, na
     episode, found = imported(Path("run.npz"))
     assert set(episode.outputs["actuator"]) == {"goal"}
     assert f"left out: '{name}' is 0 throughout" in "\n".join(found.evidence)
-    assert described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description.commands == ("goal",)
+    assert from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description.commands == ("goal",)
 
 
 def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, monkeypatch, recorded):
@@ -128,4 +128,4 @@ def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, mo
         '[nodes.sensor]\nstamps = "t_s"\nfields.position = { source = "q", unit = "rad" }\n'
     )
     told = RobotFlags(mjcf=Path("robot.xml"), mapping=Path("map.toml"))
-    assert described.from_flags(told, ["run.npz"]).description.commands == ("goal",)
+    assert from_model.from_flags(told, ["run.npz"]).description.commands == ("goal",)

@@ -5,10 +5,10 @@ import pytest
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
-from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.planned import truth_header
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.emulated_bus import truth_header
+from sim2real.hardware.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.plant import OperatingMode, load_plant
-from sim2real.hardware.truth import TruthLog, read_truth
 
 PLANTS = Path(__file__).parent / "plants.py"
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.packets import Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
 
 pytestmark = pytest.mark.realtime
 

@@ -14,14 +14,14 @@ import pytest
 from dynamixel_sdk import GroupBulkRead, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
-from sim2real.hardware import emulator
+from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL, StatusError
-from sim2real.hardware.embedded import EmbeddedRobot
-from sim2real.hardware.packets import Instruction, Parser
+from sim2real.hardware.emulation import emulator
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.hardware.plant import load_plant
-from sim2real.hardware.truth import Kind, TruthLog, read_truth
 
 pytestmark = pytest.mark.realtime
 
@@ -237,7 +237,7 @@ def test_truth_file_can_be_read_at_any_time_and_cut_anywhere(start_robot, tmp_pa
 
 
 def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
-    command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", f"{PLANTS}:Ramp"]
+    command = [sys.executable, "-m", "sim2real.hardware.emulation.emulator", "--plant", f"{PLANTS}:Ramp"]
     command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig"]
     began_s = time.monotonic()
     process = subprocess.Popen(
@@ -256,7 +256,7 @@ def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
 
 def test_robot_goes_when_its_parent_is_killed(tmp_path):
     code = (
-        "import time; from sim2real.hardware.embedded import EmbeddedRobot;"
+        "import time; from sim2real.hardware.emulation.embedded import EmbeddedRobot;"
         "from sim2real.hardware.dynamixel.emulation import EmulatorConfig;"
         f"print(EmbeddedRobot({f'{PLANTS}:Ramp'!r}, EmulatorConfig()).pid, flush=True); time.sleep(60)"
     )
@@ -276,7 +276,8 @@ def _env(tmp_path):
 
 def test_import_is_light():
     code = (
-        "import sys, sim2real.hardware.emulator, sim2real.hardware.embedded, sim2real.hardware.gate;"
+        "import sys, sim2real.hardware.emulation.emulator, sim2real.hardware.emulation.embedded;"
+        "import sim2real.hardware.safety.gate;"
         "print([m for m in ('jax', 'mujoco', 'serial', 'sim2real.graph', 'sim2real.log') if m in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

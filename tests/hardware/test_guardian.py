@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from sim2real.errors import SAFETY_STOP, SafetyStop
-from sim2real.hardware import emulator, guardian, guardian_process
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.emulation import emulator
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
+from sim2real.hardware.safety import guardian, guardian_process
 from sim2real.runtime import clock
 
 pytestmark = pytest.mark.realtime

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim2real.hardware import models
+from sim2real.hardware.bus import models
 from sim2real.hardware.device import Alone
 from sim2real.hardware.dynamixel import models as dynamixel
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus

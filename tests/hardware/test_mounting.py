@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, Device, Reading, Transaction
-from sim2real.hardware.gate import GateConfig
+from sim2real.hardware.emulation.mounted_plant import MountedPlant
 from sim2real.hardware.joint import Joint, Mounting
-from sim2real.hardware.mounted import MountedPlant
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.rig import Rig
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 STEP_S, N = 0.02, 2
 PLAIN = ((0.0, 1, 1.0),) * N

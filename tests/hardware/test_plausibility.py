@@ -11,9 +11,9 @@ from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.plausibility import Plausibility
-from sim2real.hardware.rig import Rig
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.plausibility import Plausibility
+from sim2real.hardware.safety.rig import Rig
 
 pytestmark = pytest.mark.realtime
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
 from sim2real.hardware.dynamixel.link import BusLink
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.packets import Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.rig import Rig
-from sim2real.hardware.truth import Kind
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 pytestmark = pytest.mark.realtime
 
@@ -230,10 +230,10 @@ import time
 import numpy as np
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.drive import PositionDrive
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.packets import Instruction
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.rig import Rig
+from sim2real.hardware.safety.rig import Rig
 servos = DynamixelServos(BusConfig({robot.port!r}, silence_s=0.1), {IDS!r}, PositionDrive(800, 20.0))
 rig = Rig(servos, GateConfig(**{GATE!r}))
 rig.start()

@@ -5,8 +5,8 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim2real.hardware.bus.packets import Instruction, Packet, Parser
 from sim2real.hardware.dynamixel.protocol import HEADER, PROTOCOL, crc16
-from sim2real.hardware.packets import Instruction, Packet, Parser
 
 build = PROTOCOL.build
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.packets import Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.rig import Rig
-from sim2real.hardware.truth import Kind
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 pytestmark = pytest.mark.realtime
 

@@ -7,9 +7,9 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
+from sim2real.hardware.emulation.twin import TwinPlant
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.twin import TwinPlant
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.packets import BROADCAST_ID, Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import ConfigurablePlant
-from sim2real.hardware.truth import Kind
 
 MS = 1_000_000
 STEP_NS = 500_000

@@ -9,12 +9,12 @@ import pytest
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import run_search
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import uncertainty
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.uncertainty.uncertainty import uncertainty
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
 LEAD_S = 0.00025

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sim2real.identify.broyden import corrected
+from sim2real.identify.problem.broyden import corrected
 
 TIMES = np.linspace(0.0, 3.0, 40)
 TRUTH = np.array([2.0, 0.7, 0.3])

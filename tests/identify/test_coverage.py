@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.identify.excitation import band, motion, motion_of, sampling, speed, spread
+from sim2real.identify.uncertainty.recording_coverage import band, motion, motion_of, sampling, speed, spread
 
 T = np.arange(0, 40, 0.02)
 

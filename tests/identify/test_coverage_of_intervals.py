@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify import identifiability, uncertainty
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span, cut
-from sim2real.identify.sizes import padded
-from sim2real.identify.uncertainty import Linearised
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span, cut
+from sim2real.identify.problem.sizes import padded
+from sim2real.identify.uncertainty import identifiability, uncertainty
+from sim2real.identify.uncertainty.uncertainty import Linearised
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SEGMENTS, SEGMENT_S, RATE_HZ, MAX_DELAY_S = 10, 1.5, 50.0, 0.06
 TRUTH = {

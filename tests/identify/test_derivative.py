@@ -9,8 +9,8 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
-from sim2real.identify.derivative import finite_differences
-from sim2real.identify.residuals import SegmentResiduals
+from sim2real.identify.problem.derivative import finite_differences
+from sim2real.identify.problem.residuals import SegmentResiduals
 
 POINT = jnp.array([0.4, -0.7, 1.1])
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_folds import BIAS, CONFIG, LENGTH_S, Model, lag_log, spans
 
-from sim2real.identify.each import identify_each
 from sim2real.identify.fit import fit
+from sim2real.identify.uncertainty.per_recording import identify_each
 
 
 def test_each_recording_says_what_it_says_alone():

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from test_folds import CONFIG, LENGTH_S, TICK_S, Lag, Level, Model, lag_log, spans
 
-from sim2real.identify import ensemble
 from sim2real.identify.fit import fit
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.refine import refine
-from sim2real.identify.terms import Selection
-from sim2real.identify.uncertainty import from_linearised, linearise
-from sim2real.stages.identified import Findings
+from sim2real.identify.search.refine import refine
+from sim2real.identify.uncertainty import ensemble
+from sim2real.identify.uncertainty.uncertainty import from_linearised, linearise
+from sim2real.identify.validation.optional_terms import Selection
+from sim2real.stages.estimation.estimate import Findings
 
 
 def of(found, every=None, choice=None):

@@ -19,12 +19,12 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.prediction import samples
-from sim2real.identify.problem import Problem
-from sim2real.identify.refine import Refined
-from sim2real.identify.robust import tamed
-from sim2real.identify.search import SearchResult
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.robust import tamed
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.refine import Refined
+from sim2real.identify.search.search import SearchResult
+from sim2real.identify.validation.prediction import samples
 
 TICK_S, PERIOD_S, DURATION_S = 0.01, 0.02, 8.0
 GAIN, TIME_CONSTANT_S = 1.7, 0.13

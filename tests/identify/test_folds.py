@@ -15,11 +15,11 @@ from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit, refit
-from sim2real.identify.folds import Fold, folds_of, leave_out, moving
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.refine import refine
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.refine import refine
+from sim2real.identify.validation.folds import Fold, folds_of, leave_out, moving
 
 TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
 GAIN, TAU_S, BIAS, NOISE = 1.7, 0.13, 0.2, 0.002

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.identify.identifiability import from_linearised
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Linearised
+from sim2real.identify.uncertainty.identifiability import from_linearised
+from sim2real.identify.uncertainty.uncertainty import Linearised
 
 
 def checked(table, slopes, segment_s=1.0, segments=10, initial_state="rest", prior=None):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.prediction import errors, samples
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import centred, sum_of
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.uncertainty.uncertainty import centred, sum_of
+from sim2real.identify.validation.prediction import errors, samples
 
 SETTLE_S = 0.3
 

@@ -9,9 +9,9 @@ from test_links import COMMAND_DELAY_S, COUNT_RAD, GAIN, GRID, NOISE_RAD, PERIOD
 
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
-from sim2real.identify.jitter import LateCommands, Variances, deviation, one_later
-from sim2real.identify.likelihood import Seen
-from sim2real.identify.links import find, links
+from sim2real.identify.delays.jitter import LateCommands, Variances, deviation, one_later
+from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.links import find, links
 
 SENT_S, PART_S, LATER_S = 0.02, 1.0, 0.002
 

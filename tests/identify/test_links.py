@@ -8,10 +8,10 @@ from scipy.signal import lfilter
 
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.errors import UsageError
-from sim2real.identify.likelihood import Seen
-from sim2real.identify.links import describe, find, links, measured
-from sim2real.identify.losses import losses
-from sim2real.stages.identified import show
+from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.links import describe, find, links, measured
+from sim2real.identify.delays.lost_messages import losses
+from sim2real.stages.estimation.estimate import show
 
 GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]
 COMMAND_DELAY_S, NOISE_RAD, COUNT_RAD = 0.004, 1e-3, 1e-3

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.identify.ensemble import posterior
-from sim2real.identify.identifiability import from_linearised as judged
 from sim2real.identify.model import Channel
-from sim2real.identify.negligible import negligible
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Linearised, from_linearised
+from sim2real.identify.uncertainty.ensemble import posterior
+from sim2real.identify.uncertainty.identifiability import from_linearised as judged
+from sim2real.identify.uncertainty.negligible import negligible
+from sim2real.identify.uncertainty.uncertainty import Linearised, from_linearised
 
 SEGMENTS, SAMPLES = 30, 40
 LOW, HIGH = 1e-4, 10.0

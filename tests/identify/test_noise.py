@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.noise import Noise
-from sim2real.identify.noise import noises, widening
+from sim2real.artifacts.estimation.noise import Noise
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Linearised
+from sim2real.identify.uncertainty.noise import noises, widening
+from sim2real.identify.uncertainty.uncertainty import Linearised
 
 QUANTUM, DEVIATION, BIAS = 0.0015, 0.004, 0.003
 SEGMENTS, LENGTH = 60, 80

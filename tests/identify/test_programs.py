@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_folds import CONFIG, DURATION_S, Model, lag_log
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.programs import Program
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.programs import Program
+from sim2real.identify.problem.segments import Span
 
 LENGTH_S = 0.93
 

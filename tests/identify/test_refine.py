@@ -12,9 +12,9 @@ from sim2real.errors import Sim2RealError
 from sim2real.identify import fit as fitting
 from sim2real.identify.config import FitConfig
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.problem import Evaluation
-from sim2real.identify.refine import refine, remaining
-from sim2real.identify.uncertainty import from_linearised, linearise
+from sim2real.identify.problem.problem import Evaluation
+from sim2real.identify.search.refine import refine, remaining
+from sim2real.identify.uncertainty.uncertainty import from_linearised, linearise
 
 WIDE = 20.0
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_folds import BIAS, CONFIG, GAIN, NOISE, TAU_S, Model, lag_log
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 
 LENGTH_S, SPLIT_S = 0.93, 0.4
 SPANS = [Span(0, 0.4 + 0.9 * i, fitted=i != 4) for i in range(9)]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.identify.robust import tamed
+from sim2real.identify.problem.robust import tamed
 
 REACH = 2.5
 CLOSED = {

@@ -13,8 +13,8 @@ import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.config import FitConfig
-from sim2real.identify.engine import Choice, check_devices
-from sim2real.identify.search import search, strategies
+from sim2real.identify.problem.engine import Choice, check_devices
+from sim2real.identify.search.search import search, strategies
 
 BOTTOM = np.array([1.0, -2.0])
 INCOMPLETE = {"RandomSearch": "sampling_fn", "SV_CMA_ES": "num_populations", "SV_Open_ES": "num_populations"}
@@ -240,7 +240,7 @@ DIVIDED = """
 from dataclasses import replace
 import numpy as np
 from test_search import CONFIG, bowl
-from sim2real.identify.search import search
+from sim2real.identify.search.search import search
 
 config, programs, found = replace(CONFIG, generations=40, restarts=2), {}, []
 for devices in (1, 2):

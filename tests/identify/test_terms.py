@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.terms import Selection, Statistics, below, choose, narrowed, votes
+from sim2real.identify.validation.optional_terms import Selection, Statistics, below, choose, narrowed, votes
 
 PARTS, ROWS, NOISE = 6, 200, 0.1
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim2real.identify import uncertainty
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Linearised, centred, from_linearised, sum_of, time_shift
+from sim2real.identify.uncertainty import uncertainty
+from sim2real.identify.uncertainty.uncertainty import Linearised, centred, from_linearised, sum_of, time_shift
 
 WIDE = 1e4
 

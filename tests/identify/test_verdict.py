@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Prediction
-from sim2real.identify import verdict
-from sim2real.identify.identifiability import Check
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.round_trip import RoundTrip
-from sim2real.identify.verdict import Position, scores
+from sim2real.identify.uncertainty.identifiability import Check
+from sim2real.identify.uncertainty.round_trip import RoundTrip
+from sim2real.identify.validation import verdict
+from sim2real.identify.validation.verdict import Position, scores
 
 DELAYS = ("sensor_delay", "actuator_delay")
 TABLE = ParameterTable(

@@ -9,16 +9,16 @@ from dataclasses import asdict
 
 import pytest
 
-from sim2real.hardware.truth import read_truth
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.hardware.emulation.truth import read_truth
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 FAULTY = """
 import time
 from dataclasses import replace
 import numpy as np
-from sim2real.robots import hardware
-from sim2real.robots.loop import control_nodes
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.robots.control_loop import hardware
+from sim2real.robots.control_loop.loop import control_nodes
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pendulum = load_pipeline("pendulum")
 robot = pendulum.load()
@@ -55,7 +55,7 @@ def make_pipeline(tmp_path, monkeypatch):
         folder = tmp_path / "pipelines" / name
         folder.mkdir(parents=True)
         (folder / "__init__.py").write_text(
-            "from sim2real.stages.pipeline import Pipeline\n"
+            "from sim2real.stages.pipeline.pipeline import Pipeline\n"
             f"PIPELINE = Pipeline(name={name!r}, summary='pendulum with a fault', package=__name__)\n"
         )
         (folder / "robot.py").write_text(FAULTY + textwrap.dedent(body) + FAULTS)
@@ -69,7 +69,7 @@ def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, its truth file, how to stop it."""
     embedded = load_pipeline("pendulum").load().embedded
     path = tmp_path / "truth.bin"
-    command = [sys.executable, "-m", "sim2real.hardware.emulator", "--plant", embedded.plant]
+    command = [sys.executable, "-m", "sim2real.hardware.emulation.emulator", "--plant", embedded.plant]
     command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig", "--truth", str(path)]
     command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(embedded.emulator).items() if v is not None]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

@@ -10,8 +10,8 @@ from shared_run import copied
 
 from sim2real import cli, errors
 from sim2real.policy.bundle import sealed
-from sim2real.stages.parameters import open_identification
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.open_parameters import open_identification
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 

@@ -9,8 +9,8 @@ import pytest
 
 from sim2real.artifacts.recording import Recording
 from sim2real.log import read_log
-from sim2real.stages.identify import identify
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.identify.stage import identify
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 DATASETS = Path(__file__).parents[2] / "datasets"
 MANIFEST = json.loads((DATASETS / "manifest.json").read_text())["logs"]

@@ -18,12 +18,12 @@ from wiretap import Wiretap
 from sim2real import cli
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
 from sim2real.log.reader import read_log, read_session
 from sim2real.policy import PolicyContract, save_bundle
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 
@@ -238,4 +238,4 @@ def test_a_session_without_a_rig_of_a_device_is_refused(make_pipeline, tmp_path)
     code, _, err = call("record", name, "--dry-run")
     assert code == 2
     assert "this robot's session has a Rig for a rig" in err
-    assert "hint: make its `rig` a sim2real.hardware.rig.Rig" in err
+    assert "hint: make its `rig` a sim2real.hardware.safety.rig.Rig" in err

@@ -8,8 +8,8 @@ import pytest
 from live_robots import assert_torque_ends_off, manifest_of, motor
 
 from sim2real import cli, errors
+from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import read_log
 
 pytestmark = pytest.mark.realtime

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from live_robots import PATIENT, assert_torque_ends_off, manifest_of, motor, wait_until_running
 
-from sim2real.artifacts.manifest import read_manifest
+from sim2real.artifacts.run.manifest import read_manifest
 from sim2real.errors import SAFETY_STOP
+from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
 pytestmark = pytest.mark.realtime

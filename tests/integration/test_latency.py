@@ -4,10 +4,10 @@ import pytest
 from live_robots import PATIENT, manifest_of
 
 from sim2real import cli
-from sim2real.artifacts.latency import Latency
 from sim2real.artifacts.recording import Recording
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.truth import true_values
+from sim2real.stages.identify.true_values import true_values
+from sim2real.stages.latency.result import Latency
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 

@@ -12,8 +12,8 @@ import pytest
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 

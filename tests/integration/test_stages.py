@@ -15,7 +15,7 @@ import sim2real
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.run_folder import STAGES, finished, newest
+from sim2real.artifacts.run.run_folder import STAGES, finished, newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 

@@ -5,9 +5,9 @@ import select
 import threading
 import tty
 
+from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.packets import Instruction, Parser
 
 # Torque Enable, and Goal PWM, Goal Current, Goal Velocity, Goal Position: what makes a DYNAMIXEL X move.
 TORQUE = (reg.TORQUE_ENABLE.address, reg.TORQUE_ENABLE.end)

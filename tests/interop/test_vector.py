@@ -11,7 +11,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 
 from sim2real.errors import UsageError  # noqa: E402
 from sim2real.interop import robot_environment, vector_env  # noqa: E402
-from sim2real.stages.pipeline import load_pipeline  # noqa: E402
+from sim2real.stages.pipeline.pipeline import load_pipeline  # noqa: E402
 
 COPIES = 3
 

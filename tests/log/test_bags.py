@@ -10,9 +10,9 @@ from mcap_ros2.writer import Writer as RosWriter
 
 from sim2real.errors import UsageError
 from sim2real.log import import_file
-from sim2real.log.foreign import open_foreign
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
 
 JOINTS = ["pan", "lift", "grip"]
 HEADER = """std_msgs/Header header

@@ -4,7 +4,7 @@ import followers
 import numpy as np
 import pytest
 
-from sim2real.log import evidence, following
+from sim2real.log.importing import command_response, evidence
 
 
 @pytest.fixture(scope="module")
@@ -13,8 +13,8 @@ def recorded():
 
 
 def found(t, goal, q):
-    held, joined, period_s = following.on_grid(t, goal, t, q)
-    return following.following(held, joined, period_s)
+    held, joined, period_s = command_response.on_grid(t, goal, t, q)
+    return command_response.following(held, joined, period_s)
 
 
 def test_lag_slope_and_correlation_are_those_of_the_recording(recorded):
@@ -58,8 +58,8 @@ def test_torque_that_is_off_says_nothing(recorded):
     t, goal, q = recorded
     acting = t < 6.0
     fallen = np.where(acting[:, None], q, -1.5)
-    held, joined, period_s = following.on_grid(t, goal, t, fallen, acting)
-    assert np.diag(following.following(held, joined, period_s).r).min() > 0.97
+    held, joined, period_s = command_response.on_grid(t, goal, t, fallen, acting)
+    assert np.diag(command_response.following(held, joined, period_s).r).min() > 0.97
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,6 @@ def test_the_grid_of_dated_stamps_does_not_drift():
     """Dates in float64 are rounded to 0.24 us, and the median step is off by half of that."""
     t = (1_700_000_000_000_000_000 + 5_000_000 * np.arange(20_000)) * 1e-9
     values = np.arange(20_000.0)[:, None]
-    held, joined, period = following.on_grid(t, values, t, values)
+    held, joined, period = command_response.on_grid(t, values, t, values)
     assert period == pytest.approx(0.005, abs=1e-10)
     np.testing.assert_allclose(held, joined, atol=1e-3)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.run_folder import newest
+from sim2real.artifacts.run.run_folder import newest
 from sim2real.log import import_file, read_log
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
 PIPELINE = """
-from sim2real.stages.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 PIPELINE = Pipeline(name="rig", summary="a rig", package=__name__)
 """

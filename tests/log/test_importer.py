@@ -16,7 +16,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.log import ImportMapping, import_file, read_log
-from sim2real.log.importer import facts, write_log
+from sim2real.log.importing.importer import facts, write_log
 from sim2real.log.reader import summary
 
 
@@ -266,8 +266,8 @@ def test_a_timeline_needs_no_connections(file):
 
 
 def test_identification_takes_the_log(file, tmp_path, recwarn):
-    from sim2real.stages.pipeline import Pipeline
-    from sim2real.stages.recordings import open_recording
+    from sim2real.stages.pipeline.open_log import open_recording
+    from sim2real.stages.pipeline.pipeline import Pipeline
 
     write_log(tmp_path / "run.mcap", import_file(file, mapping()), mapping())
     episode = open_recording(tmp_path / "run.mcap", Pipeline("rig", "a rig", "rig")).episode

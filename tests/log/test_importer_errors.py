@@ -12,7 +12,7 @@ from foreign_files import COUNT, MAPPING, STAMPS_US, TOML, Q, U
 
 from sim2real.errors import UsageError
 from sim2real.log import ImportMapping, import_file, load_mapping
-from sim2real.log.foreign import open_foreign
+from sim2real.log.importing.files.foreign import open_foreign
 
 RIG = ImportMapping.from_dict(MAPPING)
 

@@ -6,11 +6,11 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.log import import_file
-from sim2real.log.foreign import joined, open_foreign
-from sim2real.log.importer import import_opened
-from sim2real.log.mapping import load_mapping, to_toml
-from sim2real.log.proposal import propose
-from sim2real.log.quantities import Asked
+from sim2real.log.importing.files.foreign import joined, open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.mapping import load_mapping, to_toml
+from sim2real.log.importing.proposal import propose
+from sim2real.log.importing.quantities import Asked
 
 
 @pytest.fixture(scope="module")

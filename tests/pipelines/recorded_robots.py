@@ -12,11 +12,11 @@ import pytest
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.schedule import draw
-from sim2real.identify.leaves import get_leaf
-from sim2real.identify.prediction import samples
-from sim2real.log.importer import import_file
-from sim2real.log.mapping import load_mapping
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.identify.parameter_paths import get_leaf
+from sim2real.identify.validation.prediction import samples
+from sim2real.log.importing.importer import import_file
+from sim2real.log.importing.mapping import load_mapping
+from sim2real.runtime.compilation.compiled import CompiledGraph
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))

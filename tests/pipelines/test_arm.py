@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli, composer
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("arm")
 ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")

@@ -11,9 +11,9 @@ from recorded_robots import check_leaves, check_start, effects, episode, predict
 from scipy.optimize import least_squares
 
 from sim2real.identify.fit import fit
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("disk")
 PERIOD_S, STEP_S = 0.025, 0.0001

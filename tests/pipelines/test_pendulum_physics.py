@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sim2real.hardware.plant import OperatingMode
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("pendulum")
 MODEL, PLANT = (PIPELINE.load(name) for name in ("model", "plant"))

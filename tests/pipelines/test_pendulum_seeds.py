@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.stages.identify import identify
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.recordings import open_recording
+from sim2real.stages.identify.stage import identify
+from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "chirp.mcap"
 SEEDS = range(5)

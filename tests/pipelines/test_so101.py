@@ -10,10 +10,10 @@ import pytest
 
 from sim2real import cli, composer
 from sim2real.errors import UsageError
-from sim2real.hardware.config import GateLimits
 from sim2real.hardware.feetech import registers
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.hardware.safety.config import GateLimits
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101")
 ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from recorded_robots import check_leaves, check_start, effects, episode, predictions, public, rmse
 
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("xl330")
 MAX_DELAY_S = PIPELINE.identify.max_delay_s

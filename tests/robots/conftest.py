@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_robot import VALUES, PairRobot, play_in_a_graph
 
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,10 @@ import numpy as np
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.datasheet import DataSheet
-from sim2real.robots.messages import Goals
-from sim2real.robots.parts import GoalTask, Servo, ServoDriven
-from sim2real.robots.servo_robot import ServoRobot, Servos
+from sim2real.robots.control_loop.messages import Goals
+from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.parts import GoalTask, Servo, ServoDriven
+from sim2real.robots.servo.servo_robot import ServoRobot, Servos
 
 SHEET = DataSheet(stall=1.4, damping=0.2, armature=0.01, friction=0.02, p_gain=1200, profile_rad_s=2.0)
 

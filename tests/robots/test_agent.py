@@ -9,8 +9,8 @@ from flax import struct
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.testing import NodeConformance
-from sim2real.robots.agent import AgentParams, DirectAgent, GoalAgent
-from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.control_loop.messages import Goals, JointReading
+from sim2real.robots.servo.agent import AgentParams, DirectAgent, GoalAgent
 
 LOW, HIGH, RATE_HZ = np.array([-1.0, -0.5]), np.array([0.8, 1.2]), 50.0
 AIM, START = np.array([0.25, -0.5, 2.0]), np.array([0.1, -0.2])

@@ -4,7 +4,7 @@ import pytest
 from small_robot import PairRobot
 
 from sim2real.errors import UsageError
-from sim2real.robots.base import RecordedRobot, Robot, checked
+from sim2real.robots.contract import RecordedRobot, Robot, checked
 from sim2real.robots.roles import Roles
 
 
@@ -23,7 +23,7 @@ def test_all_that_is_missing_or_wrong_is_named_at_once():
     for part in ("has no units: field -> unit", "has rate_hz = -50.0", "has action = ('speed',)", "has no observation"):
         assert part in said
     assert "has command" not in said
-    assert caught.value.hint == "sim2real.robots.base.Robot says what each of them is"
+    assert caught.value.hint == "sim2real.robots.contract.Robot says what each of them is"
 
 
 def test_a_recorded_robot_needs_less():

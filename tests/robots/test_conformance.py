@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.robots import testing
 from sim2real.robots.roles import Roles
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 

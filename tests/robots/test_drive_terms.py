@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.composer.c.rollouts import Rollouts, Start
+from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.refine import refine
-from sim2real.identify.segments import Span
-from sim2real.identify.uncertainty import linearise
-from sim2real.robots.mjcf import driven
-from sim2real.robots.mjcf_parameters import (
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.search.refine import refine
+from sim2real.identify.uncertainty.uncertainty import linearise
+from sim2real.robots.from_model.mjcf import driven
+from sim2real.robots.from_model.mjcf_parameters import (
     ASKED,
     LAWS,
     OPTIONAL,
@@ -27,8 +27,8 @@ from sim2real.robots.mjcf_parameters import (
     optional,
     tilted,
 )  # fmt: skip
-from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
-from sim2real.stages import left_out
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
+from sim2real.stages.estimation import held_out_parts
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 
 MASS, LENGTH, STEP_S = 0.5, 0.12, 0.001
@@ -204,27 +204,27 @@ def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
 def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     terms = (*usual_terms(("goal",)), PER_TURN)
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms[:-1]))
-    assert left_out.offering(robot, "own") is robot
+    assert held_out_parts.offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
-    table = left_out.offering(robot, "auto").identifiable(0.02).parameters
+    table = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
     assert {p.term for p in table} - {""} == set(OPTIONAL) - set(ASKED)
     assert table.terms == ()  # none is free by itself
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms))
-    every = left_out.widest(left_out.offering(robot, "all").identifiable(0.02).parameters, "all")
+    every = held_out_parts.widest(held_out_parts.offering(robot, "all").identifiable(0.02).parameters, "all")
     assert set(every.terms) == set(OPTIONAL)
     off = {p.name: p.without for p in every if p.term}
     assert off == dict.fromkeys(set(ON) - {"cogging_per_turn"}, 0.0) | {"stribeck_rad_s": 0.1}
     values = every.decode(every.start())
     either = {"bias", "cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin", "tilt_x", "tilt_y"}
     assert all(values[what] > 0.0 for what in set(off) - either)  # at a bound nothing would move
-    assert left_out.widest(table, "load").terms == ("load",)
+    assert held_out_parts.widest(table, "load").terms == ("load",)
 
 
 @pytest.mark.parametrize("one", ASKED)
 def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_file, one):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_terms(("goal",)), PER_TURN)))
-    table = left_out.offering(robot, f"load,{one}").identifiable(0.02).parameters
-    assert left_out.widest(table, f"load,{one}").terms == ("load", one)
+    table = held_out_parts.offering(robot, f"load,{one}").identifiable(0.02).parameters
+    assert held_out_parts.widest(table, f"load,{one}").terms == ("load", one)
     own = optional((ParameterPattern(OPTIONAL[one][0]),), "auto")
     assert {t.term for t in own} == set(OPTIONAL) - set(ASKED) | {one}
     assert [t.what for t in own if t.term == one] == [OPTIONAL[one][0]], "a robot may feel tilt_y and not tilt_x"
@@ -233,7 +233,7 @@ def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_f
 def test_cogging_is_refused_without_how_often_it_repeats(model_file):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
     with pytest.raises(UsageError, match="how often"):
-        left_out.offering(robot, "cogging")
+        held_out_parts.offering(robot, "cogging")
     with pytest.raises(UsageError, match="counted"):
         ParameterPattern("cogging_per_turn")
     with pytest.raises(UsageError, match="whole robot"):
@@ -250,8 +250,8 @@ def test_an_encoder_off_its_axis_is_read_back():
 
 def test_parameters_of_a_term_bring_it_back(model_file):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
-    assert left_out.having(robot, ["kp", "delay", "round_trip_delay"]) is robot
-    assert left_out.having(robot, ["kp", "load"]).make_nodes()[2].law is not None
+    assert held_out_parts.having(robot, ["kp", "delay", "round_trip_delay"]) is robot
+    assert held_out_parts.having(robot, ["kp", "load"]).make_nodes()[2].law is not None
 
 
 def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():

@@ -13,8 +13,8 @@ from small_robot import SHEET, VALUES, PairRobot, PairTask
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 
 MAX_DELAY_S, SEGMENT_S = 0.03, 0.4
 LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03), "friction_left": (0.01, 0.1)}

@@ -12,8 +12,8 @@ from test_engines import MAX_DELAY_S, SEGMENT_S, ConvergedRobot, pair_log
 
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import run_search
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 
 pytestmark = pytest.mark.full  # MJX compiles for two minutes
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flax import struct
 
+from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode
@@ -21,11 +21,11 @@ from sim2real.identify.export.terms import find_terms
 from sim2real.identify.mjcf import identified_mjcf
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
-from sim2real.robots.mjcf_parameters import ParameterPattern
-from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.recorded import LoggedRobot
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay
 

@@ -9,13 +9,13 @@ import pytest
 
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.config import GateLimits
+from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, read_truth
+from sim2real.hardware.safety.config import GateLimits
 from sim2real.log.reader import read_log
-from sim2real.robots.hardware import Excitation
-from sim2real.robots.messages import Goals
-from sim2real.stages.session import run_episode
+from sim2real.robots.control_loop.hardware import Excitation
+from sim2real.robots.control_loop.messages import Goals
+from sim2real.stages.on_robot.episode import run_episode
 
 pytestmark = pytest.mark.realtime
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.couplings import couplings_of, groups
-from sim2real.robots.holding import apply, plan
-from sim2real.robots.mjcf import driven, joints_of
-from sim2real.robots.mjcf_parameters import ParameterPattern
-from sim2real.robots.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.couplings import couplings_of, groups
+from sim2real.robots.from_model.holding import apply, plan
+from sim2real.robots.from_model.mjcf import driven, joints_of
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.worlds.closing import Closing
 
 

@@ -9,9 +9,9 @@ from small_robot import VALUES
 from test_engines import MAX_DELAY_S, SEGMENT_S, ConvergedRobot, pair_log
 
 from sim2real.identify.config import FitConfig
-from sim2real.identify.initial_states import separated
-from sim2real.identify.problem import Problem
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.initial_states import separated
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from sim2real.graph.node import BaseWorld
 from sim2real.graph.schedule import derive, draw
 from sim2real.graph.windows import bursty_episodes, newest_message
 from sim2real.identify.parameters import ParameterTable
-from sim2real.robots.loop import (
+from sim2real.robots.control_loop.loop import (
     BURST,
     DELAYS,
     DelayParams,
@@ -25,7 +25,7 @@ from sim2real.robots.loop import (
     recorded_loop,
     simulated_loop,
 )
-from sim2real.runtime.bursts import make_room
+from sim2real.runtime.compilation.bursts import make_room
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
 VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}

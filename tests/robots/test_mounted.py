@@ -9,19 +9,19 @@ from mujoco import MjModel
 from small_robot import PairRobot, PairTask
 
 from sim2real.errors import UsageError
-from sim2real.hardware.config import GateLimits
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.emulation.truth import Kind, read_truth
+from sim2real.hardware.emulation.twin import TwinPlant
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind, read_truth
-from sim2real.hardware.twin import TwinPlant
+from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.fit import fit
-from sim2real.identify.segments import Span
+from sim2real.identify.problem.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.stages.config import RecordConfig
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.session import run_episode
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.on_robot.episode import run_episode
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PATIENT = GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6)
 GEARS = (2.0, 0.5)

@@ -6,10 +6,10 @@ from small_robot import PairRobot, PairTask
 
 from sim2real.composer.world import ComposedWorld, Observations
 from sim2real.errors import UsageError
-from sim2real.identify.engine import choose
-from sim2real.robots.parts import GOAL
-from sim2real.robots.simulated import ServoWorld
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.identify.problem.engine import choose
+from sim2real.robots.servo.parts import GOAL
+from sim2real.robots.servo.simulated_world import ServoWorld
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 class Steered(PairTask):

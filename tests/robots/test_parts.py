@@ -6,7 +6,7 @@ from small_robot import SHEET, PairTask, play_in_a_graph, play_on_c
 
 from sim2real import composer
 from sim2real.errors import UsageError
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 STEP_S = 0.005
 

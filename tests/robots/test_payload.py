@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sim2real.hardware.plant import load_plant
-from sim2real.stages.left_out import widest
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.estimation.held_out_parts import widest
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.policy import ActionTerm, PolicyContract
 from sim2real.policy.bundle import make_runner
-from sim2real.robots.policy_node import PolicyNode, in_numpy
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.train.networks import Policy
+from sim2real.robots.control_loop.policy_node import PolicyNode, in_numpy
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.train.networks.policy import Policy
 
 STEPS = 4
 

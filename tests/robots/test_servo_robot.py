@@ -11,10 +11,10 @@ from small_robot import SHEET, VALUES, PairRobot
 
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.episode import named_leaves
-from sim2real.robots import standard
-from sim2real.robots.agent import AgentParams
-from sim2real.robots.datasheet import DataSheet
-from sim2real.robots.messages import Decision, JointReading
+from sim2real.robots.control_loop.messages import Decision, JointReading
+from sim2real.robots.servo import parameters
+from sim2real.robots.servo.agent import AgentParams
+from sim2real.robots.servo.datasheet import DataSheet
 
 
 class Slouching(PairRobot):
@@ -160,13 +160,13 @@ def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
 
 def test_joints_may_have_any_of_the_servos_parameters_for_themselves():
     joints = ("left", "right")
-    found = standard.parameters(SHEET, joints, own=("damping", "friction"))
+    found = parameters.parameters(SHEET, joints, own=("damping", "friction"))
     own = ["damping_left", "damping_right", "friction_left", "friction_right"]
     assert [p.name for p in found] == ["gain", *own[:2], "armature", *own[2:]]
     values = {p.name: p.nominal for p in found} | {"damping_right": 0.5, "saturation_left": 0.1}
-    placed = standard.place(values, SHEET, joints, 0.002)
+    placed = parameters.place(values, SHEET, joints, 0.002)
     np.testing.assert_allclose(placed["damping"], [SHEET.damping, 0.5], rtol=1e-6)
     np.testing.assert_allclose(placed["most"][:, 1], SHEET.gain * np.array([0.1, SHEET.full_rad]), rtol=1e-6)
     del values["damping_left"]
     with pytest.raises(KeyError, match="damping_left"):
-        standard.place(values, SHEET, joints, 0.002)
+        parameters.place(values, SHEET, joints, 0.002)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sim2real.log.reader import read_log
-from sim2real.stages import record
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.record import stage as record_stage
 
 pytestmark = pytest.mark.realtime
 
@@ -38,7 +38,7 @@ def head(tmp_path, monkeypatch):
 def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     gate = replace(head.record.gate, servo_watchdog_s=0.5)  # a busy machine is not what is tested
     config = replace(head.record, duration_s=3.0, gate=gate)
-    made = record.run(head, config, tmp_path / "runs", None)
+    made = record_stage.run(head, config, tmp_path / "runs", None)
     log = read_log(made.output("log"))
     goal, position = log.outputs["actuator"]["goal"], log.outputs["sensor"]["position"]
     assert goal.shape[1] == position.shape[1] == 2

@@ -12,10 +12,10 @@ from flax import struct
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, InputState, StepState
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.base import RecordedRobot, checked
-from sim2real.robots.messages import Goals
+from sim2real.robots.contract import RecordedRobot, checked
+from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.worlds import WorldModel, in_world
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.worlds.recorded import command_delay
 
 PLUGIN = Path(__file__).parents[1] / "plugin"

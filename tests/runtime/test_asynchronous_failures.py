@@ -16,9 +16,9 @@ from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.failure import GraphTimeout, NodeFailed, noted
-from sim2real.runtime.nodethread import NodeThread
-from sim2real.runtime.wallclock import WallClockRun
-from sim2real.runtime.watchdog import step_limits
+from sim2real.runtime.wall_clock.node_thread import NodeThread
+from sim2real.runtime.wall_clock.wall_clock import WallClockRun
+from sim2real.runtime.wall_clock.watchdog import step_limits
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
 KEY = jax.random.key(0)

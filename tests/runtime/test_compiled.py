@@ -16,7 +16,7 @@ from sim2real.graph.times import Vertex
 from sim2real.graph.windows import bursty_episodes
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
 
 KEY = jax.random.key(0)
 DURATION_S = 0.45

@@ -16,9 +16,9 @@ from sim2real.graph.node import TICKS_PER_S, Jitter, Scheduling
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import Value, jax_hash_node
 from sim2real.graph.testing.nodes import Contraction
-from sim2real.runtime.bursts import make_room
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.runtime.open_loop import OpenLoopGraph
+from sim2real.runtime.compilation.bursts import make_room
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compilation.open_loop import OpenLoopGraph
 
 KEY = jax.random.key(0)
 DURATION_S, EPISODES = 0.4, 2

@@ -12,9 +12,9 @@ from sim2real.graph.schedule import draw, rederive
 from sim2real.graph.testing import random_graph
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
+from sim2real.runtime.compilation.wiring import wire, wire_pattern
 from sim2real.runtime.init import OUTPUTS
 from sim2real.runtime.testing import interpret_hashes
-from sim2real.runtime.wiring import wire, wire_pattern
 
 
 def simulate(nodes, supervisor, timeline, eps=0, seed=0):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real.log.reader import read_log
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.drift_arms import ReachingArm, ReachingSO101

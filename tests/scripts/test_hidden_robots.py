@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim2real.hardware.plant import load_plant
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches import hidden_robots, hidden_wall

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.manifest import sha256
-from sim2real.artifacts.run_folder import StageFolder
+from sim2real.artifacts.run.manifest import sha256
+from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.robots.probe import StepAnswers, Witness
-from sim2real.stages import admission
 from sim2real.stages.config import DeployConfig
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.deploy import preflight
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 TRAINED = (0.044, 0.046)
 
@@ -43,7 +43,7 @@ def arm():
 
 def test_a_policy_for_the_robot_is_let_in(arm):
     contract = contract_of(arm)
-    admission.require_fit(arm, Bundle(contract, still(contract)))
+    preflight.require_fit(arm, Bundle(contract, still(contract)))
 
 
 CHANGES = {
@@ -72,14 +72,14 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
     contract = contract_of(arm)
     contract = replace(contract, **{field: change(getattr(contract, field))})
     with pytest.raises(Sim2RealError, match=rf"(?s){said}.*hint: train a policy"):
-        admission.require_fit(arm, Bundle(contract, still(contract)))
+        preflight.require_fit(arm, Bundle(contract, still(contract)))
 
 
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
     robot = load_pipeline("pendulum").load()
     contract = contract_of(robot, action=(replace(robot.action[0], low=-100.0, high=100.0),))
     with pytest.raises(Sim2RealError, match="this robot bears -2 to 2"):
-        admission.require_fit(robot, Bundle(contract, still(contract)))
+        preflight.require_fit(robot, Bundle(contract, still(contract)))
 
 
 @pytest.mark.parametrize(("value", "said"), [(np.nan, "not finite"), (1e9, "values up to 1e")])
@@ -96,11 +96,11 @@ def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
     path = save_bundle(tmp_path / "train" / "bundle", still(contract), contract)
     outputs = {"bundle": {"path": "bundle", "sha256": sha256(path)}}
     trained = StageFolder(path.parent, {"outputs": outputs})
-    admission.require_untouched(trained)
+    preflight.require_untouched(trained)
     about = json.loads((path / "policy.json").read_text())  # the hashes in it still fit: only the manifest tells
     (path / "policy.json").write_text(json.dumps({**about, "rate_hz": 51.0}))
     with pytest.raises(Sim2RealError, match=r"(?s)not the bundle that its training wrote.*hint: train again"):
-        admission.require_untouched(trained)
+        preflight.require_untouched(trained)
 
 
 @pytest.mark.parametrize(
@@ -115,20 +115,20 @@ def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
 )
 def test_delay_and_jitter_must_be_those_of_the_training(delay_s, varies_s, said):
     found = StepAnswers(delay_s + varies_s * np.array([-1.0, -0.8, 0.0, 0.0, 0.8, 1.0]))
-    reason = admission.misfit(found, TRAINED, 0.008)
+    reason = preflight.misfit(found, TRAINED, 0.008)
     assert reason is None if said is None else said in str(reason)
 
 
 @pytest.mark.parametrize("force", [False, True])
 def test_a_delay_that_was_not_trained_is_refused_or_with_force_told(arm, monkeypatch, capsys, force):
-    monkeypatch.setattr(admission, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
+    monkeypatch.setattr(preflight, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
     witness = Witness(SimpleNamespace(wait_until_still=lambda timeout_s: None))
     pendulum = load_pipeline("pendulum").load()
     contract = contract_of(pendulum, trained_s={"round_trip_delay": TRAINED})
     if force:
-        found = admission.check_delay(pendulum, witness, contract, DeployConfig(force=True))
+        found = preflight.check_delay(pendulum, witness, contract, DeployConfig(force=True))
         assert found["measured delay"].startswith("60 ms")
         assert "warning: the delay is 60 ms" in capsys.readouterr().err
     else:
         with pytest.raises(DelayChanged, match=r"(?s)the delay is 60 ms.*hint: .*--force"):
-            admission.check_delay(pendulum, witness, contract, DeployConfig())
+            preflight.check_delay(pendulum, witness, contract, DeployConfig())

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.stages import advice, flags
+from sim2real.commands import flags
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.pipeline import load_pipeline, pipeline_of
+from sim2real.stages.estimation import recording_advice
+from sim2real.stages.pipeline.pipeline import load_pipeline, pipeline_of
 
 ARM = load_pipeline("arm")
 
@@ -22,7 +23,7 @@ def parsed(command):
 
 
 def test_nothing_new_is_no_command():
-    assert advice.again(ARM, IdentifyConfig(), Path("runs"), "") == ""
+    assert recording_advice.again(ARM, IdentifyConfig(), Path("runs"), "") == ""
 
 
 @pytest.mark.parametrize(
@@ -47,14 +48,14 @@ def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix,
         initial_state="rest",
         max_delay_s=0.05,
     )
-    pipeline, asked = parsed(advice.again(ARM, before, Path("elsewhere"), new))
+    pipeline, asked = parsed(recording_advice.again(ARM, before, Path("elsewhere"), new))
     assert (pipeline, asked.runs) == ("arm", Path("elsewhere"))
     assert asked.config == replace(before, bounds=bounds, fix=fix, max_delay_s=max_delay_s)
 
 
 def test_a_robot_of_python_alone_gets_no_command_that_does_not_find_it():
     own = pipeline_of(type("Spare", (type(ARM.load()),), {})())
-    said = advice.onward(own, own.identify, Path("runs"), Path("runs/my robot/partial.json"))
+    said = recording_advice.onward(own, own.identify, Path("runs"), Path("runs/my robot/partial.json"))
     call = "sim2real.identify(robot, recording, ...)"
     assert said.startswith(f"{call} with the settings --begin 'runs/my robot/partial.json'")
-    assert advice.command(own, own.identify, Path("runs")) == call
+    assert recording_advice.command(own, own.identify, Path("runs")) == call

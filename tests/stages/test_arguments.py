@@ -14,8 +14,8 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages import arguments
 from sim2real.stages.config import DeployConfig, IdentifyConfig, TrainConfig
+from sim2real.stages.pipeline import python_arguments
 
 FOUND = Identification(
     "pendulum",
@@ -76,15 +76,15 @@ def test_what_is_wrong_is_said_before_anything_happens(pendulum, call, said, tmp
 def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
     given = {"episode_s": 2.0, "ppo": {"num_envs": 64}}
     own = replace(pendulum.train, episode_s=2.0, ppo=replace(pendulum.train.ppo, num_envs=64))
-    assert arguments.config_of(given, pendulum.train) == own
-    assert arguments.config_of(None, pendulum.train) is pendulum.train
+    assert python_arguments.config_of(given, pendulum.train) == own
+    assert python_arguments.config_of(None, pendulum.train) is pendulum.train
     with pytest.raises(UsageError):
-        arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.identify)
+        python_arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.identify)
 
 
 def test_one_recording_is_as_good_as_several(pendulum):
-    assert arguments.recordings_of(RECORDING, pendulum) == [RECORDING]
-    assert arguments.recordings_of((RECORDING, RECORDING), pendulum) == [RECORDING] * 2
+    assert python_arguments.recordings_of(RECORDING, pendulum) == [RECORDING]
+    assert python_arguments.recordings_of((RECORDING, RECORDING), pendulum) == [RECORDING] * 2
 
 
 @pytest.mark.parametrize("kind", [str, Path])
@@ -92,7 +92,7 @@ def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
     folder = kind(tmp_path / "new" / "folder")
     FOUND.save(folder)
     assert Identification.load(folder).values == {"gain": 21.0494}
-    assert arguments.identification_of(folder).values == {"gain": 21.0494}
+    assert python_arguments.identification_of(folder).values == {"gain": 21.0494}
     with pytest.raises(Sim2RealError, match="there is no log"):
         Recording.load(kind(tmp_path / "none.mcap"))
     for load in (Bundle.load, Deployment.load, Timing.load):

@@ -12,11 +12,13 @@ import pytest
 
 from sim2real import cli
 from sim2real.errors import UsageError
-from sim2real.stages import advice, check
-from sim2real.stages.config import CheckConfig, RecordConfig
-from sim2real.stages.excitation import excitation
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.planned import simulate
+from sim2real.stages.check import stage as check_stage
+from sim2real.stages.check.config import CheckConfig
+from sim2real.stages.config import RecordConfig
+from sim2real.stages.estimation import recording_advice
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.excitation.simulated_log import simulate
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 COMMANDS = ("sim2real identify pendulum", "sim2real record pendulum")
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "multisine.mcap"
@@ -68,7 +70,7 @@ def test_the_log_is_described(judged):
 
 
 def test_people_get_tables_and_a_recommendation(judged, capsys):
-    check.show(judged[1])
+    check_stage.show(judged[1])
     said = capsys.readouterr().out
     assert "95 % of the power of actuator.action" in said
     assert "round_trip_delay" in said
@@ -92,14 +94,14 @@ def spoiled(judged, **changes):
     ],
 )
 def test_what_is_wrong_with_a_motion_is_told(judged, changes, said):
-    assert said in "\n".join(advice.recommend(spoiled(judged, **changes), *COMMANDS))
+    assert said in "\n".join(recording_advice.recommend(spoiled(judged, **changes), *COMMANDS))
 
 
 def test_gaps_short_logs_and_constant_commands_are_told(judged):
     found = spoiled(judged)
     found["recordings"][0]["sampling"] |= {"gaps": 2, "longest_gap_s": 0.5, "duration_s": 8.0}
     found["recordings"][0]["commands"][0] |= {"low_hz": None, "high_hz": None}
-    said = "\n".join(advice.recommend(found, *COMMANDS))
+    said = "\n".join(recording_advice.recommend(found, *COMMANDS))
     for part in ("only 8.0 s", "2 gaps", "no command changes"):
         assert part in said
 
@@ -107,14 +109,14 @@ def test_gaps_short_logs_and_constant_commands_are_told(judged):
 def test_how_long_to_record_follows_from_the_worst_parameter(judged):
     found = spoiled(judged)
     found["parameters"][2]["percent_of_nominal"] = 3.0
-    said = "\n".join(advice.recommend(found, *COMMANDS))
+    said = "\n".join(recording_advice.recommend(found, *COMMANDS))
     assert "damping is least certain: 3 % of nominal from a minute; 1% takes 9 min" in said
 
 
 def test_an_open_direction_ends_with_code_1_and_names_it(judged, monkeypatch, capsys):
     found = {k: v for k, v in judged[1].items() if k not in ("pipeline", "recommendation")}
     found |= {"determined": False, "undetermined": [["gain", "friction"]]}
-    monkeypatch.setattr(check, "judge", lambda *_: found)
+    monkeypatch.setattr(check_stage, "judge", lambda *_: found)
     assert cli.main(["check", "pendulum", "--log", str(LOG)]) == 1
     said = capsys.readouterr().out
     assert "some of gain, friction would be guesses" in said
@@ -134,7 +136,7 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
     assert th[0] == pytest.approx(np.pi, abs=1e-3)
     assert np.ptp(th) > 0.05
     np.testing.assert_allclose(np.abs(episode.outputs["actuator"]["action"]).max(), 1.0, atol=0.35)
-    assert check.coverage(episode, model, {})["joints"][0]["moving"] > 0.1
+    assert check_stage.coverage(episode, model, {})["joints"][0]["moving"] > 0.1
 
 
 def test_without_recording_and_plan_there_is_nothing_to_judge(tmp_path):
@@ -142,7 +144,7 @@ def test_without_recording_and_plan_there_is_nothing_to_judge(tmp_path):
     model = pipeline.load().identifiable(0.06)
     for config in (CheckConfig(runs=tmp_path), CheckConfig(plan=True)):
         with pytest.raises(UsageError) as caught:
-            check.find_source(pipeline, config, model, model.parameters, pipeline.identify)
+            check_stage.find_source(pipeline, config, model, model.parameters, pipeline.identify)
         assert "--log FILE" in (caught.value.hint or "")
 
 
@@ -153,10 +155,10 @@ def test_a_plan_and_a_log_exclude_each_other():
 
 def test_segments_lie_side_by_side_and_are_not_too_many(judged):
     pipeline = load_pipeline("pendulum")
-    episode = check.open_recording(LOG, pipeline).episode
-    spans, length_s = check.cut([episode], pipeline.identify)
+    episode = check_stage.open_recording(LOG, pipeline).episode
+    spans, length_s = check_stage.cut([episode], pipeline.identify)
     assert len(spans) == judged[1]["segments"]
     assert np.diff([s.begin_s for s in spans]) == pytest.approx(length_s)
-    many, _ = check.cut([episode] * 20, pipeline.identify)
+    many, _ = check_stage.cut([episode] * 20, pipeline.identify)
     assert len(many) == 120
     assert {s.recording for s in many} == set(range(20))

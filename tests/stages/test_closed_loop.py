@@ -16,14 +16,14 @@ import shared_run
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, Gap, Scores, log_of
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.iterations import Iterations
 from sim2real.artifacts.recording import LOG, Recording
-from sim2real.artifacts.run_folder import STAGES, attempts, finished, open_stage
-from sim2real.robots.loop import DELAYS
-from sim2real.stages import once_more, running
-from sim2real.stages.flags import RunFlags
-from sim2real.stages.judging import judged
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.run_folder import STAGES, attempts, finished, open_stage
+from sim2real.commands import retry, run_loop
+from sim2real.commands.flags import RunFlags
+from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.stages.deploy.verdict import judged
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches import hidden_robots as hidden
@@ -79,7 +79,7 @@ def world(tmp_path, finished_run_dir):
         if name != "deploy" and not (run_dir and attempts(run_dir, name)):
             return first(name)
         if name in ("identify", "train"):
-            return importlib.import_module(f"sim2real.stages.{name}").run(pipeline, config, root, run_dir)
+            return importlib.import_module(f"sim2real.stages.{name}.stage").run(pipeline, config, root, run_dir)
         with open_stage(root, pipeline.name, name, config, run_dir=run_dir) as stage:
             {"record": record, "deploy": deploy}[name](stage, config, run_dir)
         return stage.result
@@ -89,8 +89,8 @@ def world(tmp_path, finished_run_dir):
 
 def test_a_robot_that_became_later_is_identified_anew_and_deployed_again(world, monkeypatch):
     pipeline, root, call = world
-    monkeypatch.setattr(once_more, "GOOD", 0.0)  # what so few steps teach is no policy
-    running.run_all(pipeline, RunFlags(iterations=2, runs=root, **tiny(pipeline)), call)
+    monkeypatch.setattr(retry, "GOOD", 0.0)  # what so few steps teach is no policy
+    run_loop.run_all(pipeline, RunFlags(iterations=2, runs=root, **tiny(pipeline)), call)
     (run_dir,) = (root / "pendulum").iterdir()
     first, second = Iterations.load(run_dir).rows
     assert (first.stages, first.verdict) == (STAGES, "re-identify")

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from sim2real.stages import console
+from sim2real.stages.terminal import console
 
 
 def test_table_aligns_numbers_right_and_text_left():

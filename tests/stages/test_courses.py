@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.deployment import Deployment, Replay, Scores
-from sim2real.stages.courses import courses, off_course
+from sim2real.stages.deploy.trajectories import courses, off_course
 
 T = np.arange(0.0, 10.0, 0.02)
 ROW = Replay("hinge", "rad", 0.1, {}, 0.007, column="th", free_run=0.01)

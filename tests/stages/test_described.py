@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from sim2real import cli
+from sim2real.commands import model_flags
 from sim2real.errors import UsageError
 from sim2real.log import read_log
-from sim2real.robots.mjcf_parameters import ParameterPattern
-from sim2real.robots.mjcf_robot import RobotConfig
-from sim2real.stages import advice, described, described_flags
-from sim2real.stages.config import RobotFlags
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import RobotConfig
+from sim2real.stages.estimation import recording_advice
+from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 XML = """<mujoco>
   <option timestep="0.002"/>
@@ -46,7 +48,7 @@ def workplace(tmp_path, monkeypatch, recorded):
 
 
 def test_a_model_and_a_log_describe_a_robot(workplace):
-    found = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
+    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
     assert found.name == "robot"
     own = found.description
     assert (own.joints, own.commands, own.step_s) == (("pan_joint", "lift_joint"), ("goal",), 0.002)
@@ -58,15 +60,17 @@ def test_a_model_and_a_log_describe_a_robot(workplace):
 
 def test_the_next_command_describes_the_robot_again(workplace):
     told = RobotFlags(mjcf=Path("robot.xml"), joints=("lift_joint", "pan_joint"), parameter=("kp=20",), contacts=True)
-    found = described.from_flags(told, ["run.npz"])
+    found = from_model.from_flags(told, ["run.npz"])
     asked = replace(found.identify, log=("run.npz",), fix={"delay": 0.0})
-    program, stage, *rest = shlex.split(advice.command(found, asked, Path("runs")))
+    program, stage, *rest = shlex.split(recording_advice.command(found, asked, Path("runs")))
     assert (program, stage) == ("sim2real", "identify")
-    again = described_flags.parse_identify(rest, "")
+    again = model_flags.parse_identify(rest, "")
     assert (again.robot, again.config) == (told, asked)
     asked = replace(asked, refine_steps=3)
-    _, _, *rest = shlex.split(advice.onward(found, asked, Path("all runs"), Path("all runs/robot/partial.json")))
-    onward = described_flags.parse_identify(rest, "")
+    _, _, *rest = shlex.split(
+        recording_advice.onward(found, asked, Path("all runs"), Path("all runs/robot/partial.json"))
+    )
+    onward = model_flags.parse_identify(rest, "")
     assert (onward.robot, onward.runs) == (told, Path("all runs"))
     assert (onward.config.begin, onward.config.log) == ("all runs/robot/partial.json", ("run.npz",))
 
@@ -86,7 +90,7 @@ def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsy
 def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
     t, goal, q = recorded
     np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal, kp=np.float64(32.0), torque_enable=np.ones(len(t)))
-    own = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description
+    own = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description
     assert (set(own.commands), set(own.shared)) == ({"goal", "kp", "enabled"}, {"kp", "enabled"})
     assert own.kp_unit == 32.0
     assert ParameterPattern("kd") in own.terms
@@ -98,7 +102,7 @@ def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
     assert "'q_rad' follows 'goal_rad'" in err
     assert "wrote run.import.toml" in out
     assert read_log("run.mcap").metadata["pipeline"] == "robot"
-    found = described.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
+    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
     assert found.mapping is None
     assert found.description.commands == ("goal",)
     assert cli.main(["import", "run.npz", "--mapping", "run.import.toml", "--out", "again.mcap"]) == 0
@@ -132,7 +136,7 @@ def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
     asset = '<asset><mesh name="m" file="meshes/m.obj"/></asset><worldbody>'
     Path("robot.xml").write_text(XML.replace("<worldbody>", asset))
     Path("meshes/m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    texts = described.files_of(RobotConfig(Path("robot.xml"), ("pan_joint",), ("goal",)))
+    texts = from_model.files_of(RobotConfig(Path("robot.xml"), ("pan_joint",), ("goal",)))
     assert list(texts) == ["robot.toml"]
     assert str(workplace / "robot.xml") in texts["robot.toml"]
 
@@ -169,4 +173,4 @@ def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recor
     assert not Path("wrong.mcap").exists()
     assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
     with pytest.raises(UsageError, match="contradict"):
-        described.from_flags(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
+        from_model.from_flags(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])

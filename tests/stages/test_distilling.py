@@ -5,14 +5,14 @@ import pytest
 
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.run_folder import open_stage
+from sim2real.artifacts.run.run_folder import open_stage
 from sim2real.errors import UsageError
 from sim2real.policy import NetworkSpec, PolicyContract
-from sim2real.stages.distilling import as_taught, find_teacher, teacher_of
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.train_config import TrainConfig
-from sim2real.train.architectures import MLP
-from sim2real.train.networks import Policy
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.config import TrainConfig
+from sim2real.stages.train.teacher_bundle import as_taught, find_teacher, teacher_of
+from sim2real.train.networks.architectures import MLP
+from sim2real.train.networks.policy import Policy
 
 KNOWN = 12
 TINY = [

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.stages.explaining import disturbance_rows, parameter_rows
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.prepared import prepare
-from sim2real.train.variation import VariationConfig
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.explain import disturbance_rows, parameter_rows
+from sim2real.stages.train.training_setup import prepare
+from sim2real.train.environment.variation import VariationConfig
 
 
 @pytest.fixture(scope="module")

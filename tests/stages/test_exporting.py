@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts import run_folder
+from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.run import run_folder
+from sim2real.commands import export_model
+from sim2real.commands.config import ExportConfig
 from sim2real.identify.export import terms
-from sim2real.stages import exporting
-from sim2real.stages.config import ExportConfig
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
 def identified(pipeline, status="accepted", **values):
@@ -70,7 +70,7 @@ def test_a_run_folder_is_found_by_its_pipeline(arm, here, capsys):
         for name, path in arm.save(stage.folder).items():
             stage.output(name, path)
     for source in ("arm", str(stage.run_dir), str(stage.folder)):
-        assert exporting.find_parameters(ExportConfig(source)).samefile(stage.folder / "parameters.json")
+        assert export_model.find_parameters(ExportConfig(source)).samefile(stage.folder / "parameters.json")
     out = here / "own.json"
     assert cli.main(["export", "identified", "arm", "--to", "json", "--out", str(out)]) == 0
     assert "own.json" in capsys.readouterr().out

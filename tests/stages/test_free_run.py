@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import FreeRun
-from sim2real.identify.verdict import Position
-from sim2real.stages.free_run import lacking
+from sim2real.identify.validation.verdict import Position
+from sim2real.stages.estimation.free_run import lacking
 
 AXIS, ARM = Position("x[0]", "axis", "m", 1e-5), Position("x[1]", "arm", "rad", 1e-3)
 

@@ -14,11 +14,11 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.robots.loop import control_nodes
+from sim2real.robots.control_loop.loop import control_nodes
 from sim2real.robots.roles import ROLES
-from sim2real.robots.states import as_columns, as_sent
-from sim2real.stages import gap
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.robots.score_columns import as_columns, as_sent
+from sim2real.stages.deploy import simulation_gap
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ARM = load_pipeline("arm").load()
 
@@ -41,7 +41,9 @@ def states(tmp_path_factory):
     episode = Episode(
         steps={n: steps(len(next(iter(o.values())))) for n, o in outputs.items()}, messages={}, outputs=outputs
     )
-    return outputs, *gap._states(Recording(tmp_path_factory.mktemp("deploy") / "session.mcap", episode), ARM, True)
+    return outputs, *simulation_gap._states(
+        Recording(tmp_path_factory.mktemp("deploy") / "session.mcap", episode), ARM, True
+    )
 
 
 def test_vectors_become_columns(states):
@@ -88,12 +90,12 @@ def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
         recorder.message(MessageRecord("agent", "sensor", k, k, 20_000 * k, 20_000 * k))
         recorder.message(MessageRecord("actuator", "agent", k, k, begin + 1000, begin + 1000))
     nodes = control_nodes(*(BaseNode(name, 50.0, delay=0.002) for name in ("sensor", "agent", "actuator")))
-    rows = {row.quantity: row for row in gap._age_rows(robot, [recorder.episode()], draw(nodes, 1.0, 3))}
+    rows = {row.quantity: row for row in simulation_gap._age_rows(robot, [recorder.episode()], draw(nodes, 1.0, 3))}
     worst = rows["age_of_sensor_in_agent_max_s"]
     assert [worst.real, worst.simulation, worst.gap] == pytest.approx([0.08, 0.002, 0.078])
     assert rows["age_of_sensor_in_agent_p50_s"].real == pytest.approx(0.0)
     assert len(rows) == 4
-    alone = gap._age_rows(robot, [recorder.episode()], None)
+    alone = simulation_gap._age_rows(robot, [recorder.episode()], None)
     assert [row.simulation for row in alone] == [None] * 4
 
 
@@ -101,7 +103,7 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    assert gap._simulate(ARM, None, {"gain": 1.0}, Timing.of(episode), 1.0, 1, "world") == (None, None)
+    assert simulation_gap._simulate(ARM, None, {"gain": 1.0}, Timing.of(episode), 1.0, 1, "world") == (None, None)
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -123,7 +125,9 @@ def test_simulated_measurements_are_compared_with_measurements():
     values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))
-    (t_s, world), (at_s, sensor) = gap._simulate(robot, policy, [values], Timing.of(episode), 0.6, 1, "world")[0][0]
+    (t_s, world), (at_s, sensor) = simulation_gap._simulate(
+        robot, policy, [values], Timing.of(episode), 0.6, 1, "world"
+    )[0][0]
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)
     then = np.interp(at_s - late_s, t_s, world["th"])

@@ -3,7 +3,7 @@
 import pytest
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.stages import identified
+from sim2real.stages.estimation import estimate as identified
 
 
 @pytest.mark.parametrize(

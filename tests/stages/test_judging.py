@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay, Scores
-from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages import judging
-from sim2real.stages.next_step import commands
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.view.judging import tables, verdict_blocks
+from sim2real.stages.deploy import verdict
+from sim2real.stages.deploy.next_command import commands
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.view.page.deployment_verdict import tables, verdict_blocks
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
@@ -35,7 +35,7 @@ def episode(seconds=10.0, took_s=0.001):
 
 def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEADY, took_s=0.001, seconds=10.0):
     """A deployment: how far models are off, how well it went, what has changed, and how long steps took."""
-    rows = (Replay("hinge", "rad", 0.1, {"identified": identified, judging.AS_HERE: here, "hold": 0.5}, 0.01),)
+    rows = (Replay("hinge", "rad", 0.1, {"identified": identified, verdict.AS_HERE: here, "hold": 0.5}, 0.01),)
     logs = tuple(Recording(Path(f"runs/pendulum/T/deploy/episode_{i}.mcap"), episode(seconds, took_s)) for i in (0, 1))
     gap = (Gap("success", success, simulated, success - simulated),)
     return Deployment((Scores({}),) * 2, gap, recordings=logs, replay=rows, drift=drift)
@@ -59,17 +59,17 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     ],
 )  # fmt: skip
 def test_one_finding_decides(found, status, said):
-    told = judging.verdict(deployed(**found), BUNDLE)
+    told = verdict.verdict(deployed(**found), BUNDLE)
     assert told.status == status
     assert said in told.reasons[0]
     assert told.joint == ("hinge" if status == "look at this joint" else "")
 
 
 def test_what_has_most_likely_changed_is_said_where_the_model_is_off_and_no_test_is_sure():
-    told = judging.verdict(deployed(identified=0.04, drift=LIKELY), BUNDLE)
+    told = verdict.verdict(deployed(identified=0.04, drift=LIKELY), BUNDLE)
     assert told.status == "re-identify"
     assert "most likely the robot has changed: friction is 12 rad/s^2" in told.reasons[1]
-    assert judging.verdict(deployed(drift=LIKELY), BUNDLE).status == "fine", "by itself that is no proof"
+    assert verdict.verdict(deployed(drift=LIKELY), BUNDLE).status == "fine", "by itself that is no proof"
 
 
 @pytest.mark.parametrize(
@@ -153,13 +153,13 @@ def replace_terms(terms):
 
 
 def test_times_stand_beside_those_of_training():
-    rows = {g.quantity: g for g in judging._trained(deployed(took_s=0.004), BUNDLE)}
+    rows = {g.quantity: g for g in verdict._trained(deployed(took_s=0.004), BUNDLE)}
     assert rows["step_of_agent_p99_s"].gap == pytest.approx(0.003)
     assert rows["round_trip_delay_s"].simulation == pytest.approx(0.05)
 
 
 def test_a_deployment_without_an_identification_says_so(folder):
-    told = judging.judged(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
+    told = verdict.judged(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
 
 
@@ -167,18 +167,18 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
     def too_little(*_):
         raise Sim2RealError("0.0 s of them in motion")
 
-    monkeypatch.setattr(judging, "tested", too_little)
+    monkeypatch.setattr(verdict, "tested", too_little)
     pipeline = load_pipeline("pendulum")
-    told = judging.judged(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
+    told = verdict.judged(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
-    assert judging.judged(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
+    assert verdict.judged(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
 
 
 def test_console_and_page_end_in_the_verdict(capsys):
     shown = deployed(drift=ALARM)
     shown = replace(shown, advice=Advice("re-identify", ("friction is 12",), "sim2real identify pendulum"))
-    judging.show(shown)
+    verdict.show(shown)
     said = capsys.readouterr()
     assert "friction" in said.out
     assert said.err.splitlines() == ["verdict: re-identify", "  friction is 12", "next: sim2real identify pendulum"]

@@ -11,15 +11,15 @@ import pytest
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
-from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
-from sim2real.artifacts.iterations import Iterations
-from sim2real.artifacts.run_folder import STAGES, Source, attempts, finished, newest, open_stage
-from sim2real.artifacts.standing import TAKES, standing
-from sim2real.stages import info, running
-from sim2real.stages.flags import RunFlags
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.view import page
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage
+from sim2real.artifacts.run.stage_status import TAKES, standing
+from sim2real.commands import info, run_loop
+from sim2real.commands.flags import RunFlags
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.view.page import page
 
 TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "accepted")
 NOT_DRIFTED = Drift((Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 0.8),), 0.05, (), 18.0)
@@ -79,7 +79,7 @@ class Stages:
         pipeline = load_pipeline("pendulum")
         stages = {stage: getattr(pipeline, stage) for stage in STAGES}
         flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages)
-        running.run_all(pipeline, flags, self)
+        run_loop.run_all(pipeline, flags, self)
         (run_dir,) = (self.root / "pendulum").iterdir()
         return run_dir
 
@@ -103,7 +103,7 @@ def killed(stages, call, when, **options):
 @pytest.fixture(autouse=True)
 def quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
+    monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir: run_dir / "report.html")
 
 
 def ran(run_dir):

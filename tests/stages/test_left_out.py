@@ -10,12 +10,12 @@ from scipy import stats
 from sim2real.artifacts.identification import Left
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty import Uncertainty
-from sim2real.identify.verdict import Position
-from sim2real.stages import identify
+from sim2real.identify.uncertainty.uncertainty import Uncertainty
+from sim2real.identify.validation.verdict import Position
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.left_out import further, promises, sentences, widened, widest
-from sim2real.stages.partial import Best
+from sim2real.stages.estimation.held_out_parts import further, promises, sentences, widened, widest
+from sim2real.stages.identify import stage as identify_stage
+from sim2real.stages.identify.interrupted import Best
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -146,10 +146,10 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         tables.append((config.generations, table))
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
-    monkeypatch.setattr(identify, "fitted_to", fit)
-    monkeypatch.setattr(identify.left_out, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
+    monkeypatch.setattr(identify_stage, "fitted_to", fit)
+    monkeypatch.setattr(identify_stage.left_out, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    identify._with_terms(None, [], [], config, table, ["log"], Best())
+    identify_stage._with_terms(None, [], [], config, table, ["log"], Best())
     fewer = tables[1][1]
     assert fewer.terms == ("cogging",)
     assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.run_folder import attempts
+from sim2real.artifacts.run.run_folder import attempts
 from sim2real.errors import Sim2RealError
-from sim2real.stages import identify
-from sim2real.stages.parameters import open_identification
-from sim2real.stages.partial import Best
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.stages.identify import stage as identify_stage
+from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.pipeline.open_parameters import open_identification
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).parents[2]
 LOG = next((ROOT / "datasets" / "pendulum").glob("*.mcap"))
@@ -37,10 +37,10 @@ def interrupted(pipeline, root, monkeypatch, ending, told=True):
                 tell("search", 0.25, loss, own.encode(values))
         raise ending
 
-    monkeypatch.setattr(identify, "fitted_to", fit)
+    monkeypatch.setattr(identify_stage, "fitted_to", fit)
     config = replace(pipeline.identify, log=(str(LOG),))
     with pytest.raises(type(ending)):
-        identify.run(pipeline, config, root, None)
+        identify_stage.run(pipeline, config, root, None)
     (run,) = (root / "pendulum").iterdir()
     return attempts(run, "identify")[0]
 

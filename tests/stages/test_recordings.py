@@ -8,8 +8,8 @@ import pytest
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.recordings import open_recording, require_units
+from sim2real.stages.pipeline.open_log import open_recording, require_units
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 DATASET = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 

@@ -9,11 +9,11 @@ import pytest
 
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.run_folder import open_stage
+from sim2real.artifacts.run.run_folder import open_stage
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages import train as stage
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.resuming import CHECKPOINT, find_interrupted
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train import stage
+from sim2real.stages.train.resume import CHECKPOINT, find_interrupted
 
 TINY = [
     *("train", "pendulum", "--model", "nominal", "--episode-s", "0.5", "--timelines", "2", "--seed", "1"),
@@ -69,8 +69,8 @@ def test_a_stage_folder_and_a_run_name_it_too(runs):
 
 
 def settings(own, target, **changes):
-    from sim2real.stages import flags
-    from sim2real.stages.pipeline import load_pipeline
+    from sim2real.commands import flags
+    from sim2real.stages.pipeline.pipeline import load_pipeline
 
     words = [*TINY[2:], "--resume", str(target)]
     words += [word for name, value in changes.items() for word in (f"--{name}", value)]

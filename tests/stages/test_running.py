@@ -8,15 +8,15 @@ import pytest
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
-from sim2real.artifacts.drift import Changed, Drift
+from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
-from sim2real.artifacts.iterations import Iterations
-from sim2real.artifacts.run_folder import STAGES, Source, open_stage
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.run_folder import STAGES, Source, open_stage
+from sim2real.commands import run_loop
+from sim2real.commands.flags import RunFlags
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
-from sim2real.stages import running
-from sim2real.stages.flags import RunFlags
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.view.iterations import iterations_sections
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.view.page.iterations import iterations_sections
 
 WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
@@ -32,7 +32,7 @@ def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
 def world(tmp_path, monkeypatch):
     """Stages that leave what the loop reads; each deployment takes the next verdict."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
+    monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir: run_dir / "report.html")
     seen = SimpleNamespace(
         calls=[],
         verdicts=[],
@@ -78,7 +78,7 @@ def world(tmp_path, monkeypatch):
         stages = {stage: getattr(pipeline, stage) for stage in STAGES}
         stages["train"] = replace(pipeline.train, **(train or {}))
         flags = RunFlags(iterations=iterations, runs=tmp_path / "runs", **stages, **told)
-        running.run_all(pipeline, flags, call)
+        run_loop.run_all(pipeline, flags, call)
         (run_dir,) = (tmp_path / "runs" / "pendulum").iterdir()
         return [s for s, _ in seen.calls[4:]], Iterations.load(run_dir).rows
 

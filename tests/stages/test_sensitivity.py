@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate
-from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
-from sim2real.robots.loop import DelayParams
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.stages.sensitivity import MULTIPLES, models_of, moves_of, sensitivity, with_room
-from sim2real.train.architectures import MLP
-from sim2real.train.env import GraphEnvironment
-from sim2real.train.networks import Policy
+from sim2real.robots.control_loop.loop import DelayParams
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.sensitivity import MULTIPLES, models_of, moves_of, sensitivity, with_room
+from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.networks.architectures import MLP
+from sim2real.train.networks.policy import Policy
 
 VALUES = {
     "gain": 20.0, "gravity": 100.0, "damping": 20.0, "friction": 0.1, "sensor_delay": 0.02, "actuator_delay": 0.025,

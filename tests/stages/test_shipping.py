@@ -9,11 +9,11 @@ import venv
 import numpy as np
 import pytest
 
+from sim2real.commands import export_policy
+from sim2real.commands.config import ShipConfig
 from sim2real.errors import UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
 from sim2real.policy.network import NetworkSpec
-from sim2real.stages import shipping
-from sim2real.stages.config import ShipConfig
 
 SAME = """
 import json, sys
@@ -65,7 +65,7 @@ def ask(python, code, *arguments, cwd):
 
 def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
     bundle, observations = trained
-    out = shipping.run(ShipConfig(str(bundle), tmp_path / "out"))
+    out = export_policy.run(ShipConfig(str(bundle), tmp_path / "out"))
     for missing in ("jax", "sim2real", "safetensors"):
         assert ask(bare, f"import importlib.util as u; print(u.find_spec('{missing}'))", cwd=out) == ["None"]
     actions, imported = ask(bare, SAME, json.dumps(observations.tolist()), cwd=out)
@@ -79,7 +79,7 @@ def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
 
 def test_what_is_written_is_a_bundle(trained, tmp_path):
     bundle, observations = trained
-    out = shipping.run(ShipConfig(str(bundle.parent), tmp_path / "out"))
+    out = export_policy.run(ShipConfig(str(bundle.parent), tmp_path / "out"))
     assert np.array_equal(load_bundle(out).act(observations[0]), load_bundle(bundle).act(observations[0]))
 
 
@@ -97,7 +97,7 @@ def test_the_runner_is_imported_where_there_is_no_jax():
 def test_a_policy_with_other_layers_is_not_run_as_if_it_had_none(trained, bare, tmp_path):
     import safetensors.numpy
 
-    out = shipping.run(ShipConfig(str(trained[0]), tmp_path / "out"))
+    out = export_policy.run(ShipConfig(str(trained[0]), tmp_path / "out"))
     weights = safetensors.numpy.load((out / "policy.safetensors").read_bytes())
     more = {**weights, "memory.kernel": np.zeros((2, 2), np.float32), "memory.bias": np.zeros(2, np.float32)}
     (out / "policy.safetensors").write_bytes(safetensors.numpy.save(more))
@@ -115,7 +115,7 @@ def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_pa
     squashed = save_bundle(
         tmp_path / "bundle", weights, load_bundle(trained[0]).contract, spec=NetworkSpec("mlp", True)
     )
-    out = shipping.run(ShipConfig(str(squashed), tmp_path / "out"))
+    out = export_policy.run(ShipConfig(str(squashed), tmp_path / "out"))
     assert sorted(path.name for path in out.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
     assert "run policy.onnx with onnxruntime" in capsys.readouterr().err
     with pytest.raises(ValueError, match="clipped tanh layers"):
@@ -125,9 +125,9 @@ def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_pa
 def test_a_folder_that_holds_something_is_left_alone(trained, tmp_path):
     (tmp_path / "mine").write_text("x")
     with pytest.raises(UsageError, match=r"(?s)not empty.*hint: .*--to"):
-        shipping.run(ShipConfig(str(trained[0]), tmp_path))
+        export_policy.run(ShipConfig(str(trained[0]), tmp_path))
 
 
 def test_a_policy_must_be_named():
     with pytest.raises(UsageError, match=r"(?s)Pipelines: .*pendulum.*hint: sim2real export policy"):
-        shipping.run(ShipConfig())
+        export_policy.run(ShipConfig())

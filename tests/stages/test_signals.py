@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from sim2real.stages.interruption import SignalHandling, interruptible, patiently
+from sim2real.stages.terminal.interruption import SignalHandling, interruptible, patiently
 
 pytestmark = pytest.mark.realtime
 
@@ -18,7 +18,7 @@ FINALISER = """
 import gc, sys, time
 from types import ModuleType
 from sim2real import cli
-from sim2real.artifacts import run_folder
+from sim2real.artifacts.run import run_folder
 
 class Slow:
     def __del__(self):
@@ -44,7 +44,7 @@ def run(pipeline, config, root, run_dir):
         finally:
             print("torque off", flush=True)
 
-module = ModuleType("sim2real.stages.record")
+module = ModuleType("sim2real.stages.record.stage")
 module.run = run
 sys.modules[module.__name__] = module
 sys.exit(cli.main(["record", "pendulum"]))
@@ -75,7 +75,7 @@ import sys, time
 from types import ModuleType
 import jax, jax.numpy as jnp
 from sim2real import cli
-from sim2real.artifacts import run_folder
+from sim2real.artifacts.run import run_folder
 
 def run(pipeline, config, root, run_dir):
     with run_folder.open_stage(root, pipeline.name, "train", config, run_dir=run_dir):
@@ -84,7 +84,7 @@ def run(pipeline, config, root, run_dir):
         print("started", flush=True)
         time.sleep(300)
 
-module = ModuleType("sim2real.stages.train")
+module = ModuleType("sim2real.stages.train.stage")
 module.run = run
 sys.modules[module.__name__] = module
 sys.argv[1:] = ["train", "pendulum"]

@@ -10,14 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2real.artifacts.noise import Noise
+from sim2real.artifacts.estimation.noise import Noise
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
-from sim2real.train.env import GraphEnvironment
-from sim2real.train.ppo import train
+from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.ppo.trainer import train
 
 
 def environment(recording: int) -> GraphEnvironment:

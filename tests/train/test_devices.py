@@ -12,7 +12,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
-from sim2real.train.mesh import mesh_of
+from sim2real.train.scale.mesh import mesh_of
 
 SCRIPT = """
 import dataclasses, json, re
@@ -40,9 +40,9 @@ for devices in (1, 8):
     found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
 
 found["mesh"] = dict(divided[-1].whole.mesh.shape)
-from sim2real.train.devices import place
-from sim2real.train.ppo import _epoch
-from sim2real.train.start import make_networks, make_start
+from sim2real.train.scale.devices import place
+from sim2real.train.ppo.trainer import _epoch
+from sim2real.train.ppo.initial_state import make_networks, make_start
 
 config = dataclasses.replace(config, num_seeds=1, num_envs=48, rollout_steps=5, hidden=(7,), devices=2)
 networks = make_networks(Bandit(), config)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
-from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.quantity import Quantity
 from sim2real.errors import UsageError
-from sim2real.train.draws import COUNT, draw_robots, widened
-from sim2real.train.variation import VariationConfig
+from sim2real.train.environment.draws import COUNT, draw_robots, widened
+from sim2real.train.environment.variation import VariationConfig
 
 NAMES = ("gain", "gravity", "sensor_delay", "actuator_delay", "zero")
 KINDS = ("dynamics", "dynamics", "delay", "delay", "measurement")

@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from sim2real.train.config import PPOConfig
-from sim2real.train.optimiser import LEAST_RATE, MOST_RATE, adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.train.ppo.optimiser import LEAST_RATE, MOST_RATE, adapt_rate, get_rate, make_optimiser, set_rate
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,14 @@ from environments import Bandit
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.stages.pipeline import load_pipeline
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.train.config import PPOConfig
-from sim2real.train.env import GraphEnvironment
-from sim2real.train.ppo import train
-from sim2real.train.protocol import Step
-from sim2real.train.pushes import Pushes
-from sim2real.train.variation import VariationConfig
+from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.environment.protocol import Step
+from sim2real.train.environment.pushes import Pushes
+from sim2real.train.environment.variation import VariationConfig
+from sim2real.train.ppo.trainer import train
 
 KEY = jax.random.key(4)
 CONFIG = PPOConfig(

@@ -9,8 +9,8 @@ from environments import Bandit
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
-from sim2real.train.ppo import train
-from sim2real.train.start import swept_numbers
+from sim2real.train.ppo.initial_state import swept_numbers
+from sim2real.train.ppo.trainer import train
 from sim2real.train.sweep import SWEPT, Sweep, named
 
 CONFIG = PPOConfig(

@@ -10,9 +10,9 @@ from environments import Bandit, Coin, Sign
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
-from sim2real.train.normaliser import Normaliser, deviations
-from sim2real.train.ppo import train
-from sim2real.train.teacher import TeacherEnvironment, check_teacher
+from sim2real.train.networks.normaliser import Normaliser, deviations
+from sim2real.train.ppo.teacher import TeacherEnvironment, check_teacher
+from sim2real.train.ppo.trainer import train
 
 CONFIG = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=16_000, hidden=(16,), evaluations=1, eval_steps=20,

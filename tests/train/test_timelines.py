@@ -7,10 +7,10 @@ from sim2real.artifacts.timing import NodeTiming, Spread, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.graph.node import TICKS_PER_S, BaseNode, BaseWorld
 from sim2real.graph.schedule import draw
-from sim2real.robots.loop import delay_bounds, simulated_loop
-from sim2real.runtime.compiled import CompiledGraph
-from sim2real.runtime.wiring import wire
-from sim2real.train.timelines import Recorded, Stretches, draw_timelines
+from sim2real.robots.control_loop.loop import delay_bounds, simulated_loop
+from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compilation.wiring import wire
+from sim2real.train.environment.timelines import Recorded, Stretches, draw_timelines
 
 RATE_HZ, SECONDS, CALM_S = 50.0, 40, 0.001
 COUNT = int(RATE_HZ * SECONDS)

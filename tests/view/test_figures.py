@@ -15,11 +15,14 @@ from sketches import sketched, texts
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.identification import Identification
-from sim2real.artifacts.quantity import Quantity
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run_folder import Source, finished_stages
-from sim2real.view import figures, identify_figures, intervals, residuals, style, timing
+from sim2real.artifacts.run.run_folder import Source, finished_stages
+from sim2real.view import style, timing
+from sim2real.view.identification import figures as identify_figures
+from sim2real.view.identification import intervals, residuals
+from sim2real.view.page import figures
 from sim2real.view.signals import signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.links import Link, Ranged
-from sim2real.view.links import draw_link, link_blocks
+from sim2real.artifacts.estimation.links import Link, Ranged
+from sim2real.view.identification.links import draw_link, link_blocks
 from sim2real.view.style import new_figure, styled
 
 

@@ -14,12 +14,12 @@ import pytest
 import synthetic_run
 from sketches import sketched
 
+from sim2real.artifacts.estimation.posterior import Alternative, Posterior
 from sim2real.artifacts.identification import Identification, Judgement, Left
-from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, decimals_for, fixed, number, spoken
-from sim2real.view.identify_section import _alternatives, _banner, _parts
-from sim2real.view.page import deploy_page, identify_page, report
+from sim2real.view.identification.section import _alternatives, _banner, _parts
+from sim2real.view.page.page import deploy_page, identify_page, report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
 FLAGS = (

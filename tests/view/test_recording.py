@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import synthetic_run
 
-from sim2real.artifacts.run_folder import finished_stages
+from sim2real.artifacts.run.run_folder import finished_stages
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord, steps_from_records
-from sim2real.stages.pipeline import load_pipeline
-from sim2real.view.content import states_of, tabs_of
-from sim2real.view.recording import view
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.view.rerun_content import states_of, tabs_of
+from sim2real.view.rerun_recording import view
 
 RERUN = Path(sysconfig.get_path("scripts")) / "rerun"
 LAVAPIPE = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
@@ -160,7 +160,7 @@ def test_a_place_that_cannot_be_written_is_named(run):
 
 
 def test_importing_the_room_imports_no_viewer():
-    code = "import sys, sim2real.view.recording, sim2real.view.page; sys.exit('rerun' in sys.modules)"
+    code = "import sys, sim2real.view.rerun_recording, sim2real.view.page.page; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
-from sim2real.view.sensitivity import sensitivity_blocks
+from sim2real.view.page.sensitivity import sensitivity_blocks
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, StepState
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import NodeConformance, Value
-from sim2real.runtime.compiled import CompiledGraph
+from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.worlds.ode import OdeWorld
 
 

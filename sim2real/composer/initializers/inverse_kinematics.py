@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim2real.composer.models.translate import mj
+from sim2real.composer.models.mjcf.translate import mj
 
 if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
     from sim2real.composer.models.element import Element, Elements
+    from sim2real.composer.physics.c.physics import Physics
     from sim2real.composer.types import ArrayLike
 
 TOLERANCE = 1e-10

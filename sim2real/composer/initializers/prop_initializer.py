@@ -17,10 +17,10 @@ from sim2real.composer.variation.rotations import IDENTITY_QUATERNION
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
     from sim2real.composer.entity import Entity
-    from sim2real.composer.mjx.physics import MjxPhysics
-    from sim2real.composer.mjx.random import JaxRandomState
+    from sim2real.composer.physics.c.physics import Physics
+    from sim2real.composer.physics.mjx.physics import MjxPhysics
+    from sim2real.composer.physics.mjx.random import JaxRandomState
     from sim2real.composer.types import RandomState, Varying
 
 _log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ class PropPlacer(Initializer):
 
     def _place_on_mjx(self, physics: MjxPhysics, random_state: JaxRandomState, ignored: list[Entity]) -> None:
         """Place the props inside a compiled program; ``physics.fail`` says where that did not work."""
-        from sim2real.composer.mjx.placing import place
+        from sim2real.composer.physics.mjx.placing import place
 
         if self._settles:
             raise UsageError(

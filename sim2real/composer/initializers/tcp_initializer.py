@@ -10,14 +10,14 @@ from sim2real.composer import variation
 from sim2real.composer.errors import EpisodeInitializationError
 from sim2real.composer.initializer import Initializer
 from sim2real.composer.initializers import inverse_kinematics
-from sim2real.composer.models.translate import mj
+from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.models.traversal import get_freejoint
 from sim2real.composer.robot import DOWN_QUATERNION
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
     from sim2real.composer.models.element import Element
+    from sim2real.composer.physics.c.physics import Physics
     from sim2real.composer.types import ArrayLike, RandomState, Varying
 
 

@@ -8,8 +8,8 @@ from sim2real.composer.models.element import Element
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.c.physics import Physics
     from sim2real.composer.models.element import Elements
+    from sim2real.composer.physics.c.physics import Physics
 
 
 class JointStaticIsolator:

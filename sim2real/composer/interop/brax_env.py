@@ -6,7 +6,7 @@ import math
 
 from sim2real.composer.interop.counted import PureBraxEnv
 from sim2real.composer.interop.task import PureTask, check_shown
-from sim2real.composer.mjx.environment import MjxEnvironment
+from sim2real.composer.physics.mjx.environment import MjxEnvironment
 
 
 class BraxEnv(PureBraxEnv):

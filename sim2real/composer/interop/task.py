@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2real.composer.interop.moment import Moment
-from sim2real.composer.mjx.environment import MjxEnvironment, State
+from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.errors import UsageError
 
 

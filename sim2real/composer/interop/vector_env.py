@@ -8,7 +8,7 @@ from dm_env import specs
 
 from sim2real.composer.interop.copies import AutoresetMode, CopiesVectorEnv, gymnasium
 from sim2real.composer.interop.task import PureTask, check_shown
-from sim2real.composer.mjx.environment import MjxEnvironment
+from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
 

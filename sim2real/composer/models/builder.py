@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.models import files, given, paths, references, schema, translate
-from sim2real.composer.models.references import REFERENCES, refer
-from sim2real.composer.models.schema import KIND_OF_TAG
-from sim2real.composer.models.translate import TREE_KINDS
+from sim2real.composer.models.mjcf import explicit_values, files, references, schema, tendon_paths, translate
+from sim2real.composer.models.mjcf.references import REFERENCES, refer
+from sim2real.composer.models.mjcf.schema import KIND_OF_TAG
+from sim2real.composer.models.mjcf.translate import TREE_KINDS
 from sim2real.composer.models.tree import H, Handle, Tree
 from sim2real.errors import UsageError
 
@@ -202,7 +202,7 @@ def _catch_up(element: Handle, said: dict[str, Any], key: str | None) -> None:
         except AttributeError:
             continue
         if isinstance(value, np.ndarray):
-            said[name] = np.array(given.show(value, said[name]))
+            said[name] = np.array(explicit_values.show(value, said[name]))
 
 
 def reclass(model: Tree[Handle], element: Handle, name: str, value: Any) -> None:
@@ -235,7 +235,7 @@ def class_of(element: Handle) -> str:
     return getattr(name, "name", name) or "main"
 
 
-def said_by_classes(element: Handle) -> Iterator[given.Given]:
+def said_by_classes(element: Handle) -> Iterator[explicit_values.Given]:
     """Yield what the classes of an element say of elements of its kind, the nearest class first."""
     model: Tree[Handle] = element.root
     name: str | None = class_of(element)
@@ -256,15 +256,15 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
         attrs: The attributes in MJCF; elements, or their names.
     """
-    path = paths.path_of(model, tendon._native)
-    part = paths.make_part(model, tag, attrs)
+    path = tendon_paths.path_of(model, tendon._native)
+    part = tendon_paths.make_part(model, tag, attrs)
 
     def name(kind: str, target: Handle | str) -> str:
         if isinstance(target, str):
             return target
-        return target._native.name if target.root is model else paths.ELSEWHERE
+        return target._native.name if target.root is model else tendon_paths.ELSEWHERE
 
-    paths.wrap(tendon._native, part, name)
+    tendon_paths.wrap(tendon._native, part, name)
     part.written = {k: v._native.name for k, v in part.values.items() if isinstance(v, Handle)}
     path.append(part)
     model.touch()

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.models import builder, given, schema, translate
+from sim2real.composer.models import builder
 from sim2real.composer.models.element import Element
-from sim2real.composer.models.schema import KIND_OF_TAG
+from sim2real.composer.models.mjcf import explicit_values, schema, translate
+from sim2real.composer.models.mjcf.schema import KIND_OF_TAG
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
@@ -160,7 +161,7 @@ class DefaultElement(Element):
         """MuJoCo's own defaults; asking a class for its class ends the process."""
         return translate.blank(self.kind)
 
-    def recorded(self) -> given.Given:
+    def recorded(self) -> explicit_values.Given:
         """Return what the class says."""
         return self.root.records.of_class(self._native, self.kind)
 

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.models import attaching, builder, files, given, schema, translate, xml
+from sim2real.composer.models import builder
+from sim2real.composer.models.composition import attach as attaching
 from sim2real.composer.models.element_list import ElementList
-from sim2real.composer.models.references import REFERENCES, refer, referenced, rename
-from sim2real.composer.models.schema import KIND_OF_TAG
-from sim2real.composer.models.translate import TREE_KINDS, mj
+from sim2real.composer.models.mjcf import explicit_values, files, schema, translate, xml
+from sim2real.composer.models.mjcf.references import REFERENCES, refer, referenced, rename
+from sim2real.composer.models.mjcf.schema import KIND_OF_TAG
+from sim2real.composer.models.mjcf.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Handle, Tree
 from sim2real.errors import UsageError
 
@@ -148,17 +150,17 @@ class Element(Handle):
             return self.root.default_class(said.values[name])
         return self._shown(name, said)
 
-    def _shown(self, name: str, said: given.Given) -> Any:
+    def _shown(self, name: str, said: explicit_values.Given) -> Any:
         """Return the value of a plain attribute, in PyMJCF's form where it was given."""
         try:
             value = translate.read(self._native, self.kind, name)
         except AttributeError:
             if name not in said.values:
                 raise
-            return given.parse(said.values[name])
+            return explicit_values.parse(said.values[name])
         if isinstance(value, np.ndarray):  # which the caller may write into
             self.root.touch()
-        return given.show(value, said.values[name]) if name in said.values else value
+        return explicit_values.show(value, said.values[name]) if name in said.values else value
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "name":

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.models import attaching, compose, duplicate, files, parse, references, writing
+from sim2real.composer.models.composition import attach as attaching
+from sim2real.composer.models.composition import compose, duplicate
 from sim2real.composer.models.element import Element
-from sim2real.composer.models.given import Document
-from sim2real.composer.models.schema import SECTION_OF
+from sim2real.composer.models.mjcf import files, parse, references, writer
+from sim2real.composer.models.mjcf.explicit_values import Document
+from sim2real.composer.models.mjcf.schema import SECTION_OF
 from sim2real.composer.models.sections import Section, make_sections
 from sim2real.composer.models.tree import Tree
 
@@ -164,7 +166,7 @@ class Model(Tree[Element]):
         with files.renamed(self):
             spec = compose.compose(self)
         files.flatten(spec)
-        return writing.to_xml(spec)
+        return writer.to_xml(spec)
 
     def get_assets(self) -> dict[str, bytes]:
         """Return the contents of the files that ``to_xml_string`` names: name -> bytes."""

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
-from sim2real.composer.models import merge
-from sim2real.composer.models.translate import mj
+from sim2real.composer.models.composition import merge_options
+from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ class Scope:
         self._spec: MjSpec = mj.MjSpec() if spec is None else spec
         self._spec.modelname = model or (self._spec.modelname if spec is not None else "unnamed_model")
         self.check_name("model", self._spec.modelname)
-        self._settings: merge.Settings | None = {} if spec is None else None
-        self.overrides = merge.Overrides()
+        self._settings: merge_options.Settings | None = {} if spec is None else None
+        self.overrides = merge_options.Overrides()
         self.inherits_angle = spec is None
         self.parent_model: Self | None = None
         self.attachments: dict[str, Attachment[Self]] = {}
@@ -55,10 +55,10 @@ class Scope:
 
     # -- changes
 
-    def settings(self) -> merge.Settings:
+    def settings(self) -> merge_options.Settings:
         """Return the options, sizes and visual settings that this model sets, without those of attached models."""
         if self._settings is None or self._revision is None:
-            self._settings = merge.settings(self._spec)
+            self._settings = merge_options.settings(self._spec)
         return self._settings
 
     def touch_settings(self) -> None:

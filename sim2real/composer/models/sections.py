@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.models import builder, merge, schema, translate
+from sim2real.composer.models import builder
+from sim2real.composer.models.composition import merge_options
 from sim2real.composer.models.defaults import Defaults
 from sim2real.composer.models.element import Element
 from sim2real.composer.models.element_list import ElementList
-from sim2real.composer.models.translate import mj
+from sim2real.composer.models.mjcf import schema, translate
+from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.models.tree import Tree
 from sim2real.errors import UsageError
 
@@ -115,7 +117,7 @@ class Section:
             return Flags(self._model)
         if not hasattr(self._native, name):
             raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
-        value = merge.in_world(self._model, self._path, name, getattr(self._native, name))
+        value = merge_options.in_world(self._model, self._path, name, getattr(self._native, name))
         if isinstance(value, np.ndarray):  # which the caller may write into
             self._model.touch_settings()
         return next((k for k, v in _CHOICES[name].items() if v == value), value) if name in _CHOICES else value
@@ -140,7 +142,7 @@ class Section:
             native.eulerseq = list(value)
             return
         setattr(native, name, translate.like(current, value))
-        merge.note(self._model, self._path, name)
+        merge_options.note(self._model, self._path, name)
 
     def _known(self) -> str:
         return ", ".join(n for n in dir(self._native) if not n.startswith("_"))
@@ -155,21 +157,23 @@ class Flags:
         object.__setattr__(self, "_model", model)
 
     def _check(self, name: str) -> None:
-        if name not in merge.FLAGS:
-            raise AttributeError(f"<option.flag> has no attribute {name!r}. Available: {', '.join(merge.FLAGS)}")
+        if name not in merge_options.FLAGS:
+            raise AttributeError(
+                f"<option.flag> has no attribute {name!r}. Available: {', '.join(merge_options.FLAGS)}"
+            )
 
     def __getattr__(self, name: str) -> str:
         self._check(name)
-        field, bit = merge.FLAGS[name]
+        field, bit = merge_options.FLAGS[name]
         on = bool(getattr(self._model._spec.option, field) & bit) == (field == "enableflags")
-        return merge.in_world(self._model, merge.FLAG, name, "enable" if on else "disable")
+        return merge_options.in_world(self._model, merge_options.FLAG, name, "enable" if on else "disable")
 
     def __setattr__(self, name: str, value: str) -> None:
         self._check(name)
         if value not in ("enable", "disable"):
             raise UsageError(f"option.flag.{name}={value!r} is not valid. Available: disable, enable")
-        merge.set_flag(self._model._spec, name, value)
-        merge.note(self._model, merge.FLAG, name)
+        merge_options.set_flag(self._model._spec, name, value)
+        merge_options.note(self._model, merge_options.FLAG, name)
 
 
 class DocumentsOnly:

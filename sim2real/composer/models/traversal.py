@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sim2real.composer.models import builder, compose, schema
+from sim2real.composer.models import builder
+from sim2real.composer.models.composition import compose
 from sim2real.composer.models.element import Element
+from sim2real.composer.models.mjcf import schema
 from sim2real.composer.models.model import Model
 
 

@@ -6,11 +6,11 @@ import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
-from sim2real.composer.models import translate
-from sim2real.composer.models.given import Document, Given, PathPart, Records
-from sim2real.composer.models.schema import KIND_OF_TAG, SECTION_OF
+from sim2real.composer.models.mjcf import translate
+from sim2real.composer.models.mjcf.explicit_values import Document, Given, PathPart, Records
+from sim2real.composer.models.mjcf.schema import KIND_OF_TAG, SECTION_OF
+from sim2real.composer.models.mjcf.translate import TREE_KINDS
 from sim2real.composer.models.scope import Scope
-from sim2real.composer.models.translate import TREE_KINDS
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.arrays import is_jax, namespace
+from sim2real.composer.physics.arrays import is_jax, namespace
 
 if TYPE_CHECKING:
     from sim2real.composer.types import ArrayLike, RandomState, Varying

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.arrays import namespace
+from sim2real.composer.physics.arrays import namespace
 from sim2real.composer.variation.base import Variation, evaluate
 from sim2real.errors import UsageError
 

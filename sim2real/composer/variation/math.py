@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any
 
-from sim2real.composer.arrays import namespace
+from sim2real.composer.physics.arrays import namespace
 from sim2real.composer.variation.base import Variation, evaluate
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.arrays import multiply_quaternions, namespace, rotate
+from sim2real.composer.physics.arrays import multiply_quaternions, namespace, rotate
 from sim2real.composer.variation.base import Variation, evaluate
 
 if TYPE_CHECKING:

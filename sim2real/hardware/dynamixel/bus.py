@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.bus.registers import Register
+from sim2real.hardware.bus.servos import GuardedServos
 from sim2real.hardware.device import Reading, Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.link import BusConfig, BusLink, watchdog_message
 from sim2real.hardware.dynamixel.models import model
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.registers import Register
-from sim2real.hardware.servos import GuardedServos
 
 __all__ = ["BusConfig", "ServoBus"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import PROTOCOL, StatusError
 from sim2real.hardware.dynamixel.servo import EmulatedServo
-from sim2real.hardware.instructions import InstructedBus
-from sim2real.hardware.packets import Instruction
-from sim2real.hardware.planned import BusEmulation, Request
+from sim2real.hardware.emulation.emulated_bus import BusEmulation, Request
+from sim2real.hardware.emulation.instructions import InstructedBus
 
 
 class EmulatedBus(InstructedBus[EmulatedServo, "EmulatorConfig"]):

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from sim2real.errors import SafetyStop, Sim2RealError
+from sim2real.hardware.bus.link import ServoLink
+from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
+from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import ALERT_BIT, PROTOCOL, StatusError
-from sim2real.hardware.link import ServoLink
-from sim2real.hardware.packets import BROADCAST_ID, Answer, Instruction
-from sim2real.hardware.port import LinkConfig
 
 _REASONS: Final[dict[int, str]] = {
     StatusError.RESULT_FAIL: "it failed to carry it out",

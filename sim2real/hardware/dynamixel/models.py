@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from sim2real.hardware.models import ServoModel
+from sim2real.hardware.bus.models import ServoModel
 
 _MANUAL: Final = "e-Manual, Bus Watchdog(98); not measured by us"
 _FORUM: Final = "ROBOTIS reproduced it with all 330s: forum.robotis.com/t/4814 (firmware 51)"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-from sim2real.hardware.packets import Answer, Instruction, Packet, PacketFormat
+from sim2real.hardware.bus.packets import Answer, Instruction, Packet, PacketFormat
 
 HEADER: Final = b"\xff\xff\xfd\x00"
 MAX_PACKET_LENGTH: Final = 1024

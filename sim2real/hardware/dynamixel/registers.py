@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from sim2real.hardware.registers import TWOS_COMPLEMENT, MemoryTable, Register, eeprom, ram
+from sim2real.hardware.bus.registers import TWOS_COMPLEMENT, MemoryTable, Register, eeprom, ram
 
 COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.models import model
 from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
-from sim2real.hardware.firmware import ServoFirmware
+from sim2real.hardware.emulation.firmware import ServoFirmware
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.registers import Register
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5

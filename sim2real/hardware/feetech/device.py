@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.bus.models import ServoModel
+from sim2real.hardware.bus.servos import GuardedServos
 from sim2real.hardware.device import POSITION, CommandKind, Device, Reading, Transaction
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.link import StsConfig, StsLink
-from sim2real.hardware.models import ServoModel
-from sim2real.hardware.servos import GuardedServos
 
 _SOURCE: Final = "Feetech, STS Series Servo Memory Table: no register for it; not measured by us"
 MODELS: Final = {777: ServoModel("STS3215", None, _SOURCE), 2825: ServoModel("STS3250", None, _SOURCE)}

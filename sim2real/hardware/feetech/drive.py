@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 from sim2real.errors import UsageError
+from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint
-from sim2real.hardware.registers import Register
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim2real.errors import UsageError
+from sim2real.hardware.emulation.emulated_bus import BusEmulation, Firmware, Request
+from sim2real.hardware.emulation.instructions import InstructedBus
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.profile import ProfiledPlant
 from sim2real.hardware.feetech.protocol import PROTOCOL
 from sim2real.hardware.feetech.servo import StsServo
-from sim2real.hardware.instructions import InstructedBus
-from sim2real.hardware.planned import BusEmulation, Firmware, Request
 from sim2real.hardware.plant import Plant
 
 

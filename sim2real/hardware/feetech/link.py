@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sim2real.errors import SafetyStop
+from sim2real.hardware.bus.link import ServoLink
+from sim2real.hardware.bus.packets import Answer
+from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.protocol import PROTOCOL, describe_alarms
-from sim2real.hardware.link import ServoLink
-from sim2real.hardware.packets import Answer
-from sim2real.hardware.port import LinkConfig
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from itertools import combinations
 from typing import Final
 
-from sim2real.hardware.packets import BROADCAST_ID, Answer, Packet, PacketFormat
+from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Packet, PacketFormat
 
 HEADER: Final = b"\xff\xff"
 

@@ -11,7 +11,7 @@ import math
 from enum import IntEnum
 from typing import Final
 
-from sim2real.hardware.registers import MemoryTable, Register, eeprom, ram
+from sim2real.hardware.bus.registers import MemoryTable, Register, eeprom, ram
 
 COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from sim2real.hardware.emulation.firmware import ServoFirmware
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.firmware import ServoFirmware
 from sim2real.hardware.plant import OperatingMode
 
 STALL_CURRENT_A: Final = 2.7  # data sheet of the STS3215-C018, 12 V

@@ -6,11 +6,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from sim2real.hardware import emulator
+from sim2real.hardware.emulation import emulator
+from sim2real.hardware.emulation.emulated_bus import truth_header
+from sim2real.hardware.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.feetech.emulation import StsBus
-from sim2real.hardware.planned import truth_header
 from sim2real.hardware.plant import load_plant
-from sim2real.hardware.truth import TruthLog, read_truth
 
 PLANTS = Path(__file__).parents[1] / "plants.py"
 IDS = (1, 2, 3)

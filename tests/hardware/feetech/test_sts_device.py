@@ -9,7 +9,8 @@ from sts_bench import IDS, PLANTS
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
-from sim2real.hardware.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
@@ -17,7 +18,6 @@ from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.registry import load_device
-from sim2real.hardware.truth import Kind
 
 pytestmark = pytest.mark.realtime
 

@@ -12,16 +12,16 @@ import pytest
 from sts_bench import IDS
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError
+from sim2real.hardware.bus.packets import Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.feetech.protocol import PROTOCOL
-from sim2real.hardware.gate import GateConfig
-from sim2real.hardware.packets import Instruction
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.rig import Rig
-from sim2real.hardware.truth import Kind
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
 
 pytestmark = pytest.mark.realtime
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim2real.hardware.bus.packets import Instruction, Packet, Parser
+from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.protocol import HEADER, PROTOCOL, describe_alarms
-from sim2real.hardware.packets import Instruction, Packet, Parser
-from sim2real.hardware.registers import Register
 
 build = PROTOCOL.build
 

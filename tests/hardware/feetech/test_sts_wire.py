@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
+from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.feetech.profile import ProfiledPlant
 from sim2real.hardware.feetech.protocol import PROTOCOL
-from sim2real.hardware.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.truth import Kind
 
 MS = 1_000_000
 build = PROTOCOL.build

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim2real.hardware.planned import BusEmulation, PlannedBus, Request
+from sim2real.hardware.emulation.emulated_bus import BusEmulation, PlannedBus, Request
+from sim2real.hardware.emulation.truth import TruthLog
 from sim2real.hardware.plant import OperatingMode, Plant
-from sim2real.hardware.truth import TruthLog
 
 from .odrive import CLOSED_LOOP, IDLE, STATE, TURN, WATCHDOG, SpeedLoop, framed, unframed
 
@@ -40,7 +40,7 @@ class Lines:
 
 
 class Axis:
-    """Properties and firmware of axis 0, without time, line and physics; see `sim2real.hardware.planned.Firmware`."""
+    """Properties and firmware of axis 0, without time, line and physics; it is a ``Firmware`` of ``emulated_bus``."""
 
     servo_id = 0
     watchdog_stops = True

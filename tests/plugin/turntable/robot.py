@@ -14,11 +14,11 @@ from sim2real.hardware.registry import load_device
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.agent import AgentParams, GoalAgent
-from sim2real.robots.hardware import Embedded
-from sim2real.robots.loop import DelayParams, delay_of
-from sim2real.robots.loop_robot import LoopRobot
-from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.control_loop.hardware import Embedded
+from sim2real.robots.control_loop.loop import DelayParams, delay_of
+from sim2real.robots.control_loop.loop_robot import LoopRobot
+from sim2real.robots.control_loop.messages import Goals, JointReading
+from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 from .odrive import SpeedLoop

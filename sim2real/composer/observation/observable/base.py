@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.arrays import namespace
+from sim2real.composer.physics.arrays import namespace
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,0 +1,1 @@
+"""Parts of an identification's artifact: posterior, noise, links, drift."""

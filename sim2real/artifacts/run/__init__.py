@@ -1,0 +1,1 @@
+"""The run folder: manifests, locks, the status of stages, iterations."""

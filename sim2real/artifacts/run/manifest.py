@@ -1,0 +1,213 @@
+"""A stage's ``manifest.json``: what it ran on, with what, and what came out; plain JSON, replaced atomically."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import hashlib
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from enum import Enum
+from importlib import metadata
+from numbers import Integral, Real
+from pathlib import Path, PurePath
+from typing import Any
+
+from sim2real.artifacts.run.locks import held_lock, read_with_lock
+from sim2real.errors import Sim2RealError
+
+MANIFEST = "manifest.json"
+RUNNING = "running"
+DIED = "died"
+"""Status of a stage whose process ended without a word: it was killed, or the machine lost its power."""
+_TEXTS = ("pipeline", "stage", "status", "started")
+_DRAFT = f".{MANIFEST}.tmp"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Most manifests have 4 kB; long summaries need more.
+_RESERVED_BYTES = 32 * 1024
+PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return a stage folder's manifest, or None if it is missing or malformed.
+
+    The status is `died` where the manifest says `running` and no process holds the lock on it.
+    """
+    try:
+        text, locked = read_with_lock(folder / MANIFEST)
+        manifest = json.loads(text)
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not _is_manifest(manifest):
+        return None
+    return manifest | {"status": DIED} if manifest["status"] == RUNNING and not locked else manifest
+
+
+def _is_manifest(value: object) -> bool:
+    """Whether a JSON document has a manifest's entries, and its outputs lie in its folder."""
+    if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
+        return False
+    for kind in ("inputs", "outputs"):
+        entries = value.get(kind)
+        if not isinstance(entries, dict):
+            return False
+        for entry in entries.values():
+            if not (isinstance(entry, dict) and all(isinstance(entry.get(k), str) for k in ("path", "sha256"))):
+                return False
+            path = PurePath(entry["path"])
+            if kind == "outputs" and (path.is_absolute() or ".." in path.parts):
+                return False
+    return True
+
+
+def write_manifest(folder: Path, manifest: Mapping[str, Any], lock: bool = False) -> int | None:
+    """Write a stage folder's manifest; a reader sees the old one or the new one, never a part.
+
+    Args:
+        folder: The stage's folder.
+        manifest: What to write.
+        lock: Whether to hold a lock on it, which readers see as long as this process lives.
+
+    Returns:
+        The file descriptor that holds the lock; its owner closes it. None without a lock.
+
+    Raises:
+        TypeError: When a value has no plain JSON form.
+    """
+    text = json.dumps(plain(manifest), indent=2, allow_nan=False)
+    draft = folder / _DRAFT
+    # Written over what `reserve` left, and cut to its length afterwards: it needs no room of its own on a full disk.
+    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
+        file.write(f"{text}\n".encode())
+        file.truncate()
+        file.flush()
+        os.fsync(file.fileno())
+        # Locked before it has its name: no reader finds it without the lock.
+        held = held_lock(file.fileno()) if lock else None
+    os.replace(draft, folder / MANIFEST)
+    return held
+
+
+def reserve(folder: Path) -> None:
+    """Reserve disk space for the folder's next manifest: even on a full disk it must say how the stage ended."""
+    with (folder / _DRAFT).open("wb") as file:
+        file.write(b" " * _RESERVED_BYTES)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def in_words(error: BaseException, folder: Path) -> BaseException:
+    """Return the exception to show the user: a plain error where a full disk is the cause, else the same."""
+    if not isinstance(error, OSError) or error.errno not in _FULL:
+        return error
+    where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
+    return Sim2RealError(
+        f"the disk is full: {error.strerror}{where}",
+        hint=f"free some space, or name a folder elsewhere with --runs DIR; what was written is in {folder}",
+    )
+
+
+def plain(value: object) -> Any:
+    """Return a value as dicts, lists, strings, numbers, booleans and None.
+
+    Dataclasses become dicts, arrays nested lists, enums their names, paths strings; numbers that JSON lacks become the
+    strings 'inf', '-inf' and 'nan'.
+
+    Raises:
+        TypeError: When the value, or one inside it, is none of these.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Integral):
+        return int(value)
+    if isinstance(value, Real):
+        number = float(value)
+        return number if math.isfinite(number) else str(number)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        return {str(name): plain(v) for name, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    import numpy as np  # only for arrays: `sim2real info` does without
+
+    array = np.asarray(value)
+    if array.dtype == object:
+        raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")
+    return plain(array.tolist())
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, or of a folder: of its files' relative names and hashes in order of name.
+
+    Raises:
+        Sim2RealError: When there is no such file or folder.
+    """
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+            digest.update(f"{file.relative_to(path).as_posix()}\0{sha256(file)}\n".encode())
+        return digest.hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise Sim2RealError(f"cannot read {path}: {error.strerror}") from error
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of the packages that a result may depend on; None for one that is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def git_state(folder: Path | None = None) -> dict[str, Any] | None:
+    """Return the commit of the repository that holds a folder (default: the working directory) and if it is dirty.
+
+    Files that git does not track do not make it dirty: run folders usually lie beside the code. None outside of a
+    repository, or without git.
+    """
+    safe = {"core.fsmonitor": "false", "core.hooksPath": os.devnull}
+
+    def git(*arguments: str) -> str:
+        entries = enumerate(safe.items())
+        over = {
+            f"GIT_CONFIG_{what}_{i}": v for i, pair in entries for what, v in zip(("KEY", "VALUE"), pair, strict=True)
+        }
+        done = subprocess.run(
+            ["git", "--no-optional-locks", *arguments],
+            cwd=folder,
+            env={**os.environ, **over, "GIT_CONFIG_COUNT": str(len(safe))},
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    try:
+        # A repository may come from anywhere, and its settings may name programs that git would run: file system
+        # monitors, hooks, filters. They are switched off; the user's own settings stay.
+        for line in git("config", "--list", "--name-only", "--show-scope").splitlines():
+            scope, _, key = line.partition("\t")
+            if scope in ("local", "worktree") and key.startswith("filter."):
+                safe[key] = "false" if key.endswith(".required") else ""
+        return {
+            "sha": git("rev-parse", "--verify", "HEAD"),
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")),
+        }
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,395 @@
+"""Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a manifest.
+
+A stage that is run again in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: a folder is made once, by the
+process that writes into it, and never renamed. So two processes never write into the same one, nothing recorded is
+overwritten, references to files stay valid, and a failed attempt does not hide a finished one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sim2real.artifacts.run.manifest import (
+    RUNNING,
+    git_state,
+    in_words,
+    plain,
+    read_manifest,
+    reserve,
+    sha256,
+    versions,
+    write_manifest,
+)
+from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+
+STAGES = ("record", "identify", "train", "deploy")
+TESTS = ("latency", "explain")
+"""What has a folder in a run as stages have, but no other stage takes up."""
+DRY = "dry run"
+"""Status of a stage that ended well but moved nothing: later stages do not use it."""
+INTERRUPTED = 130
+_NAME = re.compile(r"\w[\w.-]*")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that an artifact was made from: its path, relative to the run folder, and its SHA-256."""
+
+    path: str
+    sha256: str
+
+    @staticmethod
+    def of(path: Path, run_dir: Path) -> Source:
+        """Describe a file that an artifact in a run folder was made from."""
+        return Source(portable(path, run_dir), sha256(path))
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """A stage's folder and what its manifest says."""
+
+    folder: Path
+    manifest: Mapping[str, Any]
+
+    @property
+    def run_dir(self) -> Path:
+        """The run folder it lies in."""
+        return self.folder.parent
+
+    @property
+    def stage(self) -> str:
+        """The stage's name."""
+        return self.manifest["stage"]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the stage came to its end."""
+        return self.manifest.get("status") == "finished"
+
+    @property
+    def dry(self) -> bool:
+        """Whether it moved nothing: its commands were never sent."""
+        return self.manifest.get("dry_run") is True
+
+    @property
+    def outputs(self) -> dict[str, Path]:
+        """Name -> path of what the stage wrote."""
+        return {name: self.folder / entry["path"] for name, entry in self.manifest.get("outputs", {}).items()}
+
+    def output(self, name: str) -> Path:
+        """Return the path of one output.
+
+        Raises:
+            Sim2RealError: When the stage wrote none of this name, or it has been deleted.
+        """
+        paths = self.outputs
+        if name not in paths:
+            raise Sim2RealError(
+                f"{self.folder} has no output {name!r}. Available: {', '.join(sorted(paths)) or 'none'}"
+            )
+        if not paths[name].exists():
+            raise Sim2RealError(
+                f"{paths[name]} is missing, though the manifest lists it", hint=f"run the stage {self.stage!r} again"
+            )
+        return paths[name]
+
+
+@dataclass
+class OpenStage:
+    """A stage that is running: it writes into ``folder`` and says what it wrote."""
+
+    folder: Path
+    _outputs: dict[str, Path] = field(default_factory=dict)
+    _summary: dict[str, Any] = field(default_factory=dict)
+    _result: StageFolder | None = None
+
+    @property
+    def run_dir(self) -> Path:
+        """The run folder it lies in."""
+        return self.folder.parent
+
+    def output(self, name: str, path: Path | str) -> Path:
+        """Name a file or folder that the stage writes, before or after writing it; it is hashed when the stage ends.
+
+        Args:
+            name: What later stages ask for.
+            path: Inside of the stage's folder; relative paths are relative to it.
+
+        Returns:
+            The absolute path.
+        """
+        full = self.folder / path
+        if not full.resolve().is_relative_to(self.folder.resolve()):
+            raise UsageError(f"output {name!r} must lie in {self.folder}, got {path}")
+        self._outputs[name] = full
+        return full
+
+    def summary(self, values: Mapping[str, Any]) -> None:
+        """Add the numbers that belong in the table at the end and in the manifest; call it as often as needed."""
+        self._summary.update(plain(values))
+
+    @property
+    def result(self) -> StageFolder:
+        """The finished stage: what a stage function returns; available after the ``with`` block."""
+        if self._result is None:
+            raise RuntimeError("the stage is still running: ask for its result after the `with` block")
+        return self._result
+
+
+@contextmanager
+def open_stage(
+    root: Path,
+    pipeline: str,
+    stage: str,
+    config: Any,
+    inputs: Mapping[str, Path] | None = None,
+    run_dir: Path | None = None,
+    dry_run: bool = False,
+) -> Iterator[OpenStage]:
+    """Run a stage in a folder of its own, with a manifest from the first moment to the last.
+
+    Args:
+        root: Folder of all runs.
+        pipeline: Name of the pipeline.
+        stage: One of ``STAGES``, or of ``TESTS``.
+        config: The resolved configuration, a dataclass.
+        inputs: Name -> file or folder that the stage reads; hashed before it starts.
+        run_dir: Run folder to add to; None makes a new one.
+        dry_run: Whether the stage moves nothing.
+
+    Yields:
+        The running stage; at its end the manifest says 'finished', 'dry run', 'failed' or 'interrupted', and the exit
+        code.
+
+    Raises:
+        UsageError: When there is no such stage, or the pipeline's name cannot be that of a folder.
+        Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
+    """
+    _check_names(pipeline, stage)
+    hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
+    folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
+    hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
+    running = OpenStage(folder)
+    manifest = _first_manifest(pipeline, stage, config, hashed, dry_run)
+    start, lock = time.monotonic(), None
+    try:
+        lock = write_manifest(folder, manifest, lock=True)
+        reserve(folder)
+        yield running
+        _close(running, manifest, start, DRY if dry_run else "finished", OK)
+    except BaseException as error:
+        told = in_words(error, folder)
+        try:
+            _close(running, manifest, start, *_failure(told), told)
+        except OSError as other:
+            told.add_note(f"then: the manifest could not be written: {other}")
+        if told is error:
+            raise
+        raise told from error
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str, Any], dry_run: bool) -> dict[str, Any]:
+    """Return the manifest of a stage that begins now."""
+    return {
+        "format": 1,
+        "pipeline": pipeline,
+        "stage": stage,
+        "status": RUNNING,
+        "dry_run": dry_run,
+        "exit_code": None,
+        "started": datetime.now(UTC).isoformat(timespec="microseconds"),
+        "duration_s": None,
+        "command": sys.argv,
+        "config": config,
+        "inputs": inputs,
+        "outputs": {},
+        "summary": {},
+        "versions": versions(),
+        "git": git_state(),
+    }
+
+
+def _check_names(pipeline: str, stage: str) -> None:
+    """Refuse unknown stages, and names of pipelines, which may come from files, that lead out of the folder of runs."""
+    if stage not in (known := (*STAGES, *TESTS)):
+        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(known)}")
+    if not _NAME.fullmatch(pipeline):
+        raise UsageError(
+            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
+        )
+
+
+def portable(path: Path, run_dir: Path) -> str:
+    """Return a path as an artifact of a run refers to it: relative to the run folder.
+
+    So a run that is moved, or copied to another machine, still finds its own files.
+    """
+    return Path(os.path.relpath(path.resolve(), run_dir.resolve())).as_posix()
+
+
+def new_run(root: Path, pipeline: str) -> Path:
+    """Make a run folder named by the time (UTC, to the millisecond): the names are unique and sort by age."""
+    while True:
+        now = datetime.now(UTC)
+        folder = Path(root) / pipeline / f"{now:%Y%m%d-%H%M%S}-{now.microsecond // 1000:03d}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            time.sleep(0.001)  # two runs started in the same millisecond
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+        else:
+            return folder
+
+
+def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
+    """Return all attempts at a stage in a run folder, the latest first: by number, for a clock may be set back."""
+    numbers = [int(f.suffix[1:]) for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdecimal()]
+    folders = [*(run_dir / f"{stage}.{n}" for n in sorted(numbers, reverse=True)), run_dir / stage]
+    found = [(folder, read_manifest(folder)) for folder in folders]
+    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
+
+
+def finished(run_dir: Path, stage: str) -> StageFolder | None:
+    """Return the latest finished attempt at a stage in a run folder, or None."""
+    return next((attempt for attempt in attempts(run_dir, stage) if attempt.finished), None)
+
+
+def open_folder(folder: Path, stage: str) -> StageFolder:
+    """Return a stage's folder, finished or not.
+
+    Raises:
+        Sim2RealError: When there is no such folder.
+    """
+    if not folder.is_dir():
+        raise Sim2RealError(f"there is no folder {folder}", hint=f"make one with `sim2real {stage} PIPELINE`")
+    return StageFolder(folder, read_manifest(folder) or {"stage": stage})
+
+
+def finished_stages(run_dir: Path) -> dict[str, StageFolder]:
+    """Return stage -> its latest finished attempt, in the order of the stages; a dry run where there is no other.
+
+    Raises:
+        Sim2RealError: When there is none at all.
+    """
+    found = {}
+    for stage in STAGES:
+        tried = attempts(run_dir, stage)
+        done = [a for a in tried if a.finished] + [a for a in tried if a.manifest.get("status") == DRY]
+        if done:
+            found[stage] = done[0]
+    if not found:
+        raise Sim2RealError(
+            f"{run_dir} has no finished stage. Looked for: {', '.join(STAGES)}",
+            hint="make one with `sim2real record PIPELINE`, or name another run",
+        )
+    return found
+
+
+def pipeline_of(run_dir: Path) -> str:
+    """Return the name of the pipeline that a run belongs to.
+
+    Raises:
+        Sim2RealError: When the run has no finished stage.
+    """
+    return str(next(iter(finished_stages(run_dir).values())).manifest["pipeline"])
+
+
+def run_folders(root: Path, pipeline: str) -> list[Path]:
+    """Return a pipeline's run folders, the oldest first."""
+    return sorted(f for f in (Path(root) / pipeline).glob("*") if any(attempts(f, stage) for stage in STAGES))
+
+
+def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -> StageFolder:
+    """Return the newest finished artifact of a stage.
+
+    Args:
+        root: Folder of all runs.
+        pipeline: Name of the pipeline.
+        stage: The stage whose artifact is wanted.
+        run_dir: Run folder to look in first; without the artifact there, the newest of all runs is taken.
+
+    Raises:
+        Sim2RealError: When there is none; the message says what was looked for and the hint which command makes it.
+    """
+    own = finished(run_dir, stage) if run_dir else None
+    if own is not None:
+        return own
+    folders = sorted((Path(root) / pipeline).glob("*"))
+    candidates = [done for folder in folders if (done := finished(folder, stage)) is not None]
+    if not candidates:
+        others = [attempt for folder in folders for attempt in attempts(folder, stage)]
+        dry = sum(attempt.dry for attempt in others)
+        kinds = [(len(others) - dry, "unfinished"), (dry, "dry run" if dry == 1 else "dry runs")]
+        also = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+        also = f" ({also})" if also else ""
+        raise Sim2RealError(
+            f"no finished {stage!r} of pipeline {pipeline!r} in {root}{also}",
+            hint=f"make one with `sim2real {stage} {pipeline}`, or name another folder with --runs DIR",
+        )
+    return max(candidates, key=lambda c: c.manifest["started"])
+
+
+def _stage_folder(run_dir: Path, stage: str) -> Path:
+    """Make a stage's folder under the first free number; whoever makes it owns it, also beside other processes."""
+    number = 1
+    while True:
+        folder = run_dir / (stage if number == 1 else f"{stage}.{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+        else:
+            return folder
+
+
+def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
+    return Sim2RealError(
+        f"cannot write the run folder {folder}: {error.strerror}", hint="name a folder of your own with --runs DIR"
+    )
+
+
+def _failure(error: BaseException) -> tuple[str, int]:
+    """Return the status and the exit code that an exception ends a stage with."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", INTERRUPTED
+    if isinstance(error, SystemExit | GeneratorExit):
+        code = error.code if isinstance(error, SystemExit) else None
+        return "interrupted", code if isinstance(code, int) else ERROR
+    return "failed", error.exit_code if isinstance(error, Sim2RealError) else ERROR
+
+
+def _close(
+    stage: OpenStage,
+    manifest: dict[str, Any],
+    start: float,
+    status: str,
+    code: int,
+    error: BaseException | None = None,
+) -> None:
+    """Write the last manifest; a stage that failed lists only the outputs that exist."""
+    paths = stage._outputs if error is None else {n: p for n, p in stage._outputs.items() if p.exists()}
+    manifest["outputs"] = {
+        name: {"path": path.relative_to(stage.folder).as_posix(), "sha256": sha256(path)}
+        for name, path in paths.items()
+    }
+    manifest |= {"status": status, "exit_code": code, "summary": stage._summary}
+    manifest["duration_s"] = round(time.monotonic() - start, 3)
+    if error is not None:
+        manifest["error"] = "\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    write_manifest(stage.folder, manifest)
+    stage._result = StageFolder(stage.folder, read_manifest(stage.folder) or manifest)

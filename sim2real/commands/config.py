@@ -1,0 +1,76 @@
+"""The commands ``new``, ``log recover`` and ``export``; every field is a flag. Imports no JAX, for ``--help``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline.robot_flags import RobotFlags
+
+
+@dataclass(frozen=True)
+class NewConfig:
+    """Write the files of a pipeline for a robot that was recorded."""
+
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """Name of the pipeline."""
+    model: Annotated[Positional[Path | None], arg(metavar="ROBOT.xml")] = None
+    """Model of the robot: MJCF or URDF."""
+    log: Annotated[str | None, arg(metavar="FILE")] = None
+    """A log of it, which says what was commanded and measured, and how fast."""
+    drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
+    """What drives are told, where no log says so."""
+    robot: Annotated[RobotFlags, arg(name="")] = field(default_factory=RobotFlags)
+    folder: Path = Path("pipelines")
+    """Folder of pipelines."""
+
+
+@dataclass(frozen=True)
+class RecoverConfig:
+    """Write what is readable of a damaged MCAP file into a new one."""
+
+    log: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
+    """The damaged file; it is left as it is."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The new file; default: beside the damaged one, as NAME.recovered.mcap."""
+
+    @property
+    def source(self) -> Path:
+        """The damaged file.
+
+        Raises:
+            UsageError: When none was named.
+        """
+        if self.log is None:
+            raise UsageError("log recover needs a file", hint="sim2real log recover FILE")
+        return self.log
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Write what was identified in the terms of another simulator."""
+
+    source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|FILE")] = None
+    """A run folder, a pipeline, whose newest identification is taken, or a parameters.json."""
+    to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf"
+    """What to write: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The file to write; default: one in the working directory that is called after the pipeline."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+
+@dataclass(frozen=True)
+class ShipConfig:
+    """Write a policy bundle elsewhere, with an example that runs it on a machine that has numpy alone."""
+
+    source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|BUNDLE")] = None
+    """A bundle's folder, a run folder, or a pipeline, whose newest training is taken."""
+    to: Annotated[Path | None, arg(metavar="DIR")] = None
+    """The folder to write; default: one in the working directory."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""

@@ -1,0 +1,206 @@
+"""Command-line flags from typed configurations: a field is a flag, its docstring the help, its value the default."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import io
+import math
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+import tyro
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.stages.deploy.config import DeployConfig
+from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.record.config import RecordConfig
+from sim2real.stages.train.config import TrainConfig
+
+Config = TypeVar("Config")
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+
+
+@dataclass(frozen=True)
+class StageFlags(Generic[Config]):
+    """Flags of one stage."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    runs: Folder = Path("runs")
+    """Folder of all runs."""
+    run: OptionalFolder = None
+    """Run folder to add to; default: a new one for record, for the others the newest one with what they need."""
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
+
+
+@dataclass(frozen=True)
+class DemoFlags:
+    """Flags of the demo."""
+
+    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Seed of every stage."""
+    runs: Folder = Path("runs")
+    """Folder of all runs."""
+    resume: OptionalFolder = None
+    """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
+
+
+@dataclass(frozen=True)
+class RunFlags(DemoFlags):
+    """Flags of all four stages."""
+
+    iterations: int = 1
+    """How often a run goes around at most, in all: the verdict on a deployment says what is done again."""
+    until: Annotated[str | None, tyro.conf.arg(metavar="QUANTITY=VALUE")] = None
+    """Go around until a quantity of the gap report is at least so large on the robot, such as success=0.95; default:
+    until the verdict is 'fine'."""
+    record: RecordConfig = field(default_factory=RecordConfig)
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    deploy: DeployConfig = field(default_factory=DeployConfig)
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        if self.train.hosts.several:
+            raise UsageError(
+                "only training is divided among processes: each of them would record and deploy",
+                hint="record and identify in one, then `sim2real train PIPELINE --hosts...` in all",
+            )
+        if self.iterations < 1 or (self.until and self.iterations == 1):
+            raise UsageError(
+                f"a run goes around at least once, and more often to reach a goal; got {self.iterations}",
+                hint="--iterations 5 --until success=0.95",
+            )
+        _ = self.goal
+
+    @property
+    def goal(self) -> tuple[str, float] | None:
+        """The quantity to reach, and its least value; None: no goal.
+
+        Raises:
+            UsageError: When ``until`` says neither.
+        """
+        if self.until is None:
+            return None
+        name, _, value = self.until.partition("=")
+        try:
+            least = float(value)
+        except ValueError:
+            least = math.nan
+        if not name or not math.isfinite(least):
+            raise UsageError(f"until must be QUANTITY=VALUE, got {self.until!r}", hint="--until success=0.95")
+        return name, least
+
+
+@dataclass(frozen=True)
+class TargetFlags:
+    """Flags of the commands that look at a run."""
+
+    runs: Folder = Path("runs")
+    """Folder of all runs."""
+
+
+@dataclass(frozen=True)
+class ViewFlags(TargetFlags):
+    """Flags of view."""
+
+    save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Write a recording for the Rerun viewer instead of opening the viewer."""
+
+
+def parse(
+    default: Config, arguments: Sequence[str], prog: str, description: str, epilog: str = "", kind: Any = None
+) -> Config:
+    """Return a configuration with the fields that the arguments name replaced.
+
+    Args:
+        default: A dataclass; its values are the defaults.
+        arguments: What the user typed behind the command.
+        prog: The command, for the help.
+        description: First lines of the help.
+        epilog: Last lines of the help.
+        kind: Type to parse into where it is more than the default's class (a generic class with its argument).
+
+    Raises:
+        UsageError: When a flag is unknown or a value does not fit.
+        SystemExit: With code 0 after ``--help``.
+    """
+    talk = io.StringIO()
+    try:
+        with _plain_if_asked(), contextlib.redirect_stderr(talk):
+            parsed, unknown = tyro.cli(
+                kind or type(default),
+                default=default,
+                args=list(arguments),
+                prog=prog,
+                description=description,
+                return_unknown_args=True,
+            )
+    except SystemExit as end:
+        if not end.code:
+            print(f"\n{epilog}" if epilog else "", flush=True)
+            raise
+        raise _usage_error(end, talk.getvalue(), prog) from None
+    if unknown:
+        raise _unknown(unknown, default, prog)
+    return parsed
+
+
+def flag_names(config: Any, prefix: str = "") -> list[str]:
+    """Return the flags of a configuration, nested ones with their prefix."""
+    names: list[str] = []
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            # The flags of StageFlags.config and of a robot have no prefix.
+            names += flag_names(value, prefix if item.name in ("config", "robot") else f"{prefix}{item.name}.")
+        else:
+            names.append(f"--{prefix}{item.name}".replace("_", "-"))
+    return names
+
+
+def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
+    """Return the error for arguments that no flag took."""
+    known = flag_names(default)
+    flags = [word.split("=")[0] for word in unknown if word.startswith("-")]
+    if not flags:
+        return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
+    close = difflib.get_close_matches(flags[0].replace("_", "-"), known, n=1)
+    return UsageError(
+        f"unknown flag {', '.join(flags)}. Available: {', '.join(known)}",
+        hint=f"did you mean {close[0]}?" if close else f"see `{prog} --help`",
+    )
+
+
+def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:
+    """Return why the parser gave up: the configuration's own error, or the text that the parser printed in a box."""
+    cause: BaseException | None = end
+    while cause is not None:
+        if isinstance(cause, Sim2RealError):
+            return cause
+        cause = cause.__context__
+    lines = [line.strip("│| ") for line in talk.splitlines() if line[:1] in "│|"]
+    # Below the first rule of the box the parser repeats the help.
+    body = " ".join(line for line in lines[: next((i for i, x in enumerate(lines) if re.match("[─-]{4}", x)), None)])
+    return UsageError(body or talk.strip(), hint=f"see `{prog} --help`")
+
+
+@contextlib.contextmanager
+def _plain_if_asked() -> Iterator[None]:
+    """Print the help without colour where NO_COLOR is set, which the parser itself ignores."""
+    options = tyro._experimental_options
+    before = options["ansi_codes"]
+    options["ansi_codes"] = before and not os.environ.get("NO_COLOR") and sys.stdout.isatty()
+    try:
+        yield
+    finally:
+        options["ansi_codes"] = before

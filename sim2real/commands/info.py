@@ -1,0 +1,127 @@
+"""What ``sim2real info`` prints about the installation, a pipeline, a log or a run."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+from sim2real.artifacts.run.manifest import plain, versions
+from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
+from sim2real.artifacts.run.stage_status import standing
+from sim2real.commands.flags import flag_names
+from sim2real.hardware import entries
+from sim2real.runtime import compilation_cache
+from sim2real.stages.pipeline.pipeline import available, load_pipeline
+from sim2real.stages.terminal.console import pairs, shown, table
+
+
+def installation() -> str:
+    """Return versions, and the pipelines, devices and worlds found."""
+    rows = []
+    for name, source in sorted(available().items()):
+        try:
+            summary = load_pipeline(name).summary
+        except Exception as error:  # one broken pipeline must not hide the others
+            summary = f"cannot be imported: {type(error).__name__}: {error}"
+        rows.append([name, summary, _origin(source)])
+    blocks = [pairs({**versions(), "compiled programs": _programs()}), table(rows, ["pipeline", "summary", "from"])]
+    for what, group in (("device", entries.DEVICES), ("world", entries.WORLDS)):
+        if found := entries.available(group):
+            blocks.append(table([[name, _origin(found[name])] for name in sorted(found)], [what, "from"]))
+    return "\n\n".join(blocks)
+
+
+def _programs() -> str:
+    """Return where compiled programs are kept, and how much there is of them."""
+    if (own := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
+        return f"{own} (JAX_COMPILATION_CACHE_DIR)"
+    folder = compilation_cache.location()
+    if folder is None:
+        return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}"
+    return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"
+
+
+def pipeline(name: str, root: Path) -> str:
+    """Return a pipeline's defaults and how many runs it has."""
+    found = load_pipeline(name)
+    head = {
+        "pipeline": found.name,
+        "summary": found.summary,
+        "runs": f"{len(run_folders(root, name))} in {shown(root)}",
+    }
+    blocks = [pairs(head)]
+    for stage in STAGES:
+        config = getattr(found, stage)
+        rows = [[flag, _value(config, flag)] for flag in flag_names(config)]
+        blocks.append(table(rows, [stage, "default"]))
+    return "\n\n".join(blocks)
+
+
+def run(run_dir: Path) -> str:
+    """Return the stages of a run, their inputs and outputs."""
+    rows, files = [], []
+    stale = {s.newest.folder.name: s.stale for s in standing(run_dir).values() if s.stale}
+    for stage in STAGES:
+        for attempt in attempts(run_dir, stage):
+            manifest, name = attempt.manifest, attempt.folder.name
+            status = "out of date" if name in stale else manifest["status"]
+            started, sha = manifest["started"][:19], (manifest.get("git") or {}).get("sha") or "-"
+            duration = manifest.get("duration_s")
+            rows.append([name, status, manifest.get("exit_code"), started, duration, sha[:10]])
+            for kind in ("inputs", "outputs"):
+                entries = manifest[kind].items()
+                files += [[name, kind[:-1], n, e["path"], e["sha256"][:10]] for n, e in entries]
+    return "\n\n".join(
+        [
+            f"run  {shown(run_dir)}",
+            table(rows, ["stage", "status", "exit", "started (UTC)", "duration [s]", "git"]),
+            *(["\n".join(f"out of date: {why}" for why in stale.values())] if stale else []),
+            table(files, ["stage", "", "name", "path", "sha256"]),
+        ]
+    )
+
+
+def log(path: Path) -> str:
+    """Return what a log says about itself, and its topics; a log that was cut is read up to the cut.
+
+    Raises:
+        Sim2RealError: When the file is no log, or cut within its first record.
+    """
+    from sim2real.log import summary  # imports JAX, which the rest of `info` does without
+
+    facts = summary(path)
+    head = {
+        "log": shown(path),
+        "size": f"{facts['bytes'] / 1e6:.3f} MB in {facts['chunks']} chunks",
+        "duration": f"{facts['duration_s']:.3f} s",
+        "complete": facts["complete"],
+        **({"dry run": "no command in it was sent"} if (facts["session"] or {}).get("dry_run") is True else {}),
+        "unreadable": facts["skipped"],
+        "attachments": {name: f"{size} B" for name, size in facts["attachments"].items()},
+    }
+    blocks = [pairs(head), table(sorted(facts["topics"].items()), ["topic", "messages"])]
+    for title in ("session", "session_end"):
+        values = {name: _one_line(value) for name, value in (facts[title] or {}).items()}
+        blocks.append(f"{title}\n{pairs(values) or '-'}")
+    return "\n\n".join(blocks)
+
+
+def _origin(source: Any) -> str:
+    """Return where something that goes by a name comes from: a folder, a module, or an installed package."""
+    if isinstance(source, Path):
+        return shown(source)
+    return source if isinstance(source, str) else f"entry point {source.value}"
+
+
+def _one_line(value: Any) -> str:
+    """Return a metadata value on one line, cut after 160 characters."""
+    text = " ".join(value.split()) if isinstance(value, str) else json.dumps(plain(value))
+    return text if len(text) <= 160 else f"{text[:157]}..."
+
+
+def _value(config: Any, flag: str) -> Any:
+    """Return the value of a flag like ``--gate.limit``."""
+    return reduce(getattr, flag.removeprefix("--").replace("-", "_").split("."), config)

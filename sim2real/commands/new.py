@@ -1,0 +1,112 @@
+"""Write the files of a pipeline for a robot that was recorded."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from sim2real.commands.config import NewConfig
+from sim2real.errors import UsageError
+from sim2real.log.importing.mapping import to_toml
+from sim2real.robots.from_model.mjcf import joints_of, read_model
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern, expand
+from sim2real.robots.from_model.mjcf_robot import RobotConfig, usual_terms
+from sim2real.stages.pipeline import from_model
+from sim2real.stages.terminal.console import wrote
+
+_COMMANDS = {
+    "position": ("goal",),
+    "velocity": ("goal_velocity",),
+    "torque": ("torque",),
+    "duty": ("duty",),
+    "mit": ("goal", "goal_velocity", "torque", "kp", "kd"),
+}
+_INIT = '''"""{summary}."""
+
+from dataclasses import replace
+
+from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
+from sim2real.stages.pipeline.pipeline import Pipeline
+
+PIPELINE = Pipeline(
+    name="{name}",
+    summary="{summary}",
+    package=__name__,
+    # Every field of sim2real.stages.config.IdentifyConfig may stand here: how long segments are, which delays may be.
+    identify=replace(MODEL_IDENTIFY, horizon_s={horizon_s:g}, max_delay_s={max_delay_s:g}),
+)
+'''
+_ROBOT = '''"""The robot: robot.toml says which joints were recorded, what drives them, and what is identified."""
+
+from pathlib import Path
+
+from sim2real.robots.from_model.mjcf_robot import ROBOT_FILE, MjcfRobot, RobotConfig
+
+ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
+'''
+
+
+def run(config: NewConfig) -> None:
+    """Write a pipeline's folder.
+
+    Args:
+        config: What it is for.
+
+    Raises:
+        UsageError: When the name is none, the folder exists, or the model cannot be driven.
+    """
+    if config.model is None or not re.fullmatch(r"[a-z]\w*", config.name):
+        raise UsageError(
+            f"new needs a name of small letters, digits and underscores, and a model, got {config.name!r} and "
+            f"{str(config.model) if config.model else 'no model'}",
+            hint="sim2real new go2 go2.xml --log run.csv",
+        )
+    folder = config.folder / config.name
+    if folder.exists():
+        raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
+    description, mapping = _described(config)
+    # What cannot run is refused before anything is written.
+    expand(description.terms, description.joints, description.driven(), read_model(description.model))
+    if config.log is None:
+        from_model.note_held(description)
+    default = from_model.MODEL_IDENTIFY
+    summary = f"recorded robot of {len(description.joints)} joints, identified from its model"
+    texts = {
+        "__init__.py": _INIT.format(
+            name=config.name, summary=summary, horizon_s=default.horizon_s, max_delay_s=default.max_delay_s
+        ),
+        "robot.py": _ROBOT,
+        **from_model.files_of(description),
+        **({"import.toml": mapping} if mapping else {}),
+    }
+    folder.mkdir(parents=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+        wrote(folder / name)
+
+
+def _described(config: NewConfig) -> tuple[RobotConfig, str]:
+    """Return what there is to know about the robot, and its mapping file; without a log, what flags say."""
+    flags = replace(config.robot, mjcf=config.model)
+    if config.log is not None:
+        found = from_model.from_flags(flags, [config.log])
+        mapping = "" if found.mapping is None else to_toml(replace(found.mapping, pipeline=config.name))
+        return found.description, mapping
+    commands = _COMMANDS[config.drive]
+    terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
+        commands, physical=config.drive == "mit"
+    )
+    model = Path(str(config.model))
+    return RobotConfig(
+        model=model,
+        joints=flags.joints or joints_of(read_model(model)),
+        commands=commands,
+        velocity=flags.velocity,
+        rate_hz=flags.rate_hz or RobotConfig.rate_hz,
+        step_s=flags.step_s or RobotConfig.step_s,
+        fix_base=flags.fix_base,
+        contacts=flags.contacts,
+        hold=flags.hold,
+        terms=terms,
+    ), ""

@@ -1,0 +1,24 @@
+"""``sim2real log recover``: copies what is readable of a damaged log."""
+
+from __future__ import annotations
+
+from sim2real.commands.config import RecoverConfig
+from sim2real.log.recovery import recover
+from sim2real.stages.terminal.console import note, table, wrote
+
+
+def run(config: RecoverConfig) -> None:
+    """Write the new file, and print what it has and what was lost.
+
+    Raises:
+        Sim2RealError: When the file is missing or not an MCAP file, or the new file exists or cannot be written.
+    """
+    source = config.source
+    target = config.out or source.with_name(f"{source.stem}.recovered.mcap")
+    found = recover(source, target)
+    for lost in found.skipped:
+        note(f"unreadable: {lost}")
+    if found.cut:
+        note("the file ends before its data does")
+    print(table(sorted(found.messages.items()), ["topic", "messages"]))
+    wrote(target)

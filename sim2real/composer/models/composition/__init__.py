@@ -1,0 +1,1 @@
+"""Models that are attached to each other, compiled as one."""

@@ -1,0 +1,73 @@
+"""Copies of models: specs of their own, with all that is attached."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from sim2real.composer.models.composition import compose
+from sim2real.composer.models.mjcf import translate
+from sim2real.composer.models.mjcf.explicit_values import PathPart
+from sim2real.composer.models.mjcf.tendon_paths import path_of
+from sim2real.composer.models.tree import Tree
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Native
+
+T = TypeVar("T", bound=Tree[Any])
+
+
+def duplicate(model: T) -> T:
+    """Return an independent copy of a model and of all that is attached to it; it is attached to nothing."""
+    twins: dict[T, T] = {}
+    natives: dict[Native, Native] = {}
+    made = _copy(model, twins, natives)
+    for old, new in twins.items():
+        new.overrides = old.overrides.among(twins)
+        for (native, key), target in old.references.items():
+            new.references[natives[native], key] = _twin(old, target, twins, natives)
+        for native, path in old.paths.items():
+            new.paths[natives[native]] = [_part(old, part, twins, natives) for part in path]
+    return made
+
+
+def _twin(model: Tree[Any], target: Any, twins: dict[T, T], natives: dict[Native, Native]) -> Any:
+    """Return the copy of what an element of a model names."""
+    if target.is_removed:
+        return target
+    if target.root not in twins:
+        raise UsageError(
+            f"model {model.model!r} cannot be copied: it refers to {target.full_identifier!r}, which is not below it",
+            hint="copy a model above both",
+        )
+    return twins[target.root].handle(target.kind, natives[target._native])
+
+
+def _part(model: Tree[Any], part: PathPart, twins: dict[T, T], natives: dict[Native, Native]) -> PathPart:
+    values = {k: _twin(model, v, twins, natives) if hasattr(v, "root") else v for k, v in part.values.items()}
+    return PathPart(part.tag, values, dict(part.written))
+
+
+def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
+    spec = compose.full_copy(model)
+    made = twins[model] = type(model).owning(spec)
+    made.shows_text = model.shows_text
+    made.inherits_angle = model.inherits_angle
+    natives[model._spec.worldbody] = spec.worldbody
+    for kind in compose.NAMED_KINDS:
+        plural = translate.plural(kind)
+        for old, new in zip(getattr(model._spec, plural), getattr(spec, plural), strict=True):
+            natives[old] = new
+            if not old.name:  # which the copy was given
+                new.name = ""
+    for native in model._spec.tendons:
+        path_of(model, native)
+    made.records = model.records.among(natives)
+    made._order = {natives[old]: number for old, number in model._order.items() if old in natives}
+    made._clock = itertools.count(max(made._order.values(), default=next(made._clock)) + 1)
+    for name, attachment in model.attachments.items():
+        child = _copy(attachment.model, twins, natives)
+        child.parent_model = made
+        made.attachments[name] = type(attachment)(child, natives[attachment.frame])
+    return made

@@ -1,0 +1,182 @@
+"""Elements that are made anew in a composed spec: MuJoCo's copies would lose them, or let them name another one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer.models.mjcf import tendon_paths, translate
+from sim2real.composer.models.mjcf.targets import SECTION_KINDS, point, targets
+from sim2real.composer.models.mjcf.tendon_paths import path_of
+from sim2real.composer.models.mjcf.translate import TREE_KINDS
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sim2real.composer.models.tree import Handle, Tree
+    from sim2real.composer.types import MjSpec, Native
+
+_NAMED_BY = {"tendon": ("actuator", "sensor", "equality"), "actuator": ("sensor",)}
+"""MuJoCo deletes what names an element together with it: kind of element -> kinds that may name it."""
+
+
+def closed(kinds: Iterable[str]) -> frozenset[str]:
+    """Return kinds of elements that are made anew together: some, and those that name them."""
+    found = set(kinds)
+    for kind, others in _NAMED_BY.items():
+        if kind in found:
+            found.update(others)
+    return frozenset(found | {"tuple"} if found else found)
+
+
+def foreign_kinds(models: list[Tree[Handle]]) -> frozenset[str]:
+    """Return the kinds of elements in sections that name elements of other models, as far as programs named those."""
+    found = set()
+    for model in models:
+        for (native, _), target in model.references.items():
+            if target.root is not model or target.is_removed:
+                found.add(translate.kind_of(native))
+        if any(p.is_outdated(model) for native in model._spec.tendons for p in model.paths.get(native, ())):
+            found.add("tendon")
+    return closed(found & set(SECTION_KINDS))
+
+
+def final_name(target: Handle, top: Tree[Handle]) -> str:
+    """Return an element's name in the spec of a world, given the model at its top.
+
+    Raises:
+        UsageError: When the element is not in that world.
+    """
+    above: Tree[Handle] | None = target.root
+    while above is not None and above is not top:
+        above = above.parent_model
+    if above is None:
+        raise UsageError(
+            f"model {top.model!r} refers to {target.full_identifier!r}, which is not attached below it",
+            hint="attach it first, or add the referring element to a model above both",
+        )
+    return target.full_identifier if top.parent_model is None else target.root.identify(target, relative_to=top)
+
+
+def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, top: Tree[Handle]) -> str:
+    """Return the name, in the spec of a world, of what an element of a model names.
+
+    Args:
+        model: The model of the element that names another.
+        element: What the element is called, in an error.
+        kind: The kind of what it names.
+        target: What it names: an element, or a text.
+        top: The model at the top of the world.
+
+    Raises:
+        UsageError: When it is not there.
+    """
+    found: Any = target
+    if isinstance(target, str):
+        if not kind:
+            return target
+        found = model.find(kind, target)
+        if found is None:
+            known = ", ".join(filter(None, (e.name for e in model.find_all(kind, exclude_attachments=True))))
+            raise UsageError(
+                f"{element} of model {model.model!r} names the {kind} {target!r}, which is not there. "
+                f"Available: {known}",
+                hint="elements of attached models have the names of those in front: arm/hand/finger",
+            )
+    if found.is_removed:
+        name = found.root.removed.get(found, "")
+        raise UsageError(
+            f"{element} of model {model.model!r} names the {kind} {name!r}, which was removed",
+            hint=f"remove the {element.split()[0]} as well, or let it name another {kind}",
+        )
+    return final_name(found, top)
+
+
+def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: frozenset[str]) -> None:
+    """Add the elements of some kinds of all models to the composed spec, which has none of them yet.
+
+    Args:
+        out: The composed spec.
+        top: The model at its top.
+        models: All its models, in the order in which their elements follow one another.
+        kinds: The kinds.
+
+    Raises:
+        UsageError: When an element names one that is not there.
+    """
+    for kind in (k for k in SECTION_KINDS if k in kinds):
+        for model in models:
+            for native in list(getattr(model._spec, translate.plural(kind))):
+                element = model.handle(kind, native)
+                new = copied(out, kind, native, final_name(element, top))
+                what = f"{kind} {element.name or final_name(element, top)!r}"
+                for key, target_kind, text in list(targets(kind, native)):
+                    target = model.references.get((native, key), text)
+                    point(new, key, named(model, what, target_kind, target, top))
+                if kind == "tendon":
+                    for part in path_of(model, native):
+                        tendon_paths.wrap(new, part, lambda k, t, m=model, w=what: named(m, w, k, t, top))
+
+
+def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
+    """Add a copy of an element to a spec; what it names is called as in its own spec, and a tendon has no path yet.
+
+    Args:
+        out: The spec.
+        kind: What the element is.
+        native: The element of its own spec.
+        name: The name of the copy.
+    """
+    new = getattr(out, f"add_{kind}")()
+    for key in translate.attributes(native):
+        value = getattr(native, key)
+        if key == "path" or callable(value) or value is None:
+            continue
+        if isinstance(value, np.ndarray):
+            if value.tobytes() != getattr(new, key).tobytes():
+                setattr(new, key, value)
+        elif type(value).__name__.endswith("Vec") or value != getattr(new, key):
+            setattr(new, key, value)
+    new.name, new.info = name, native.info
+    if getattr(native, "plugin", None) is not None and native.plugin.active:
+        for key in ("name", "plugin_name", "active"):
+            setattr(new.plugin, key, getattr(native.plugin, key))
+    return new
+
+
+def point_aside(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], done: frozenset[str]) -> None:
+    """Let what stands in bodies, and assets, name elements of other models, now that all models are in one spec.
+
+    Args:
+        out: The composed spec.
+        top: The model at its top.
+        models: All its models.
+        done: Kinds of elements that name the right ones already.
+    """
+    for model in models:
+        for (native, key), target in model.references.items():
+            element = model.handle(translate.kind_of(native), native)
+            if (target.root is not model or target.is_removed) and element.kind not in done:
+                what = f"{element.kind} {element.full_identifier!r}"
+                new = getattr(out, element.kind)(final_name(element, top))
+                point(new, key, named(model, what, target.kind, target, top))
+
+
+COUNTED = (*TREE_KINDS, *SECTION_KINDS, *("mesh", "material", "texture", "hfield", "skin", "flex"), "numeric", "text")
+"""Elements that are counted before and after a copy."""
+
+
+def count(spec: MjSpec) -> dict[str, int]:
+    """Return how many elements of each kind a spec has; its world is no body."""
+    found = {kind: len(getattr(spec, translate.plural(kind))) for kind in COUNTED}
+    found["body"] -= 1
+    return found
+
+
+def count_own(model: Tree[Handle]) -> dict[str, int]:
+    """Return how many elements of each kind a model has, without those of attached models."""
+    if model.counted is None or model.counted[0] is None or model.counted[0] != model.revision():
+        model.counted = model.revision(), count(model._spec)
+    return model.counted[1]

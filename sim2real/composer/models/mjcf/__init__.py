@@ -1,0 +1,1 @@
+"""MJCF: its schema, parsing, writing, files, and references between elements."""

@@ -1,0 +1,98 @@
+"""MJCF into an ``MjSpec``, by MuJoCo's own parser."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim2real.composer.models.mjcf.explicit_values import Document
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjSpec
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_INCLUDE = re.compile(r"""<include\s+file\s*=\s*["']([^"']*)["']\s*(?:/>|>\s*</include>)""")
+_ROOT = re.compile(r"<(mujoco\w*)[^>]*>(.*)</\1\s*>", re.DOTALL)
+_BETWEEN = re.compile(r">\s*<(?!!)")
+
+
+def from_string(
+    text: str | bytes, assets: dict[str, bytes] | None = None, folder: str | os.PathLike[str] = ""
+) -> tuple[MjSpec, Document]:
+    """Return the ``MjSpec`` of an MJCF document, and the document as it was read, with those that it includes.
+
+    Every element is put on a line of its own: the line that MuJoCo notes then gives the order of the document, which
+    decides what elements without a name are called.
+
+    Args:
+        text: The document.
+        assets: Contents of files by name: they are looked for there first.
+        folder: Where relative paths of files begin; default: the working directory.
+
+    Raises:
+        ValueError: MuJoCo's own message, when the document cannot be parsed.
+        UsageError: When a document that it includes is not there.
+    """
+    text = text.decode() if isinstance(text, bytes) else text
+    whole = _with_included(text, Path(folder), Path(folder), assets or {})
+    spec, document = _parse(whole, assets)
+    if os.fspath(folder):
+        spec.modelfiledir = str(Path(folder).resolve())
+    return spec, document
+
+
+def _parse(text: str, assets: dict[str, bytes] | None) -> tuple[MjSpec, Document]:
+    spread = _BETWEEN.sub(">\n<", text)
+    try:
+        return _named(mj.MjSpec.from_string(spread, assets=assets or {}), text), Document(spread)
+    except ValueError:
+        mj.MjSpec.from_string(text, assets=assets or {})  # raises with the lines of the document as it is
+        raise
+
+
+def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = None) -> tuple[MjSpec, Document]:
+    """Return the ``MjSpec`` of an MJCF file, and the document as it was read, with those that it includes.
+
+    Raises:
+        UsageError: When there is no such file, or none that it includes.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
+    spec, document = _parse(_read(path, path.parent, assets or {}), assets)
+    spec.modelfiledir = str(path.parent.resolve())
+    return spec, document
+
+
+def _read(path: Path, folder: Path, assets: dict[str, bytes]) -> str:
+    """Return the text of a document with what it includes in its place."""
+    name = str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+    text = assets[name].decode() if name in assets else path.read_text(encoding="utf-8")
+    return _with_included(text, path.parent, folder, assets)
+
+
+def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, bytes]) -> str:
+    """Return a document with what it includes in its place, looked for in two folders."""
+
+    def included(match: re.Match[str]) -> str:
+        candidates = [folder / match[1], beside / match[1]]
+        found = next((c for c in candidates if c.is_file() or match[1] in assets), None)
+        if found is None:
+            raise UsageError(
+                f"the document includes {match[1]!r}, which is not there",
+                hint=f"looked for {candidates[0]}; from_xml_string takes model_dir and assets",
+            )
+        body = _ROOT.search(_read(found, folder, assets))
+        return body[2] if body else ""
+
+    return _INCLUDE.sub(included, _COMMENT.sub("", text)) if "<include" in text else text
+
+
+def _named(spec: MjSpec, text: str) -> MjSpec:
+    if not re.search(r"<mujoco[^>]*\smodel\s*=", text):
+        spec.modelname = "unnamed_model"
+    return spec

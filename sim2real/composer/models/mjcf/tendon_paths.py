@@ -1,0 +1,97 @@
+"""Paths of tendons: what they run over, held as elements. An ``MjSpec`` has names there, and does not change them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sim2real.composer.models.mjcf.explicit_values import PathPart
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sim2real.composer.models.tree import Handle, Tree
+    from sim2real.composer.types import Native
+
+NAMING = {"joint": ("joint",), "site": ("site",), "geom": ("geom", "sidesite"), "pulley": ()}
+"""Tag of a part of a path -> its attributes that name elements."""
+KIND = {"joint": "joint", "site": "site", "geom": "geom", "sidesite": "site"}
+"""Attribute that names an element -> the element's kind."""
+ELSEWHERE = "//elsewhere"
+"""What an ``MjSpec`` has for the name of an element of another model: a name that no element has."""
+_TAGS = {
+    mj.mjtWrap.mjWRAP_JOINT: "joint",
+    mj.mjtWrap.mjWRAP_SITE: "site",
+    mj.mjtWrap.mjWRAP_SPHERE: "geom",
+    mj.mjtWrap.mjWRAP_CYLINDER: "geom",
+    mj.mjtWrap.mjWRAP_PULLEY: "pulley",
+}
+
+
+def path_of(model: Tree[Any], native: Native) -> list[PathPart]:
+    """Return the path of a tendon."""
+    known = model.paths.setdefault(native, [])
+    known += [_read(model, native, wrap) for wrap in list(native.path)[len(known) :]]
+    return known
+
+
+def _read(model: Tree[Any], native: Native, wrap: Any) -> PathPart:
+    """Return what an ``MjSpec`` or its document has of a part of a path."""
+    tag = _TAGS[wrap.type]
+    values: dict[str, Any] = {"coef": wrap.coef} if tag == "joint" else {}
+    if tag == "pulley":
+        return PathPart(tag, {"divisor": wrap.divisor}, {})
+    said = model.records.written(wrap)
+    for key, target in zip(NAMING[tag], (wrap.target, wrap.sidesite if tag == "geom" else None), strict=False):
+        text = None if said is None else said.values.get(key)
+        if target is not None:
+            values[key] = model.handle(KIND[key], target)
+        elif text:
+            values[key] = model.find(KIND[key], text) or text
+        elif key == tag:
+            raise UsageError(f"tendon {native.name!r} of model {model.model!r} runs over a {tag} that is not there")
+    return PathPart(tag, values, {k: v.name or "" for k, v in values.items() if hasattr(v, "root")})
+
+
+def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> PathPart:
+    """Return a part of a path.
+
+    Args:
+        model: The model of the tendon.
+        tag: ``joint``, ``site``, ``geom`` or ``pulley``.
+        attrs: The attributes in MJCF: elements, or their names.
+
+    Raises:
+        UsageError: When there is no such part, or an attribute is missing.
+    """
+    if tag not in NAMING:
+        raise UsageError(f"a <{tag}> cannot stand in a tendon. Available: geom, joint, pulley, site")
+    needed = {"joint": ("joint", "coef"), "pulley": ("divisor",)}.get(tag, (tag,))
+    missing = [k for k in needed if attrs.get(k) is None]
+    if missing:
+        raise UsageError(f"a <{tag}> of a tendon needs {' and '.join(missing)}", hint=f"add({tag!r}, {missing[0]}=...)")
+    values = {k: v for k, v in attrs.items() if v is not None}
+    for key in NAMING[tag]:
+        if isinstance(values.get(key), str):
+            values[key] = model.find(KIND[key], values[key]) or values[key]
+    return PathPart(tag, values, {})
+
+
+def wrap(tendon: Native, part: PathPart, name: Callable[[str, Handle | str], str]) -> None:
+    """Let the path of a tendon of an ``MjSpec`` run on over a part.
+
+    Args:
+        tendon: The tendon of the ``MjSpec``.
+        part: The part.
+        name: Kind, and element or text -> the name in that ``MjSpec``.
+    """
+    names = {key: name(KIND[key], part.values[key]) for key in NAMING[part.tag] if key in part.values}
+    if part.tag == "joint":
+        tendon.wrap_joint(names["joint"], part.values["coef"])
+    elif part.tag == "site":
+        tendon.wrap_site(names["site"])
+    elif part.tag == "geom":
+        tendon.wrap_geom(names["geom"], names.get("sidesite", ""))
+    else:
+        tendon.wrap_pulley(part.values["divisor"])

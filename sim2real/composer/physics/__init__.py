@@ -1,0 +1,1 @@
+"""The two physics engines behind one interface: C MuJoCo and MJX."""

@@ -1,0 +1,172 @@
+"""Arrays of mjModel and mjData indexed by name: ``physics.named.data.xpos['hand', 'z']``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import Element
+from sim2real.composer.physics.arrays import is_jax
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy.typing as npt
+
+    from sim2real.composer.types import MjModel
+
+_KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
+_COLUMNS = {
+    **{name: i for i, name in enumerate(("x", "y", "z"))},
+    **{name: i for i, name in enumerate(("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"))},
+    **{name: i for i, name in enumerate(("qw", "qx", "qy", "qz"))},
+    **{name: i for i, name in enumerate("rgba")},
+}
+
+
+class NamedArray(NDArrayOperatorsMixin):
+    """One array whose rows are indexed by numbers, names or elements; otherwise it is that array.
+
+    A name that is not there may leave out the models it is attached below, as long as only one element ends with it.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        field: Which array.
+        holder: What has the array as an attribute: the model or the data.
+    """
+
+    def __init__(self, model: MjModel, field: layout.Field, holder: object) -> None:
+        self._model, self._field, self._holder = model, field, holder
+
+    @property
+    def _array(self) -> Any:
+        return getattr(self._holder, self._field.name)
+
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self._array, dtype=dtype) if copy else np.asarray(self._array, dtype=dtype)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        plain = [x._array if isinstance(x, NamedArray) else x for x in inputs]
+        return getattr(ufunc, method)(*plain, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._array, name)
+
+    def __len__(self) -> int:
+        return len(self._array)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._array)
+
+    def __repr__(self) -> str:
+        return f"{self._field.name}: {self._array!r}"
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._array[self.rows(key)]
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        array, rows = self._array, self.rows(key)
+        if is_jax(array):
+            setattr(self._holder, self._field.name, array.at[rows].set(value))
+        else:
+            array[rows] = value
+
+    @property
+    def axes(self) -> SimpleNamespace:
+        """``axes.row.convert_key_item(names)`` returns the rows of some names, as in dm_control."""
+        return SimpleNamespace(row=SimpleNamespace(convert_key_item=self._rows))
+
+    def rows(self, key: Any) -> Any:
+        """Return the numeric index for a key of names, elements or numbers.
+
+        Raises:
+            KeyError: When no element, or more than one, is called so.
+        """
+        if isinstance(key, tuple):
+            row, *columns = key
+            row = self._rows(row)
+            columns = [_column(c) for c in columns]
+            if isinstance(row, np.ndarray) and row.ndim == 1 and columns and isinstance(columns[0], list):
+                return np.ix_(row, columns[0])
+            return (row, *columns)
+        return self._rows(key)
+
+    def _rows(self, key: Any) -> Any:
+        if isinstance(key, str | Element):
+            return layout.index(self._model, self._field, (self._number(key),), True)
+        if isinstance(key, np.ndarray) and key.dtype.kind == "U":  # as np.ix_ makes them from names
+            return np.reshape(self._rows(key.ravel().tolist()), key.shape)
+        if isinstance(key, Iterable) and not isinstance(key, np.ndarray):
+            keys = list(key)
+            if keys and isinstance(keys[0], str | Element):
+                return layout.index(self._model, self._field, tuple(self._number(k) for k in keys), False)
+            return keys
+        return key
+
+    def _number(self, key: str | Element) -> int:
+        name = key.full_identifier if isinstance(key, Element) else key
+        kind = _KIND_OF_SIZE.get(self._field.size)
+        if kind is None:
+            raise KeyError(f"{self._field.name} has no named rows")
+        names = layout.names_of(self._model, kind)
+        if name in names:
+            return names.index(name)
+        ending = [i for i, full in enumerate(names) if full.endswith(f"/{name}")]
+        if len(ending) == 1:
+            return ending[0]
+        what = "is ambiguous" if ending else "is not there"
+        known = ", ".join(names[i] for i in ending) if ending else ", ".join(names)
+        raise KeyError(f"{self._field.name}: {kind} {name!r} {what}. Available: {known}")
+
+
+def _column(key: Any) -> Any:
+    if isinstance(key, str):
+        return _COLUMNS[key]
+    if isinstance(key, np.ndarray) and key.dtype.kind == "U":
+        return np.reshape(_column(key.ravel().tolist()), key.shape)
+    if isinstance(key, list):
+        return [_COLUMNS[k] if isinstance(k, str) else k for k in key]
+    return key
+
+
+class NamedFields:
+    """The arrays of ``model`` or ``data``, each as a ``NamedArray``.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        struct: ``model`` or ``data``.
+        holder: What has the arrays as attributes.
+    """
+
+    def __init__(self, model: MjModel, struct: str, holder: object) -> None:
+        self._model, self._struct, self._holder = model, struct, holder
+
+    def __getattr__(self, name: str) -> NamedArray:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        field = layout.array_fields(self._struct).get(name)
+        if field is None:
+            raise AttributeError(f"{self._struct} has no array {name!r}")
+        found = self.__dict__[name] = NamedArray(self._model, field, self._holder)
+        return found
+
+
+class Named:
+    """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``, which knows the names.
+        model_holder: What has the model's arrays as attributes.
+        data_holder: What has the data's.
+    """
+
+    def __init__(self, model: MjModel, model_holder: object, data_holder: object) -> None:
+        self.model = NamedFields(model, "model", model_holder)
+        self.data = NamedFields(model, "data", data_holder)

@@ -1,0 +1,377 @@
+"""A compiled model and its state on MuJoCo's C engine."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import as_elements
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.physics.c.binding import Binding, EmptyBinding, Staleness
+from sim2real.composer.physics.c.named import Named
+from sim2real.composer.physics.c.rendering import Graphics
+from sim2real.composer.physics.c.views import DataView, ModelView
+from sim2real.composer.physics.engine import Camera, TextOverlay
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.models.element import Element, Elements
+    from sim2real.composer.models.model import Model
+    from sim2real.composer.types import ArrayLike, MjData, MjModel, MjvOption, MjvScene
+
+_log = logging.getLogger(__name__)
+_RK4 = int(mj.mjtIntegrator.mjINT_RK4)
+
+
+class Physics:
+    """A model and its state; hooks, observables and tasks read and write it.
+
+    Args:
+        model: The compiled ``mujoco.MjModel``.
+        legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
+        data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
+
+    Attributes:
+        np: The module that computes with this engine's arrays: numpy.
+        variables: What tasks keep from hook to hook during an episode: name -> array. Emptied by ``reset``.
+        graphics: What draws images of it.
+    """
+
+    np: Any = np
+
+    def __init__(self, model: MjModel, legacy_step: bool = True, data: MjData | None = None) -> None:
+        self.legacy_step = legacy_step
+        self.variables: dict[str, Any] = {}
+        self._suppress = False
+        self._start(model, data)
+
+    def _start(self, model: MjModel, data: MjData | None = None) -> None:
+        self._load(model, mj.MjData(model) if data is None else data)
+        with self.suppress_physics_errors():
+            self.after_reset()
+
+    def _load(self, model: MjModel, data: MjData) -> None:
+        self.model = ModelView(model)
+        self.data = DataView(data)
+        self.named = Named(model, model, self.data.ptr)
+        self._bindings: dict[Element | tuple[Element, ...], Binding | EmptyBinding] = {}
+        self.graphics = Graphics(model)
+        self.staleness = Staleness()
+        self._warnings = self.data.ptr.warning.number
+        self._warned = self._warnings.tobytes()
+
+    @classmethod
+    def from_mjcf_model(cls, model: Model) -> Physics:
+        """Compile a model with all that is attached to it."""
+        return cls(model.compile())
+
+    @classmethod
+    def from_xml_string(cls, xml_string: str, assets: dict[str, bytes] | None = None) -> Physics:
+        """Compile MJCF."""
+        return cls(mj.MjModel.from_xml_string(xml_string, assets or {}))
+
+    @classmethod
+    def from_xml_path(cls, path: str) -> Physics:
+        """Compile an MJCF file."""
+        return cls(mj.MjModel.from_xml_path(str(path)))
+
+    def reload_from_mjcf_model(self, model: Model) -> None:
+        """Compile a model anew and start from its initial state."""
+        self._start(model.compile())
+
+    def reload_from_xml_string(self, xml_string: str, assets: dict[str, bytes] | None = None) -> None:
+        """Compile MJCF and start from its initial state."""
+        self._start(mj.MjModel.from_xml_string(xml_string, assets or {}))
+
+    def reload_from_xml_path(self, path: str) -> None:
+        """Compile an MJCF file and start from its initial state."""
+        self._start(mj.MjModel.from_xml_path(str(path)))
+
+    # -- state
+
+    def time(self) -> float:
+        """Return the simulated time [s]."""
+        return self.data.ptr.time
+
+    def timestep(self) -> float:
+        """Return the time that a step takes [s]."""
+        return self.model.ptr.opt.timestep
+
+    def control(self) -> np.ndarray:
+        """Return the controls, shape ``(nu,)``."""
+        return self.data.ptr.ctrl
+
+    def set_control(self, control: ArrayLike) -> None:
+        """Set the controls, shape ``(nu,)`` [the actuators' units]."""
+        np.copyto(self.data.ptr.ctrl, control)
+
+    def position(self) -> np.ndarray:
+        """Return a copy of qpos, shape ``(nq,)``."""
+        return self.data.ptr.qpos.copy()
+
+    def velocity(self) -> np.ndarray:
+        """Return a copy of qvel, shape ``(nv,)``."""
+        return self.data.ptr.qvel.copy()
+
+    def activation(self) -> np.ndarray:
+        """Return a copy of act, shape ``(na,)``."""
+        return self.data.ptr.act.copy()
+
+    def get_state(self, sig: int | None = None) -> np.ndarray:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or what ``mj_getState`` does."""
+        model, data = self.model.ptr, self.data.ptr
+        if sig is None:
+            return np.concatenate([data.qpos, data.qvel, data.act])
+        state = np.empty(mj.mj_stateSize(model, sig))
+        mj.mj_getState(model, data, state, sig)
+        return state
+
+    state = get_state
+
+    def set_state(self, state: ArrayLike, sig: int | None = None) -> None:
+        """Set what ``get_state`` returns.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        data, model = self.data.ptr, self.model.ptr
+        if sig is not None:
+            mj.mj_setState(model, data, np.asarray(state, float), sig)
+            return
+        expected = (model.nq + model.nv + model.na,)
+        if np.shape(state) != expected:
+            raise UsageError(f"Input physics state has shape {np.shape(state)}. Expected {expected}.")
+        data.qpos[:], data.qvel[:], data.act[:] = np.split(np.asarray(state), [model.nq, model.nq + model.nv])
+
+    def copy(self, share_model: bool = False) -> Physics:
+        """Return an independent copy of the state, and of the model unless it is to be shared."""
+        made = object.__new__(type(self))
+        made.legacy_step, made.variables, made._suppress = self.legacy_step, dict(self.variables), False
+        model = self.model.ptr if share_model else mj.MjModel.__copy__(self.model.ptr)
+        data = mj.MjData(model)
+        mj.mj_copyData(data, model, self.data.ptr)
+        made._load(model, data)
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = type(self), self.model.ptr, self.data.ptr, self.legacy_step, self.variables
+        return _restored, given
+
+    # -- dynamics
+
+    def step(self, nstep: int = 1) -> None:
+        """Advance by a number of time steps.
+
+        Raises:
+            PhysicsError: When MuJoCo warns.
+        """
+        model, data = self.model.ptr, self.data.ptr
+        self._warned = self._warnings.tobytes()
+        if not self.legacy_step:
+            mj.mj_step(model, data, nstep)
+        elif model.opt.integrator == _RK4:
+            mj.mj_step(model, data, nstep)
+            mj.mj_step1(model, data)
+        else:  # positions and velocities are those of this state already: finish the step, then prepare the next
+            mj.mj_step2(model, data)
+            if nstep > 1:
+                mj.mj_step(model, data, nstep - 1)
+            mj.mj_step1(model, data)
+        self._check_warnings()
+
+    def forward(self) -> None:
+        """Compute everything that follows from the state, without advancing."""
+        self._warned = self._warnings.tobytes()
+        mj.mj_forward(self.model.ptr, self.data.ptr)
+        self.staleness.dirty = False
+        self._check_warnings()
+
+    def reset(self, keyframe_id: int | None = None) -> None:
+        """Return to the initial state, or to a keyframe."""
+        model, data = self.model.ptr, self.data.ptr
+        if keyframe_id is None:
+            mj.mj_resetData(model, data)
+        elif 0 <= keyframe_id < model.nkey:
+            mj.mj_resetDataKeyframe(model, data, keyframe_id)
+        else:
+            raise UsageError(f"`keyframe_id` must be between 0 and {model.nkey - 1} inclusive, got: {keyframe_id}")
+        self.variables.clear()
+        self.after_reset()
+
+    def after_reset(self) -> None:
+        """Compute everything without the actuators: there are no controls yet."""
+        with self.model.disable("actuation"):
+            self.forward()
+
+    @contextlib.contextmanager
+    def reset_context(self) -> Iterator[Physics]:
+        """Reset, let the block set the initial state, then compute everything that follows from it."""
+        with contextlib.suppress(PhysicsError):
+            self.reset()
+        yield self
+        self.after_reset()
+
+    @contextlib.contextmanager
+    def suppress_physics_errors(self) -> Iterator[None]:
+        """Log MuJoCo's warnings inside a ``with`` block instead of raising them."""
+        before, self._suppress = self._suppress, True
+        try:
+            yield
+        finally:
+            self._suppress = before
+
+    def _check_warnings(self) -> None:
+        if self._warnings.tobytes() == self._warned:
+            return
+        before = np.frombuffer(self._warned, self._warnings.dtype)
+        names = [n for n, new in zip(mj.mjtWarning.__members__, self._warnings > before, strict=False) if new]
+        message = f"Physics state is invalid. Warning(s) raised: {', '.join(names)}"
+        if not self._suppress:
+            raise PhysicsError(message)
+        _log.warning(message)
+
+    # -- elements
+
+    @property
+    def is_dirty(self) -> bool:
+        """Whether something was written through a binding since everything was last computed."""
+        return self.staleness.dirty
+
+    def mark_as_dirty(self) -> None:
+        """Have everything computed again before the next computed attribute is read through a binding."""
+        self.staleness.dirty = True
+
+    def bind(self, elements: Elements) -> Any:
+        """Return the attributes of an element, or of several of one kind, in this physics.
+
+        Raises:
+            UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
+        """
+        key: Any = tuple(elements) if isinstance(elements, list) else elements
+        try:
+            return self._bindings[key]
+        except (KeyError, TypeError):  # new, or a sequence without a hash
+            found, single = as_elements(elements)
+        key = found[0] if single else found
+        if key not in self._bindings:
+            self._bindings[key] = self._new_binding(found, single)
+        return self._bindings[key]
+
+    def _new_binding(self, found: tuple[Element, ...], single: bool) -> Binding | EmptyBinding:
+        if not found:
+            return EmptyBinding()
+        kind = found[0].kind
+        layout.attributes(kind)
+        ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
+        return Binding(weakref.proxy(self), kind, ids, single)
+
+    def get(self, elements: Elements, name: str) -> Any:
+        """Return an attribute of elements; the same call on both engines."""
+        return getattr(self.bind(elements), name)
+
+    def set(self, elements: Elements, name: str, value: Any) -> Physics:
+        """Set an attribute of elements and return the physics; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What it is set to, in the shape in which it is read.
+        """
+        setattr(self.bind(elements), name, value)
+        return self
+
+    def write(self, elements: Elements, name: str, value: Any, index: Any) -> Physics:
+        """Set a part of an attribute of elements; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What the part is set to.
+            index: Which part of the attribute, as in ``attribute[index]``.
+        """
+        getattr(self.bind(elements), name)[index] = value
+        return self
+
+    def fail(self, condition: ArrayLike = True) -> None:
+        """Give this initial state up where the condition holds; the same call on both engines.
+
+        Raises:
+            EpisodeInitializationError: When it holds.
+        """
+        if np.any(condition):
+            raise EpisodeInitializationError
+
+    def recompute_constants(self) -> None:
+        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
+        mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # this state would be left as at the reference
+        self.mark_as_dirty()
+
+    def count_compensated(self) -> None:
+        """Have MuJoCo see that bodies are compensated for gravity, where none was when the model was compiled."""
+        model, before = self.model.ptr, copy.copy(self.model.ptr)
+        mj.mj_setConst(model, mj.MjData(model))  # nothing else sets the number of such bodies; the rest stays
+        for name, value in ((n, getattr(before, n)) for n in dir(before)):
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                getattr(model, name)[...] = value
+        for name in ("meaninertia", "meanmass", "meansize", "extent", "center"):
+            setattr(model.stat, name, getattr(before.stat, name))
+
+    def render(
+        self,
+        height: int = 240,
+        width: int = 320,
+        camera_id: int | str = -1,
+        overlays: Sequence[TextOverlay] = (),
+        depth: bool = False,
+        segmentation: bool = False,
+        scene_option: MjvOption | None = None,
+        render_flag_overrides: Mapping[str | int, bool] | None = None,
+        scene_callback: Callable[[Physics, MjvScene], None] | None = None,
+    ) -> np.ndarray:
+        """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
+
+        See ``engine.Camera`` and its ``render``.
+
+        Args:
+            height: Of the image [pixels].
+            width: Of the image [pixels].
+            camera_id: Number or name of one of the model's cameras; -1 is the free camera.
+            overlays: Texts to draw over it.
+            depth: Measure distances instead of colours.
+            segmentation: Tell objects by numbers and types (``mjtObj``) instead.
+            scene_option: What is drawn: an ``MjvOption``.
+            render_flag_overrides: Flags of ``mjtRndFlag`` -> value, for this image.
+            scene_callback: Called with the physics and the ``MjvScene`` before it is drawn, to add shapes.
+        """
+        scene = None if scene_callback else self.graphics.scene()  # what a callback changes is not for the next image
+        camera = Camera(self, height, width, camera_id, scene_callback=scene_callback, scene=scene)
+        return camera.render(overlays, depth, segmentation, scene_option, render_flag_overrides)
+
+    @property
+    def contexts(self) -> None:
+        """None: there is no rendering context to keep up to date; what is drawn follows the model by itself."""
+        return
+
+    def free(self) -> None:
+        """Drop the model and the state."""
+        self.graphics.close()
+        for binding in self._bindings.values():
+            binding.free()
+        self._bindings.clear()
+
+
+def _restored(
+    kind: type[Physics], model: MjModel, data: MjData, legacy_step: bool, variables: dict[str, Any]
+) -> Physics:
+    made = object.__new__(kind)
+    made.legacy_step, made.variables, made._suppress = legacy_step, variables, False
+    made._load(model, data)
+    return made

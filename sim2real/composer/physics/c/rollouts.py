@@ -1,0 +1,332 @@
+"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are known beforehand."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+from sim2real.graph.base import StepState
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Array, ArrayLike, MjModel
+    from sim2real.graph.node import BaseWorld
+
+_LARGEST_BYTES = 2**26
+"""Most memory for the states of the copies that run at a time."""
+_FRAMES = {
+    "body": ("body_ipos", "body_iquat"),
+    "geom": ("geom_pos", "geom_quat", "body_ipos", "body_iquat"),
+    "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
+}
+"""Fields that say where something is in its body; C does not look at them where that was compiled to be its frame."""
+_MASSES = ("body_mass", "body_inertia")
+
+
+class Start(NamedTuple):
+    """Where copies start; leaves ``(..., n)`` with the same leading axes, or 1.
+
+    Attributes:
+        qpos: Positions ``(..., nq)`` [m or rad].
+        qvel: Velocities ``(..., nv)`` [m/s or rad/s].
+        warmstart: Where the solver starts ``(..., nv)`` [m/s^2 or rad/s^2].
+    """
+
+    qpos: Array
+    qvel: Array
+    warmstart: Array
+
+
+class StepLaw(Protocol):
+    """What is set before every physics step from the state then, by the same function in MJX and around C.
+
+    Attributes:
+        fields: The model's fields that it sets.
+    """
+
+    fields: tuple[str, ...]
+
+    def __call__(
+        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and the fields for the next step.
+
+        Args:
+            xp: ``numpy`` or ``jax.numpy``.
+            values: Numbers of each copy, ``(..., n)``.
+            control: What the world's ``controls`` gave for this step.
+            qpos: Positions ``(..., nq)`` [m or rad].
+            qvel: Velocities ``(..., nv)`` [m/s or rad/s].
+        """
+        ...
+
+
+class OpenLoop(Protocol):
+    """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
+
+    Attributes:
+        name: Its name in the graph.
+        substeps: Physics steps in a tick.
+        derives: Whether constants that MuJoCo derives from the model (``mj_setConst``) follow from ``fields``.
+    """
+
+    name: str
+
+    @property
+    def substeps(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def derives(self) -> bool:
+        """See above."""
+        ...
+
+    def open_loop(self) -> MjModel:
+        """Take the physics out and return the ``MjModel``: from now on ``init_state`` computes nothing with it.
+
+        Raises:
+            UsageError: When the controls, or anything else that is set, depend on the state; or what the world sends on
+                more than positions, velocities and accelerations.
+        """
+
+    def fields(self, params: Any, state: Any) -> dict[str, Array]:
+        """Return the fields of the model that differ from the compiled one.
+
+        Args:
+            params: The node's parameters.
+            state: What ``init_state`` returned.
+        """
+        ...
+
+    def start(self, params: Any, state: Any) -> Start:
+        """Return where the physics starts.
+
+        Args:
+            params: The node's parameters.
+            state: What ``init_state`` returned.
+        """
+        ...
+
+    def controls(self, step_state: StepState) -> tuple[StepState, Array]:
+        """Return what is left of a tick without physics: the next step state, and the controls ``(substeps, nu)``."""
+        ...
+
+    def message(self, state: Any, qpos: Array, qvel: Array, qacc: Array) -> Any:
+        """Return what the world sends.
+
+        Args:
+            state: What ``init_state`` returned.
+            qpos: Positions ``(nq,)`` [m or rad].
+            qvel: Velocities ``(nv,)`` [m/s or rad/s].
+            qacc: Accelerations ``(nv,)`` of the last physics step; at the start those without actuators.
+        """
+        ...
+
+
+def check_steps(world: BaseWorld, base: type) -> None:
+    """Refuse a world whose class steps or starts in its own way: nobody knows what that depends on.
+
+    Raises:
+        UsageError: With the method.
+    """
+    for name in ("step", "init_state", "init_output"):
+        if getattr(type(world), name) is not getattr(base, name):
+            own = type(world).__name__
+            raise UsageError(f"world {world.name!r}: {own}.{name} is its own, and may depend on the state")
+
+
+class Rollouts:
+    """Steps copies of a model, each with fields of its own.
+
+    Args:
+        model: The ``MjModel``; it is copied.
+        substeps: Physics steps in a tick.
+        names: Fields that differ from copy to copy.
+        derives: Whether constants that follow from them are computed for each copy.
+        law: What is set before every step; it costs a call of C for each.
+
+    Raises:
+        UsageError: When C does not look at a field, or only MJX has it.
+    """
+
+    def __init__(
+        self,
+        model: MjModel,
+        substeps: int,
+        names: tuple[str, ...],
+        derives: bool = False,
+        law: StepLaw | None = None,
+    ) -> None:
+        from mujoco import batch  # 30 ms
+
+        unknown = sorted(set(names) - batch.MODEL_FIELDS)
+        if unknown:
+            raise UsageError(f"C MuJoCo has no field {unknown[0]!r} that can differ from copy to copy")
+        self._make, self._substeps, self._names, self._derives = batch.Batch, substeps, names, derives
+        self._law = law
+        self._model = _general(model, names, derives)
+        self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._batch: Any = None
+
+    def __call__(
+        self,
+        fields: Mapping[str, np.ndarray],
+        start: Start,
+        controls: np.ndarray,
+        values: Mapping[str, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Roll out every copy.
+
+        Args:
+            fields: Name -> values, ``(..., *shape)``.
+            start: Where the copies start.
+            controls: Shape ``(..., ticks, substeps, nu)``, or what the law takes.
+            values: What the law takes besides, ``(..., n)`` each.
+
+        Returns:
+            Positions ``(..., 1 + ticks, nq)``, velocities and accelerations ``(..., 1 + ticks, nv)``: at the start, and
+            after each tick. What diverged is NaN.
+        """
+        ticks = controls.shape[-3]
+        wide = {n: (fields[n], np.ndim(_value(self._model, n))) for n in self._names}
+        taken = {n: (v, 1) for n, v in (values or {}).items()}
+        arrays = [*((a, 1) for a in start), (controls, 3), *wide.values(), *taken.values()]
+        axes = np.broadcast_shapes(*(np.shape(a)[: np.ndim(a) - width] for a, width in arrays))
+        count = int(np.prod(axes))
+
+        def flat(a: ArrayLike, width: int) -> np.ndarray:
+            a = np.asarray(a, np.float64)
+            shape = a.shape[a.ndim - width :]
+            return np.broadcast_to(a, (*axes, *shape)).reshape(count, *shape)
+
+        rows, law = ({n: flat(*pair) for n, pair in pairs.items()} for pairs in (wide, taken))
+        begin = Start(*(flat(a, 1) for a in start))
+        control = flat(controls, 3).reshape(count, ticks * self._substeps, -1)
+        found = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
+        lanes = self._lanes(count, ticks * self._substeps)
+        with _quiet():
+            for first in range(0, count, lanes):
+                part = slice(first, min(first + lanes, count))
+                own = {n: values[part] for n, values in rows.items()}
+                some_law = {n: values[part] for n, values in law.items()}
+                made = self._part(own, Start(*(a[part] for a in begin)), control[part], some_law)
+                for whole, some in zip(found, made, strict=True):
+                    whole[part] = some
+        qpos, qvel, qacc = (a.reshape(*axes, *a.shape[1:]) for a in found)
+        return qpos, qvel, qacc
+
+    def _part(
+        self, fields: Mapping[str, np.ndarray], start: Start, control: np.ndarray, law: Mapping[str, np.ndarray]
+    ) -> Iterator[np.ndarray]:
+        """Yield positions, velocities and accelerations of some copies, as ``__call__``."""
+        batch, count, steps = self._batch, len(control), control.shape[1]
+        ids = np.arange(count)
+        for name, values in fields.items():
+            own = batch.expand(name)
+            own[:count] = values.reshape(count, *own.shape[1:])
+        failed = _failing(count, lambda: batch.set_const(ids)) if self._derives else np.zeros(count, bool)
+        batch.warning[:] = 0
+        batch.reset(ids, stage=mj.mjtStage.mjSTAGE_NONE)
+        for name, values in zip(("qpos", "qvel", "qacc_warmstart"), start, strict=True):
+            batch.bind(name)[:count] = values
+        flags = batch.expand("opt.disableflags")
+        compiled = flags.copy()
+        flags |= int(mj.mjtDisableBit.mjDSBL_ACTUATION)
+        known = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # before: they are filled by the next call
+        failed |= _failing(count, lambda: batch.forward(ids))
+        begun = {n: rows[:count].copy() for n, rows in known.items()}
+        flags[:] = compiled
+        batch.bind("qacc_warmstart")[:count] = start.warmstart
+        out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
+        if self._law:
+            failed |= self._stepwise(self._law, law, control, out)
+        else:
+            failed |= _failing(count, lambda: batch.rollout(steps, control, record=tuple(out), ids=ids, out=out))
+        failed |= batch.warning[:count, :, 1].any(axis=1)
+        for name, rows in out.items():
+            made = np.concatenate([begun[name][:, None], rows[:, self._substeps - 1 :: self._substeps]], axis=1)
+            made[failed] = np.nan
+            yield made
+
+    def _stepwise(
+        self, law: StepLaw, values: Mapping[str, np.ndarray], control: np.ndarray, out: Mapping[str, np.ndarray]
+    ) -> np.ndarray:
+        """Step copies one physics step at a time, fill ``out``, and return which of them failed, ``(count,)``."""
+        batch, (count, steps) = self._batch, control.shape[:2]
+        ids, failed = np.arange(count), np.zeros(count, bool)
+        live = {n: batch.bind(n) for n in (*out, "ctrl", "qfrc_applied")}
+        fields = {n: batch.expand(n) for n in law.fields}
+        for k in range(steps):
+            ctrl, applied, changed = law(np, values, control[:, k], live["qpos"][:count], live["qvel"][:count])
+            live["ctrl"][:count], live["qfrc_applied"][:count] = ctrl, applied
+            for name, new in changed.items():
+                fields[name][:count] = new
+            failed |= _failing(count, lambda: batch.step(ids))
+            for name, rows in out.items():
+                rows[:, k] = live[name][:count]
+        return failed
+
+    def _lanes(self, count: int, steps: int) -> int:
+        """Return how many copies run at a time, and make room for them."""
+        bytes_each = 8 * steps * (self._model.nq + 2 * self._model.nv + self._model.nu)
+        lanes = min(count, max(4 * self._threads, _LARGEST_BYTES // max(bytes_each, 1)))
+        if self._batch is None or self._batch.nsim < lanes:
+            self._batch = self._make(self._model, lanes, self._threads)
+        return lanes
+
+
+def _value(model: MjModel, name: str) -> np.ndarray:
+    """Return a field of a model; those of its options are called ``opt.NAME``."""
+    holder, _, field = name.rpartition(".")
+    return getattr(model.opt if holder else model, field)
+
+
+def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
+    """Return which copies MuJoCo raised an error in, ``(count,)``, bool."""
+    from mujoco.batch import SimulationError
+
+    failed = np.zeros(count, bool)
+    try:
+        call()
+    except SimulationError as error:
+        failed[error.ids] = True
+    return failed
+
+
+def _general(model: MjModel, names: tuple[str, ...], derives: bool) -> MjModel:
+    """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end.
+
+    Raises:
+        UsageError: When it has to take one: bodies whose inertia is aligned with their joints.
+    """
+    model = copy.copy(model)
+    # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
+    model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
+    if model.ntree == 1:  # all constraints then belong together: an eighth of a step's time went into finding that out
+        model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_ISLAND)
+    for kind, fields in _FRAMES.items():
+        if set(fields) & set(names):
+            getattr(model, f"{kind}_sameframe")[:] = 0
+    frames = {*_FRAMES["body"], *(() if derives else _MASSES)}
+    if frames & set(names) and (moved := np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))).size:
+        body = mj.mj_id2name(model, mj.mjtObj.mjOBJ_BODY, int(moved[0]))
+        raise UsageError(f"C MuJoCo takes the inertia of body {body!r} as compiled, and masses or inertias differ")
+    return model
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo from writing of every candidate that diverges, to the terminal and to MUJOCO_LOG.TXT."""
+    before = mj.get_mju_user_warning()
+    mj.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mj.set_mju_user_warning(before)

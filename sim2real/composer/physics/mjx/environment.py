@@ -1,0 +1,397 @@
+"""A task as a pure environment on MJX: ``reset(key)`` and ``step(state, action)``, to be jitted and vmapped."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import weakref
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from mujoco import mjx
+
+from sim2real.composer.environment import ObservationPadding
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.physics.c.physics import Physics
+from sim2real.composer.physics.mjx import gate, stepping, views
+from sim2real.composer.physics.mjx.physics import MjxPhysics
+from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
+from sim2real.composer.physics.mjx.rings import Samples, make_rings
+from sim2real.composer.physics.mjx.tracing import TracedHooks, check_variables
+from sim2real.composer.physics.mjx.warp import warp
+from sim2real.composer.reward import split_reward
+from sim2real.composer.task import Task
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
+
+    from sim2real.composer.entity import Entity
+    from sim2real.composer.types import MjModel
+
+
+@struct.dataclass
+class State:
+    """One copy of the environment.
+
+    Attributes:
+        data: The ``mjx.Data``.
+        leaves: Fields of the model that hooks set: name -> array.
+        variables: What the task keeps from hook to hook: name -> array.
+        key: Randomness.
+        memory: What variations keep from draw to draw: name -> array.
+        rings: Samples of the observables that may still be read.
+        steps: int32: control steps since the reset.
+        dirty: Whether hooks set something after everything that follows from the state was last computed.
+        observation: Name -> array.
+        reward: Reward of the last step; 0 after a reset.
+        discount: Discount of what comes next, in [0, 1].
+        done: Whether the episode ended with the last step.
+        truncated: Whether it ended only because of the time limit.
+        failed: Whether no acceptable initial state was found in ``max_reset_attempts`` attempts.
+        terms: The terms of the reward by name; none where it is a single number.
+    """
+
+    data: mjx.Data
+    leaves: dict[str, jax.Array]
+    variables: dict[str, Any]
+    key: jax.Array
+    memory: dict[str, jax.Array]
+    rings: dict[str, Samples]
+    steps: jax.Array
+    dirty: jax.Array
+    observation: dict[str, jax.Array]
+    reward: jax.Array
+    discount: jax.Array
+    done: jax.Array
+    truncated: jax.Array
+    failed: jax.Array
+    terms: dict[str, jax.Array]
+
+
+class MjxEnvironment:
+    """Runs a task on MJX.
+
+    The hooks of the task and its entities are those of the C engine, called while the programs are traced: they read
+    and set the physics, compute with ``physics.np``, draw from ``random_state`` and keep what they need later in
+    ``physics.variables``. ``initialize_episode_mjcf`` and ``after_compile`` run once, when the environment is made;
+    ``after_compile`` gets the C engine's physics, and the programs start from the model that it leaves.
+
+    Args:
+        task: The task.
+        time_limit: Longest episode [s].
+        seed: For ``initialize_episode_mjcf`` and ``after_compile``, which run on the host.
+        strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
+        max_reset_attempts: How often the initial state is drawn when hooks call ``physics.fail``.
+        delayed_observation_padding: What fills buffers at first.
+        legacy_step: After a step, also compute positions and velocities of the new state.
+        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``sim2real[warp]``. It computes in single precision
+            and has no derivatives.
+        nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
+        njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess. Where it is too small
+            the episode of the copy ends, as where it diverged; where ``nconmax`` is, those of all copies.
+        arena: The root entity of a task that has none of its own.
+
+    Raises:
+        UsageError: When the world asks for something that MJX does not do, or does otherwise; it names what.
+
+    Attributes:
+        model: The compiled ``mujoco.MjModel``.
+        mjx_model: The ``mjx.Model``.
+        initial: The ``mjx.Data`` that episodes start from.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        time_limit: float = math.inf,
+        seed: int | None = None,
+        strip_singleton_obs_buffer_dim: bool = False,
+        max_reset_attempts: int = 1,
+        delayed_observation_padding: ObservationPadding = ObservationPadding.ZERO,
+        legacy_step: bool = True,
+        *,
+        impl: str = "jax",
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        arena: Entity | None = None,
+    ) -> None:
+        if arena is not None:
+            task._root_entity = arena
+        self.task, self._attempts, self._legacy = task, max_reset_attempts, legacy_step
+        self._hooks, self._registry = TracedHooks(task), Registry()
+        random_state = np.random.RandomState(seed)
+        self._hooks.run("initialize_episode_mjcf", random_state)
+        self._hooks.refresh()
+        self.model = task.root_entity.mjcf_model.root_model.compile()
+        self._look_at_compiled(random_state)
+        observables = task.observables
+        gate.check_observables(observables)
+        gate.check_model(self.model)
+        self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
+        if self._warp is None:
+            gate.settle_cone(self.model)
+        self.substeps = task.physics_steps_per_control_step
+        limit = time_limit / task.control_timestep
+        self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
+        initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
+        strip = strip_singleton_obs_buffer_dim
+        self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
+        self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
+        self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
+        views.freeze(self.model)
+        self._changed: tuple[str, ...] = ()
+        self._dry = self._stays_dirty = False
+        self._steady = True
+        self._earned: Any = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
+        self._discover()
+
+    def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
+        """Run ``after_compile`` on the host, and ask for the action's shape there."""
+        physics = Physics(self.model, self._legacy)
+        view: Physics = weakref.proxy(physics)
+        self._hooks.run("after_compile", view, random_state)
+        self._action_spec = self.task.action_spec(view)
+
+    def _physics(
+        self, state: State | None = None, model: mjx.Model | None = None, law: stepping.Law | None = None
+    ) -> tuple[MjxPhysics, JaxRandomState]:
+        """Return the view of a state, or of the model's initial state, for hooks."""
+        compiled = self.mjx_model if model is None else model
+        data = self.initial if state is None else state.data
+        engine = stepping.Lawful(law) if law else self._warp or stepping
+        physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, engine)
+        physics.changed.update(self._changed)  # every copy carries every field that any hook sets
+        physics.switch_on()
+        physics.start = self.initial
+        physics.dry = self._dry
+        if state is None:
+            # On Warp nothing was computed yet; a model of the copy's own is not the one that was computed with.
+            physics.is_dirty = self._warp is not None or model is not None
+            memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
+            return physics, JaxRandomState(None, memory, self._registry)
+        random_state = JaxRandomState(state.key, {}, self._registry)
+        physics.load((state.data, state.leaves, state.variables, state.key, state.memory), random_state)
+        physics.is_dirty = state.dirty if self._stays_dirty else False
+        return physics, random_state
+
+    def _discover(self) -> None:
+        """Trace resets and steps, without physics, to find out what hooks set and keep; programs must carry it."""
+        key = jax.random.key(0)
+        action = jax.tree.map(lambda s: jnp.zeros(s.shape, jax.dtypes.canonicalize_dtype(s.dtype)), self._action_spec)
+        self._dry = True
+        with self._hooks.watching((self.task, *self.task.iter_entities())):
+            state, after = self._trace(key, action)
+            self._earned = after.reward, after.discount, after.terms
+            if self._stays_dirty:
+                state, after = self._trace(key, action)
+        self._dry = False
+        self._changed = tuple(sorted({*state.leaves, *after.leaves}))
+        missing = sorted(set(after.variables) - set(state.variables))
+        if missing:
+            raise UsageError(
+                f"physics.variables {', '.join(map(repr, missing))} first appear in a step",
+                hint="set them in initialize_episode too: a compiled program carries the same variables all along",
+            )
+        check_variables(state.variables, after.variables)
+
+    def _trace(self, key: jax.Array, action: jax.Array) -> tuple[State, State]:
+        state = jax.eval_shape(self.reset, key)
+        return state, jax.eval_shape(self.step, state, action)
+
+    def reset(
+        self,
+        key: jax.Array,
+        model: mjx.Model | None = None,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+        law: stepping.Law | None = None,
+    ) -> State:
+        """Return a copy at the start of an episode.
+
+        Args:
+            key: JAX key.
+            model: The ``mjx.Model`` of this copy; default: the compiled one.
+            start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
+            law: What is set of the model from the state, not on Warp; ``step`` takes the same.
+        """
+        physics, random_state = self._physics(None, model, law)
+        random_state.key = key
+        if start is not None:
+            physics.replace("data", "qpos", start[0])
+            physics.replace("data", "qvel", start[1])
+            physics.mark_as_dirty()
+
+        def attempt() -> None:
+            self._hooks.run("initialize_episode", physics, random_state)
+
+        failed = physics.retry(attempt, random_state, self._attempts)
+        physics.forward(actuation=False)
+        rings = {r.name: r.reset(physics, random_state) for r in self._rings}
+        steps = jnp.zeros((), jnp.int32)
+        observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
+        dirty = jnp.asarray(physics.is_dirty, bool)
+        data, leaves, variables, key, memory = physics.tree(random_state)
+        reward, discount, terms = jax.tree.map(lambda x: jnp.zeros(x.shape, data.qpos.dtype), self._earned)
+        no = jnp.zeros((), bool)
+        outcome = (observation, reward, discount + 1, no, no, failed, terms)
+        return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
+
+    def reset_apart(
+        self,
+        key: jax.Array,
+        model: mjx.Model | None = None,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+        data: mjx.Data | None = None,
+    ) -> State:
+        """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
+
+        Args:
+            key: JAX key.
+            model: See ``reset``.
+            start: See ``reset``.
+            data: What episodes start from; default: ``initial``.
+        """
+        before = self._dry, self.initial
+        self._dry, self.initial = True, self.initial if data is None else data
+        try:
+            return self.reset(key, model, start)
+        finally:
+            self._dry, self.initial = before
+
+    def step_apart(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> tuple[State, jax.Array]:
+        """Run the hooks of a control step without its physics.
+
+        Args:
+            state: The copy; only ``data.ctrl``, what hooks keep and ``steps`` are up to date afterwards.
+            action: See ``step``.
+            model: See ``step``.
+
+        Returns:
+            The copy, and the controls of each physics step ``(substeps, nu)``.
+        """
+        physics, random_state = self._physics(state, model)
+        physics.dry, controls = True, []
+        self._hooks.run("before_step", physics, action, random_state)
+        for _ in range(self.substeps):
+            self._hooks.run("before_substep", physics, action, random_state)
+            controls.append(physics.control())
+            self._hooks.run("after_substep", physics, random_state)
+        self._hooks.run("after_step", physics, random_state)
+        data, leaves, variables, key, memory = physics.tree(random_state)
+        kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
+        return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
+
+    def step(
+        self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
+    ) -> State:
+        """Return the copy one control step later; an episode that is over goes on, look at ``done``.
+
+        Args:
+            state: The copy.
+            action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
+            model: The ``mjx.Model`` of this copy; default: the compiled one.
+            law: See ``reset``.
+        """
+        physics, random_state = self._physics(state, model, law)
+        self._hooks.run("before_step", physics, action, random_state)
+        rings, diverged = self._substeps(physics, random_state, state, action)
+        self._hooks.run("after_step", physics, random_state)
+        steps = state.steps + 1
+        now = steps * self.substeps
+        rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
+        dtype, task = state.reward.dtype, type(self.task).__name__
+        reward, terms = split_reward(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics))
+        discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
+        ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
+        observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
+        if self._dry:
+            self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
+        dirty = jnp.asarray(physics.is_dirty, bool)
+        data, leaves, variables, key, memory = physics.tree(random_state)
+        diverged = diverged | is_unstable(data)
+        diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
+        earned = (reward, discount, terms)
+        reward, discount, terms = jax.tree.map(lambda x: jnp.where(diverged, 0.0, x).astype(dtype), earned)
+        ended = diverged | jnp.asarray(ends, bool)
+        late = jnp.zeros((), bool) if self.step_limit is None else steps >= self.step_limit
+        outcome = (observation, reward, discount, ended | late, late & ~ended, state.failed, terms)
+        return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
+
+    def _substeps(
+        self, physics: MjxPhysics, random_state: JaxRandomState, state: State, action: jax.Array
+    ) -> tuple[dict[str, Samples], jax.Array]:
+        """Take all physics steps; return the rings, without the last samples, and whether a step diverged."""
+        buffered = [r for r in self._rings if not r.direct]
+
+        entry = physics.is_dirty
+
+        def substep(carry: Any, i: jax.Array) -> tuple[Any, None]:
+            tree, rings, dirty, diverged = carry
+            physics.load(tree, random_state)
+            physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
+            self._hooks.run("before_substep", physics, action, random_state)
+            physics.step()
+            diverged = diverged | is_unstable(physics.mjx_data)  # now: hooks may write over it
+            self._hooks.run("after_substep", physics, random_state)
+            now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
+            new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
+            if self._dry:  # is it known, for every physics step alike, whether something is to be computed anew?
+                self._steady = physics.is_dirty is entry
+            dirty = jnp.asarray(physics.is_dirty, bool)
+            return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
+
+        carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool), jnp.zeros((), bool))
+        if self.substeps == 1 or self._dry:
+            carry, _ = substep(carry, jnp.zeros((), jnp.int32))
+            tree, rings, _, diverged = carry
+        else:
+            (tree, rings, dirty, diverged), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
+            if not isinstance(physics.is_dirty, bool):  # else it is known how every physics step leaves it
+                physics.is_dirty = entry if self._steady else dirty
+        physics.load(tree, random_state)
+        return rings, diverged
+
+    def action_spec(self) -> Any:
+        """Return shape and bounds of an action, as the task says."""
+        return self._action_spec
+
+    def carry(self, names: Iterable[str]) -> None:
+        """Have every copy keep fields of the model that it was reset with, for the steps, such as ``body_mass``."""
+        self._changed = tuple(sorted({*self._changed, *names}))
+
+    def observation_spec(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """Return name -> shape and dtype."""
+        return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
+
+    def select(self, condition: jax.Array, a: State, b: State) -> State:
+        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done.
+
+        Args:
+            condition: A boolean.
+            a: A copy.
+            b: Another copy.
+        """
+
+        def choose(x: jax.Array, y: jax.Array) -> jax.Array:
+            if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):
+                return jnp.where(condition, x, y)
+            data = jnp.where(condition, jax.random.key_data(x), jax.random.key_data(y))
+            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
+
+        return jax.tree_util.tree_map(choose, a, b)
+
+
+def _initial_data(model: MjModel) -> mjx.Data:
+    """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all that follows from it."""
+    physics = Physics(model)  # which computes everything, without the actuators
+    return mjx.put_data(model, physics.data.ptr, impl="jax")
+
+
+def is_unstable(data: mjx.Data) -> jax.Array:
+    """Return whether MuJoCo would warn of an instability: a value that is not finite, or beyond its ``mjMAXVAL``."""
+    state = jnp.concatenate([data.qpos, data.qvel, data.qacc])
+    return ~(jnp.abs(state) <= mj.mjMAXVAL).all()

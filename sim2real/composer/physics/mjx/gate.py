@@ -1,0 +1,90 @@
+"""What MJX would ignore or compute otherwise, refused by name before anything is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from mujoco import mjx
+
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.observation.observable.base import MujocoCamera, Observable
+from sim2real.composer.observation.observable.mjcf import MJCFCamera
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import MjModel
+
+_INTEGRATORS = (mj.mjtIntegrator.mjINT_EULER, mj.mjtIntegrator.mjINT_RK4, mj.mjtIntegrator.mjINT_IMPLICITFAST)
+_PASSIVE = (mj.mjtDisableBit.mjDSBL_SPRING, mj.mjtDisableBit.mjDSBL_DAMPER)
+
+
+def check_model(model: MjModel) -> None:
+    """Refuse a compiled model that MJX does not simulate as MuJoCo does.
+
+    Raises:
+        UsageError: With the option or the elements.
+    """
+    if int(model.opt.noslip_iterations) > 0:
+        raise UsageError(
+            f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",
+            hint="set it to 0 in the model that sets it",
+        )
+    passive = [int(model.opt.disableflags) & int(flag) != 0 for flag in _PASSIVE]
+    if any(passive) and not all(passive):
+        raise UsageError(
+            "MJX leaves out springs and dampers where only one of them is disabled",
+            hint="disable both, or neither and set stiffness or damping to 0",
+        )
+    for kind, count in (("actuator", model.nactuator), ("sensor", model.nsensor)):
+        object_type = getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}")
+        adr = getattr(model, f"{kind}_historyadr", None)
+        late = [] if adr is None else [mj.mj_id2name(model, object_type, i) for i in range(count) if adr[i] >= 0]
+        if late:
+            raise UsageError(
+                f"MJX ignores MuJoCo's own delays and intervals: {kind} {', '.join(map(repr, late))}",
+                hint="take delay, nsample and interval out of the MJCF; delay the observable or the connection instead",
+            )
+    if model.opt.integrator not in _INTEGRATORS:
+        raise UsageError(
+            f"MJX has no integrator {mj.mjtIntegrator(model.opt.integrator).name}",
+            hint="use Euler, RK4 or implicitfast",
+        )
+
+
+def settle_cone(model: MjModel) -> None:
+    """Make friction cones pyramidal where nothing can touch, and cones mean nothing; refuse those that MJX lacks.
+
+    With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
+
+    Raises:
+        UsageError: With the geoms, where contacts without friction are asked for beside elliptic cones.
+    """
+    if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
+        return
+    model.opt.cone = mj.mjtCone.mjCONE_PYRAMIDAL
+    data: Any = mjx.make_data(model, impl="jax")
+    if data._impl.ncon == 0:
+        return
+    if (data._impl.contact.dim == 1).any():
+        smooth = (model.geom_condim == 1) & ((model.geom_contype | model.geom_conaffinity) != 0)
+        names = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) for i in smooth.nonzero()[0]]
+        raise UsageError(
+            f"MJX has no contacts of condim 1 beside elliptic friction cones: geoms {', '.join(map(repr, names))}",
+            hint='give them condim 3, or set option cone to "pyramidal"',
+        )
+    model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
+
+
+def check_observables(observables: Mapping[str, Observable]) -> None:
+    """Refuse enabled observables that cannot be computed inside a compiled program.
+
+    Raises:
+        UsageError: With the names of the observables.
+    """
+    cameras = [k for k, o in observables.items() if o.enabled and isinstance(o, MJCFCamera | MujocoCamera)]
+    if cameras:
+        raise UsageError(
+            f"MJX renders no images: camera observables {', '.join(map(repr, cameras))}",
+            hint="disable them, or use the C engine",
+        )

@@ -1,0 +1,400 @@
+"""A model and its state on MJX, inside a compiled program; hooks see the interface of the C engine's physics."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from sim2real.composer.models import layout
+from sim2real.composer.models.element import as_elements
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.physics.c.binding import EmptyBinding
+from sim2real.composer.physics.c.named import Named
+from sim2real.composer.physics.mjx import constants, stepping
+from sim2real.composer.physics.mjx.random import JaxRandomState
+from sim2real.composer.physics.mjx.views import MjxBinding, MjxDataView, MjxModelView, constant
+from sim2real.composer.physics.mjx.warp import warp_fields
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from jax.typing import ArrayLike
+
+    from sim2real.composer.models.element import Elements
+    from sim2real.composer.physics.mjx.warp.warp import WarpEngine
+    from sim2real.composer.types import MjModel
+
+_FLUID = ("opt.density", "opt.viscosity", "opt.wind")
+_SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
+"""What MJX leaves out of a program because it was 0 when the model was compiled; set, it has to be in."""
+_WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
+"""The same on Warp."""
+
+
+Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, Any], jax.Array, dict[str, jax.Array]]
+"""All that changes: the state, fields of the model, variables of tasks, a key, what variations keep."""
+
+
+class MjxPhysics:
+    """The physics that hooks see while a program is traced: the same calls as on the C engine.
+
+    Setting something replaces the state that this object holds; arrays that were read before keep their values.
+
+    Args:
+        host: The compiled ``mujoco.MjModel``.
+        model: The ``mjx.Model``.
+        data: The ``mjx.Data``.
+        variables: What tasks keep from hook to hook: name -> array.
+        legacy: After a step, also compute positions and velocities of the new state.
+        engine: What steps: the module ``stepping``, which may be under a law, or a ``WarpEngine``.
+
+    Attributes:
+        np: The module that computes with this engine's arrays: ``jax.numpy``.
+        changed: Names of the model's fields that were set.
+        start: The ``mjx.Data`` that ``reset`` returns to.
+        dry: Whether steps compute nothing: for finding out what hooks set and keep.
+        failed: Whether no acceptable initial state was found, a boolean array.
+    """
+
+    np: Any = jnp
+
+    def __init__(
+        self,
+        host: MjModel,
+        model: mjx.Model,
+        data: mjx.Data | None,
+        variables: dict[str, Any],
+        legacy: bool = True,
+        engine: ModuleType | stepping.Lawful | WarpEngine = stepping,
+    ) -> None:
+        self._engine = engine
+        self.host, self.mjx_model = host, model
+        self.mjx_data: Any = data
+        self.variables, self.start = variables, data
+        self.legacy_step = legacy
+        self.changed: set[str] = set()
+        self.failed = jnp.zeros((), bool)
+        self.is_dirty: bool | jax.Array = False
+        self.dry = False
+        self._where: jax.Array | None = None
+        self._compiled = model
+        self.data, self.model = MjxDataView(self), MjxModelView(self)
+        self.named = Named(host, self.model, self.data)
+
+    def read(self, field: layout.Field) -> Any:
+        """Return a whole field; computes everything anew first when an earlier write makes it out of date."""
+        if not field.triggers:
+            self._settle()
+        if field.struct == "model":
+            return getattr(self.model, field.name)
+        try:
+            return getattr(self.data, field.name)
+        except AttributeError:
+            raise AttributeError(f"MJX has no field {field.name!r} in its data") from None
+
+    def mark_as_dirty(self) -> None:
+        """Have everything computed again before the next computed attribute is read through a binding."""
+        self.is_dirty = True
+
+    def _settle(self) -> None:
+        """Compute everything that follows from the state where something was written since that was last done.
+
+        Whether it was is known while the program is made, as a rule. Where it is not, because it depends on the step
+        before, it belongs to the state, and the program decides.
+        """
+        dirty, where = self.is_dirty, self._where
+        if dirty is False:
+            return
+        if dirty is True and where is None:
+            self.forward()
+            return
+        here = dirty if where is None else where & dirty
+        if not self.dry:
+            model, engine = self.mjx_model, self._engine
+            self.mjx_data = jax.lax.cond(here, lambda d: engine.forward(model, d), lambda d: d, self.mjx_data)
+        self.is_dirty = False if where is None else ~where & dirty
+
+    @contextlib.contextmanager
+    def only_where(self, condition: jax.Array) -> Iterator[None]:
+        """Let what is read inside a ``with`` block change nothing where a condition, a boolean array, does not hold."""
+        self._where = condition
+        try:
+            yield
+        finally:
+            self._where = None
+
+    def check(self, struct: str, name: str, rows: int | slice | np.ndarray = slice(None)) -> None:
+        """Refuse to set rows of a field where MJX would not see it.
+
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            rows: Which rows of it; default: all.
+
+        Raises:
+            UsageError: With the field.
+        """
+        if struct != "model" or warp_fields.is_warp(self.mjx_model):
+            return
+        if name.endswith("_frictionloss") and not np.all(np.asarray(getattr(self.host, name))[rows] > 0):
+            raise UsageError(
+                f"MJX leaves out {name!r} where it is 0 in the compiled model, and it is set there",
+                hint="compile the model with a small friction, such as 1e-6",
+            )
+        if name == "geom_size" and np.any(self.host.geom_type == mj.mjtGeom.mjGEOM_HFIELD):
+            raise UsageError(
+                "MJX looks for contacts with height fields within the compiled sizes of geoms: 'geom_size' cannot vary",
+                hint="set it in initialize_episode_mjcf, or use the C engine",
+            )
+
+    def replace(self, struct: str, name: str, value: ArrayLike) -> None:
+        """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
+
+        Args:
+            struct: ``model`` or ``data``.
+            name: The field.
+            value: What it is set to.
+
+        Raises:
+            UsageError: When the field is a constant of compiled programs.
+        """
+        holder = self.mjx_model if struct == "model" else self.mjx_data
+        current = _get(holder, name)
+        if not isinstance(current, jax.Array):
+            raise constant(name)
+        if struct == "model" and warp_fields.is_warp(self.mjx_model):
+            warp_fields.check_field(name)
+        try:
+            value = jnp.broadcast_to(jnp.asarray(value, current.dtype), current.shape)
+        except ValueError:
+            value = jnp.reshape(jnp.asarray(value, current.dtype), current.shape)
+        if struct == "data":
+            self.mjx_data = self.mjx_data.replace(**{name: value})
+            return
+        self.mjx_model = stepping.with_fields(self.mjx_model, {name: value})
+        self.changed.add(name)
+        self.switch_on()
+
+    def switch_on(self) -> None:
+        """Have programs compute what follows from fields that hooks set, though they were 0 in the compiled model."""
+        on_warp = warp_fields.is_warp(self.mjx_model)
+        switches: dict[str, str] = _WARP_SWITCHES if on_warp else _SWITCHES
+        for path in {switches[name] for name in self.changed if name in switches}:
+            if not _get(self.mjx_model, path):
+                self.mjx_model = stepping.with_fields(self.mjx_model, {path: True})
+        implicit = self.mjx_model.opt.integrator == mjx.IntegratorType.IMPLICITFAST
+        if self.changed.intersection(_FLUID) and implicit and not on_warp:
+            raise UsageError("MJX has no fluid forces with the integrator implicitfast", hint="use Euler or RK4")
+
+    def recompute_constants(self) -> None:
+        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
+        for name, value in constants.derive(self.host, self.mjx_model).items():
+            self.replace("model", name, value)
+        self.mark_as_dirty()
+
+    def field(self, name: str) -> jax.Array:
+        """Return a field of this copy's model, such as ``dof_damping`` or ``opt.gravity``."""
+        return _get(self.mjx_model, name)
+
+    def initial(self, elements: Elements, name: str) -> Any:
+        """Return an attribute of elements as it was compiled."""
+        field, index = self.bind(elements).place(name)
+        holder = self._compiled if field.struct == "model" else self.mjx_data
+        return getattr(holder, field.name)[index]
+
+    # -- the interface of the C engine's physics
+
+    def time(self) -> jax.Array:
+        """Return the simulated time [s]."""
+        return self.mjx_data.time
+
+    def timestep(self) -> jax.Array:
+        """Return the time that a step takes [s]."""
+        return self.mjx_model.opt.timestep
+
+    def control(self) -> jax.Array:
+        """Return the controls, shape ``(nu,)``."""
+        return self.mjx_data.ctrl
+
+    def set_control(self, control: ArrayLike) -> None:
+        """Set the controls, shape ``(nu,)`` [the actuators' units].
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        old = self.mjx_data.ctrl
+        if jnp.size(control) not in (1, old.size):
+            raise UsageError(
+                f"there are {old.size} controls, and set_control was given an array of shape {jnp.shape(control)}",
+                hint="a task whose actions are something else overrides action_spec and before_step",
+            )
+        control = jnp.ravel(jnp.asarray(control, old.dtype))
+        self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(control, old.shape))
+
+    def position(self) -> jax.Array:
+        """Return qpos, shape ``(nq,)``."""
+        return self.mjx_data.qpos
+
+    def velocity(self) -> jax.Array:
+        """Return qvel, shape ``(nv,)``."""
+        return self.mjx_data.qvel
+
+    def activation(self) -> jax.Array:
+        """Return act, shape ``(na,)``."""
+        return self.mjx_data.act
+
+    def get_state(self) -> jax.Array:
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
+        data = self.mjx_data
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    state = get_state
+
+    def set_state(self, state: ArrayLike) -> None:
+        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
+
+        Raises:
+            UsageError: When the shape is another.
+        """
+        nq, nv, na = self.host.nq, self.host.nv, self.host.na
+        if jnp.shape(state) != (nq + nv + na,):
+            raise UsageError(f"Input physics state has shape {jnp.shape(state)}. Expected {(nq + nv + na,)}.")
+        for name, part in zip(("qpos", "qvel", "act"), jnp.split(jnp.asarray(state), [nq, nq + nv]), strict=True):
+            self.replace("data", name, part)
+
+    def reset(self, keyframe_id: int | None = None) -> None:
+        """Return to the initial state, or to a keyframe; variables are forgotten.
+
+        Raises:
+            UsageError: When there is no such keyframe.
+        """
+        self.mjx_data = self.start
+        if keyframe_id is not None:
+            if not 0 <= keyframe_id < self.host.nkey:
+                raise UsageError(
+                    f"`keyframe_id` must be between 0 and {self.host.nkey - 1} inclusive, got: {keyframe_id}"
+                )
+            names = {"qpos": "qpos", "qvel": "qvel", "act": "act", "ctrl": "ctrl", "time": "time"}
+            for name, key in {**names, "mocap_pos": "mpos", "mocap_quat": "mquat"}.items():
+                self.replace("data", name, getattr(self.host, f"key_{key}")[keyframe_id])
+        self.variables.clear()
+        self.forward(actuation=False)
+
+    def step(self) -> None:
+        """Advance by a time step."""
+        if self.dry:
+            return
+        self.mjx_data = self._engine.advance(self.mjx_model, self.mjx_data, self.legacy_step)
+
+    def forward(self, actuation: bool = True) -> None:
+        """Compute everything that follows from the state, without advancing."""
+        if not self.dry:
+            self.mjx_data = self._engine.forward(self.mjx_model, self.mjx_data, actuation)
+        self.is_dirty = False
+
+    def suppress_physics_errors(self) -> contextlib.nullcontext[None]:
+        """MJX raises none."""
+        return contextlib.nullcontext()
+
+    def bind(self, elements: Elements) -> Any:
+        """Return the attributes of an element, or of several of one kind.
+
+        Raises:
+            UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
+        """
+        found, single = as_elements(elements)
+        if not found:
+            return EmptyBinding()
+        layout.attributes(found[0].kind)
+        ids = layout.resolve(self.host, found[0].kind, tuple(e.full_identifier for e in found))
+        return MjxBinding(self, found[0].kind, ids, single)
+
+    def get(self, elements: Elements, name: str) -> Any:
+        """Return an attribute of elements; the same call on both engines."""
+        return getattr(self.bind(elements), name)
+
+    def set(self, elements: Elements, name: str, value: Any) -> MjxPhysics:
+        """Set an attribute of elements and return the physics; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What it is set to, in the shape in which it is read.
+        """
+        setattr(self.bind(elements), name, value)
+        return self
+
+    def write(self, elements: Elements, name: str, value: Any, index: Any) -> MjxPhysics:
+        """Set a part of an attribute of elements; the same call on both engines.
+
+        Args:
+            elements: An element, or several of one kind.
+            name: The attribute, in MuJoCo's spelling without the kind's prefix.
+            value: What the part is set to.
+            index: Which part of the attribute, as in ``attribute[index]``.
+        """
+        whole = jnp.asarray(self.get(elements, name))
+        return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
+
+    def fail(self, condition: bool | jax.Array = True) -> None:
+        """Note that no acceptable initial state was found where the condition holds; another attempt follows."""
+        self.failed = self.failed | condition
+
+    # -- state as a tree
+
+    def tree(self, random_state: JaxRandomState) -> Carried:
+        """Return all that changes, as a tree."""
+        leaves = {name: _get(self.mjx_model, name) for name in sorted(self.changed)}
+        variables = {name: jax.tree_util.tree_map(jnp.asarray, value) for name, value in self.variables.items()}
+        return self.mjx_data, leaves, variables, random_state.key, dict(random_state.memory)
+
+    def load(self, tree: Carried, random_state: JaxRandomState) -> None:
+        """Take over what ``tree`` returned."""
+        self.mjx_data, leaves, variables, random_state.key, memory = tree
+        if leaves:
+            self.mjx_model = stepping.with_fields(self.mjx_model, leaves)
+        self.changed |= set(leaves)
+        for mine, theirs in ((self.variables, variables), (random_state.memory, memory)):
+            mine.clear()
+            mine.update(theirs)
+
+    def retry(self, attempt: Callable[[], None], random_state: JaxRandomState, attempts: int) -> jax.Array:
+        """Run a function until it no longer calls ``fail``, at most so many times; return whether the last one failed.
+
+        Every attempt starts from the same state, with new random numbers.
+
+        Args:
+            attempt: The function: without arguments.
+            random_state: The random numbers that it draws from.
+            attempts: How often it runs at most.
+        """
+        start, model, outer, dirty = self.tree(random_state), self.mjx_model, self.failed, self.is_dirty
+
+        def once(carry: Any) -> Any:
+            _, tree, count = carry
+            self.mjx_model, self.is_dirty = model, dirty
+            self.load((*start[:3], tree[3], start[4]), random_state)
+            self.failed = jnp.zeros((), bool)
+            attempt()
+            return self.failed, self.tree(random_state), count + 1
+
+        carry = once((None, start, jnp.zeros((), int)))
+        if attempts > 1:
+            carry = jax.lax.while_loop(lambda c: c[0] & (c[2] < attempts), once, carry)
+        self.mjx_model, self.failed, self.is_dirty = model, outer, True
+        self.load(carry[1], random_state)
+        return carry[0]
+
+
+def _get(holder: Any, path: str) -> Any:
+    """Return a field of a model or a state by its path, None when there is none."""
+    for step in path.split("."):
+        holder = getattr(holder, step, None)
+    return holder

@@ -1,0 +1,1 @@
+"""MJX on the kernels of MuJoCo Warp."""

@@ -1,0 +1,1 @@
+"""What all half-duplex buses of servos share: port, packets, registers, transactions."""

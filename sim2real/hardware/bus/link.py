@@ -1,0 +1,398 @@
+"""Transactions on a half-duplex bus of servos, one at a time: port, lock, retries, late answers, withheld torque.
+
+Written by hand, as the makers' packages cannot time their reads. They poll for an answer, for which PyPI's
+feetech-servo-sdk 1.0.0 takes 0.61 ms of processor time a read, and this module 0.05; they notice a missing one after 34
+ms, fixed, by the wall clock; they keep neither when an instruction was sent nor the error bytes of a synchronised read;
+and as they do not drop late answers, the one to an earlier instruction passes for that to the next.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import threading
+import time
+from abc import ABC, abstractmethod
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import ClassVar, Final, cast
+
+import numpy as np
+
+from sim2real.errors import HardwareLost
+from sim2real.hardware.bus.packets import Answer, Instruction, Packet, PacketFormat, Parser, of_servos
+from sim2real.hardware.bus.port import LinkConfig, open_port
+from sim2real.hardware.bus.registers import MemoryTable, Register
+from sim2real.hardware.device import Counters, Transaction
+from sim2real.hardware.safety.guardian import Guardian
+
+_LOCK_TIMEOUT_S: Final = 0.5
+_FORCED_ATTEMPTS: Final = 5
+_LEAST_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
+_PADS: Final = 4
+_SCANNED: Final = 20
+_CONFIRMING_BYTES: Final = 14  # no other read is as long: what confirms cannot be a late answer to something else
+
+
+class ServoLink(ABC):
+    """Owner of port and lock. Every method may be called from any thread.
+
+    Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
+
+    Args:
+        config: Port and limits.
+
+    Attributes:
+        form: How packets are written.
+        table: The servos' memory.
+        ping_bytes: Bytes of data of the answer to a ping.
+
+    Raises:
+        HardwareLost: The port cannot be opened, or another process uses it.
+    """
+
+    form: ClassVar[PacketFormat]
+    table: ClassVar[MemoryTable]
+    ping_bytes: ClassVar[int] = 0
+
+    def __init__(self, config: LinkConfig) -> None:
+        self.config = config
+        self.guardian: Guardian | None = None
+        self.closed = False
+        self.torque_withheld = False
+        self._transactions = self._retries = self._lost = self._late = self._withheld = 0
+        self._late_us = array("i")
+        self._withheld_goals: dict[tuple[int, Register], int] = {}
+        self._lock = threading.Lock()
+        self._parser = Parser(self.form)
+        self._waiting: list[Packet] = []
+        self._pad = 0
+        self._sent_ns = 0
+        self._serial = open_port(config)
+        self.fd = cast(int, self._serial.fileno())
+
+    @abstractmethod
+    def require_fine(self, answer: Answer, what: str) -> None:
+        """Raise the error that an answer reports: SafetyStop if the servo has stopped itself.
+
+        Args:
+            answer: An answer with an error.
+            what: Description of the instruction, for errors.
+        """
+
+    @property
+    def counters(self) -> Counters:
+        """What went over the bus so far."""
+        late_s = np.array(self._late_us, np.float64) * 1e-6
+        return Counters(self._transactions, self._lost, self._retries, self._late, late_s, self._withheld)
+
+    def read(self, servo_id: int, register: Register, despite_error: bool = False) -> int:
+        """Return a register's value in counts; of a goal that was withheld, that goal.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            despite_error: Whether to return it although the servo reports an error.
+        """
+        what = f"read of {register.name}"
+        found = self.read_each((servo_id,), register.address, register.size, what, despite_error)[0][0]
+        return self._withheld_goals.get((servo_id, register), register.decode(found))
+
+    def read_each(
+        self, servo_ids: Sequence[int], address: int, length: int, what: str, despite_error: bool = False
+    ) -> tuple[list[bytes], Transaction]:
+        """Read the same bytes of several servos' memory with one instruction.
+
+        Args:
+            servo_ids: The servos.
+            address: Address of the first byte.
+            length: Number of bytes of each servo.
+            what: Description of the instruction, for errors.
+            despite_error: Whether to return them although a servo reports an error.
+
+        Returns:
+            The bytes of each servo; and the transaction.
+        """
+        # After a missing answer, more bytes are requested: if it still comes, it is recognised by its length. Taken for
+        # the answer to the repeated instruction, its sample would get a time stamp that is 8 ms too late.
+        spare = max(0, min(_PADS - 1, self.table.size - address - length))
+
+        def instruction() -> tuple[bytes, int]:
+            asked = length + self._pad % (spare + 1)
+            return self.form.read(servo_ids, address, asked), asked
+
+        answers, transaction = self._exchange(instruction, servo_ids, what, despite_error)
+        return [answer.data[:length] for answer in answers], transaction
+
+    def read_counts(
+        self, servo_ids: Sequence[int], registers: Sequence[Register], what: str
+    ) -> tuple[np.ndarray, Transaction]:
+        """Read registers that are near each other, of several servos, with one instruction.
+
+        Args:
+            servo_ids: The servos.
+            registers: The registers, in the order of their addresses.
+            what: Description of the instruction, for errors.
+
+        Returns:
+            Their values, shape ``(servos, registers)`` [counts]; and the transaction.
+        """
+        begin = registers[0].address
+        blocks, transaction = self.read_each(servo_ids, begin, registers[-1].end - begin, what)
+        counts = [[r.decode(block[r.address - begin : r.end - begin]) for r in registers] for block in blocks]
+        return np.array(counts), transaction
+
+    def write(self, servo_id: int, register: Register, value: int) -> Transaction:
+        """Write a register, and wait for the servo to confirm that the instruction came.
+
+        Some servos do not say whether they took the value: `set` reads it back.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
+        if self._withholds(register, (value,)):
+            return self._withhold(register, {servo_id: value})
+        packet = self.form.write(servo_id, register, value)
+        return self._exchange(lambda: (packet, 0), (servo_id,), f"write of {value} to {register.name}")[1]
+
+    def set(self, servo_id: int, register: Register, value: int) -> None:
+        """Write a register if it holds another value; raise HardwareLost if the servo does not keep it.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
+        if self.read(servo_id, register) == value:
+            return
+        self.write(servo_id, register, value)
+        self.require(servo_id, register, value)
+
+    def require(self, servo_id: int, register: Register, value: int) -> None:
+        """Raise HardwareLost if a register does not hold the value that was written.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
+        found = self.read(servo_id, register)
+        if found != value:
+            raise HardwareLost(
+                f"servo {servo_id} does not keep its settings: {register.name} is {found} after {value} was written",
+                hint="is its supply stable, its firmware another one?",
+            )
+
+    def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
+        """Write a register of several servos, each a value in counts by id, in one instruction that none confirms."""
+        if self._withholds(register, values.values()):
+            return self._withhold(register, values)
+        packet = self.form.write_each(register, values)
+        return self._exchange(lambda: (packet, 0), (), f"write of {register.name}")[1]
+
+    def ping(self, servo_id: int) -> bytes:
+        """Return the data of a servo's answer to a ping, whatever error it reports; raise HardwareLost without one."""
+        packet, who, length = self._ping(servo_id)
+        return self._exchange(lambda: (packet, length), who, "ping", despite_error=True)[0][0].data
+
+    def scan(self) -> list[int]:
+        """Return the ids below 20 that answer a single ping; to ask all takes 2 s."""
+        with self.hold():
+            return [i for i in range(_SCANNED) if self._attempt(*self._ping(i)) is not None]
+
+    def force(self, servo_id: int, register: Register, value: int) -> bool:
+        """Write a register despite a held lock, missing answers or errors, until it reads back. Never raises.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+
+        Returns:
+            Whether the servo holds the value.
+        """
+        write = self.form.write(servo_id, register, value)
+        query = self.form.read((servo_id,), register.address, _CONFIRMING_BYTES)
+        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
+        try:
+            for _ in range(_FORCED_ATTEMPTS):
+                with suppress(Exception):
+                    self._attempt(write, (servo_id,), 0)
+                    answers = self._attempt(query, (servo_id,), _CONFIRMING_BYTES)
+                    if answers and answers[0].data and register.decode(answers[0].data[: register.size]) == value:
+                        return True
+        finally:
+            if held:
+                self._lock.release()
+        return False
+
+    def answering(self, packet: bytes, wait_s: float) -> list[int]:
+        """Send an instruction once; return the id of each answer that comes in a while, in their order."""
+        found = []
+        with self.hold():
+            self._send(packet)
+            while (answer := self._next_answer(self._sent_ns + round(1e9 * wait_s))) is not None:
+                found.append(answer.servo_id)
+        return found
+
+    def close(self) -> None:
+        """Close the port; later instructions raise HardwareLost. Never raises itself."""
+        self.closed = True
+        with suppress(OSError):
+            self._serial.close()
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Have exclusive use of the bus in the block; raise HardwareLost if it is closed."""
+        with self._lock:
+            if self.closed:
+                raise HardwareLost(f"the bus on {self.config.port} is closed")
+            yield
+
+    def _exchange(
+        self,
+        instruction: Callable[[], tuple[bytes, int]],
+        servo_ids: Sequence[int],
+        what: str,
+        despite_error: bool = False,
+    ) -> tuple[list[Answer], Transaction]:
+        """Repeat an instruction until it is answered, or the bus counts as lost.
+
+        Args:
+            instruction: Returns its bytes, and how many bytes of data each answer must have.
+            servo_ids: Who answers it, in this order.
+            what: Description of the instruction, for errors.
+            despite_error: Whether errors in the answers do not matter.
+
+        Returns:
+            The answers, and the transaction.
+
+        Raises:
+            HardwareLost: There was no answer within the configured limits.
+            SafetyStop: A servo has stopped itself; the guardian has taken over, or has died.
+        """
+        asked_ns = time.monotonic_ns()
+        losses = 0
+        to_whom = f"{what}{of_servos(servo_ids)}"
+        with self.hold():
+            began_ns = time.monotonic_ns()
+            while True:
+                if self.guardian is not None:
+                    self.guardian.beat()
+                packet, length = instruction()
+                try:
+                    answers = self._attempt(packet, servo_ids, length)
+                except OSError as failure:
+                    self._require_watching()
+                    raise HardwareLost(f"{self.config.port} failed during {to_whom}: {failure}") from failure
+                now_ns = time.monotonic_ns()
+                if answers is not None:
+                    late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
+                    break
+                losses += 1
+                self._lost += 1
+                self._pad = (self._pad + 1) % _PADS
+                self._judge(losses, (now_ns - began_ns) * 1e-9, to_whom)
+                self._retries += 1
+            transaction = Transaction(self._sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
+        for answer in answers:
+            if answer.error and not despite_error:
+                self.require_fine(answer, what)
+        return answers, transaction
+
+    def _ping(self, servo_id: int) -> tuple[bytes, tuple[int], int]:
+        return self.form.build(servo_id, Instruction.PING), (servo_id,), self.ping_bytes
+
+    def _wire_ns(self, packet: bytes, servo_ids: Sequence[int], length: int) -> int:
+        """Return how long an instruction and its answers need on the wire [ns]."""
+        count = len(packet) + len(servo_ids) * (self.form.answer_bytes + length)
+        return round(1e10 * count / self.config.baud_rate)
+
+    def _attempt(self, packet: bytes, servo_ids: Sequence[int], length: int) -> list[Answer] | None:
+        """Send an instruction once; return the answers of the servos, or None if one is missing."""
+        self._send(packet)
+        end_ns = self._sent_ns + round(1e9 * self.config.reply_timeout_s) + self._wire_ns(packet, servo_ids, length)
+        answers = []
+        for servo_id in servo_ids:
+            answer = self._receive(servo_id, length, end_ns)
+            if answer is None:
+                return None
+            answers.append(answer)
+        return answers
+
+    def _send(self, packet: bytes) -> None:
+        """Send an instruction; forget late answers that came before, and the beginning of one that was cut."""
+        self._parser.clear()
+        self._waiting.clear()
+        try:
+            self._serial.reset_input_buffer()
+        except termios.error as error:  # raised by pyserial when the adapter is unplugged
+            raise OSError(str(error)) from error
+        self._sent_ns = time.monotonic_ns()
+        os.write(self.fd, packet)
+
+    def _receive(self, servo_id: int, length: int, end_ns: int) -> Answer | None:
+        """Wait for a servo's answer with `length` bytes of data, or a refusal without any.
+
+        Others are late answers to earlier instructions, and are dropped.
+        """
+        while (answer := self._next_answer(end_ns)) is not None:
+            refused = not answer.data and answer.error & self.form.refusals
+            if answer.servo_id == servo_id and (len(answer.data) == length or refused):
+                return answer
+            self._late += 1
+        return None
+
+    def _next_answer(self, end_ns: int) -> Answer | None:
+        """Return the next status packet with a correct checksum; None if there is none until `end_ns`."""
+        while True:
+            while self._waiting:
+                packet = self._waiting.pop(0)
+                if packet.intact and (answer := self.form.answer(packet)) is not None:
+                    return answer
+            left_s = (end_ns - time.monotonic_ns()) * 1e-9
+            if left_s <= 0.0 or not select.select([self.fd], [], [], left_s)[0]:
+                return None
+            data = os.read(self.fd, 4096)
+            if not data:
+                raise OSError("the port is ready to be read, but has no data: was it unplugged?")
+            self._waiting += [found for found, _ in self._parser.feed(data)]
+
+    def _count_answer(self, now_ns: int, wire_ns: int) -> int:
+        """Count an answer that has arrived; return how much longer it took than its bytes need on the wire [ns]."""
+        self._transactions += 1
+        late_ns = max(0, now_ns - self._sent_ns - wire_ns)
+        self._late_us.append(min(late_ns // 1000, 1 << 30))
+        self._late += late_ns > 1e9 * self.config.late_after_s
+        return late_ns
+
+    def _judge(self, losses: int, silent_s: float, what: str) -> None:
+        if losses >= _LEAST_LOSSES and silent_s > self.config.max_silence_s:
+            self._require_watching()
+            raise HardwareLost(
+                f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
+                hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "
+                "reply_timeout_s?",
+            )
+
+    def _require_watching(self) -> None:
+        """Raise SafetyStop if the guardian has taken over: it reads answers off the port that are missed here."""
+        if self.guardian is not None:
+            self.guardian.require_watching()
+
+    def _withholds(self, register: Register, values: Iterable[int]) -> bool:
+        """Whether a write could move a motor, and nothing may."""
+        moves = register in self.table.goals or (register == self.table.torque and any(values))
+        return self.torque_withheld and moves
+
+    def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
+        """Keep a write to oneself, and read the register in its place: the bus is as busy, and its loss is noticed."""
+        self._withheld += 1
+        if register in self.table.goals:
+            self._withheld_goals |= {(servo_id, register): value for servo_id, value in values.items()}
+        what = f"read of {register.name}"
+        return self.read_each((next(iter(values)),), register.address, register.size, what)[1]

@@ -1,0 +1,229 @@
+"""Packets on a half-duplex bus of servos: what all families have in common, and what a family must define."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import ClassVar, Final, NamedTuple
+
+from sim2real.hardware.bus.registers import Register
+
+BROADCAST_ID: Final = 0xFE
+
+
+class Instruction(IntEnum):
+    """Instruction byte of a packet; the numbers are those of DYNAMIXEL, which other families have taken over."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    REBOOT = 0x08
+    STATUS = 0x55
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    BULK_READ = 0x92
+
+
+@dataclass(frozen=True)
+class Packet:
+    """A packet that was received.
+
+    Args:
+        servo_id: Receiver, or the sender of a status packet.
+        code: Instruction byte, not necessarily one of `Instruction`; some families have the error byte of a status
+            packet in its place.
+        parameters: Bytes between code and checksum, as they were meant.
+        intact: Whether the checksum matches; if not, the other fields may be wrong.
+    """
+
+    servo_id: int
+    code: int
+    parameters: bytes = b""
+    intact: bool = True
+
+
+class Answer(NamedTuple):
+    """What a servo says in a status packet.
+
+    Attributes:
+        servo_id: The servo.
+        error: Error byte, 0: none.
+        data: What was read.
+    """
+
+    servo_id: int
+    error: int
+    data: bytes
+
+
+class PacketFormat(ABC):
+    """How the servos of a family write packets.
+
+    Attributes:
+        header: The first bytes of every packet.
+        prefix_bytes: Bytes up to and with the one or two that say how many follow.
+        answer_bytes: Bytes of a status packet without data.
+        address_bytes: Bytes of an address, and of a number of bytes.
+        refusals: Bits of the error byte that mean that an instruction was refused; such an answer has no data.
+        off_errors: Error bytes with which a servo may say that its torque is off.
+    """
+
+    header: ClassVar[bytes]
+    prefix_bytes: ClassVar[int]
+    answer_bytes: ClassVar[int]
+    address_bytes: ClassVar[int]
+    refusals: ClassVar[int] = 0
+    off_errors: ClassVar[tuple[int, ...]] = (0,)
+
+    @abstractmethod
+    def frame(self, servo_id: int, body: bytes) -> bytes:
+        """Return the bytes of a packet with a body, which is its code and its parameters."""
+
+    def build(self, servo_id: int, code: int, parameters: bytes = b"") -> bytes:
+        """Return the bytes of a packet, as sent on the wire.
+
+        Args:
+            servo_id: The receiver; of a status packet, the sender.
+            code: As in `Packet`.
+            parameters: Bytes after it.
+        """
+        return self.frame(servo_id, bytes((code,)) + parameters)
+
+    def build_status(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
+        """Return the bytes of a status packet, a servo's answer: here with the error byte in the instruction's place.
+
+        Args:
+            servo_id: The sender.
+            error: Error byte.
+            parameters: Bytes after it.
+        """
+        return self.build(servo_id, error, parameters)
+
+    @abstractmethod
+    def following(self, prefix: bytearray) -> int | None:
+        """Return how many bytes follow a packet's first `prefix_bytes`; None: no packet begins like this."""
+
+    @abstractmethod
+    def parse(self, packet: bytes) -> Packet:
+        """Return what the bytes of a whole packet mean."""
+
+    @abstractmethod
+    def answer(self, packet: Packet) -> Answer | None:
+        """Return what a status packet says; None for any other packet."""
+
+    def read(self, servo_ids: Sequence[int], address: int, length: int) -> bytes:
+        """Return the instruction that reads the same bytes of one or several servos.
+
+        Args:
+            servo_ids: The servos.
+            address: Address of the first byte.
+            length: Number of bytes.
+        """
+        place = self._word(address) + self._word(length)
+        if len(servo_ids) == 1:
+            return self.build(servo_ids[0], Instruction.READ, place)
+        return self.build(BROADCAST_ID, Instruction.SYNC_READ, place + bytes(servo_ids))
+
+    def write(self, servo_id: int, register: Register, value: int) -> bytes:
+        """Return the instruction that writes a register.
+
+        Args:
+            servo_id: The servo.
+            register: The register.
+            value: In counts.
+        """
+        return self.build(servo_id, Instruction.WRITE, self._word(register.address) + register.encode(value))
+
+    def write_each(self, register: Register, values: Mapping[int, int]) -> bytes:
+        """Return the instruction that writes a register of several servos, by id, which they do not answer."""
+        items = b"".join(bytes((i,)) + register.encode(value) for i, value in values.items())
+        place = self._word(register.address) + self._word(register.size)
+        return self.build(BROADCAST_ID, Instruction.SYNC_WRITE, place + items)
+
+    def torque_queries(self, torque: Register, servo_ids: Sequence[int]) -> list[tuple[bytes, list[bytes]]]:
+        """Return for each servo the instruction that asks for its torque, and the answers that mean "off"."""
+        return [
+            (
+                self.read((i,), torque.address, torque.size),
+                [self.build_status(i, error, torque.encode(0)) for error in self.off_errors],
+            )
+            for i in servo_ids
+        ]
+
+    def word(self, data: bytes, position: int) -> int:
+        """Return the address, or the number of bytes, that begins at a position in a packet's parameters."""
+        return int.from_bytes(data[position : position + self.address_bytes], "little")
+
+    def _word(self, value: int) -> bytes:
+        return value.to_bytes(self.address_bytes, "little")
+
+
+class Parser:
+    """Finds packets in a byte stream that arrives in chunks, and resynchronises after garbage.
+
+    Args:
+        form: How packets are written.
+    """
+
+    def __init__(self, form: PacketFormat) -> None:
+        self._form = form
+        self._buffer = bytearray()
+
+    def clear(self) -> None:
+        """Forget the beginning of an incomplete packet."""
+        self._buffer.clear()
+
+    def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
+        """Process the next bytes.
+
+        Args:
+            chunk: The bytes.
+
+        Returns:
+            The packets that they complete; each with the number of bytes of `chunk` up to and with its last byte.
+        """
+        held_bytes = len(self._buffer)
+        self._buffer += chunk
+        taken_bytes = 0
+        packets = []
+        while (found := self._next()) is not None:
+            packet, used_bytes = found
+            taken_bytes += used_bytes
+            if packet is not None:
+                packets.append((packet, max(0, taken_bytes - held_bytes)))
+        return packets
+
+    def _next(self) -> tuple[Packet | None, int] | None:
+        """Remove a packet or leading garbage; return it (or None) and its size in bytes, None if more are needed."""
+        buffer, form = self._buffer, self._form
+        start = buffer.find(form.header)
+        if start != 0:
+            # The last bytes may be the beginning of a header.
+            garbage_bytes = start if start > 0 else max(0, len(buffer) - len(form.header) + 1)
+            return self._drop(garbage_bytes) if garbage_bytes else None
+        if len(buffer) < form.prefix_bytes:
+            return None
+        following = form.following(buffer)
+        if following is None:  # the header begins one byte later, if there is one
+            return self._drop(1)
+        end = form.prefix_bytes + following
+        if len(buffer) < end:
+            return None
+        packet = form.parse(bytes(buffer[:end]))
+        # After a wrong checksum, drop the header only: the length may be wrong too, and include good packets.
+        return packet, self._drop(end if packet.intact else len(form.header))[1]
+
+    def _drop(self, count: int) -> tuple[None, int]:
+        del self._buffer[:count]
+        return None, count
+
+
+def of_servos(servo_ids: Sequence[int]) -> str:
+    """Return whom an instruction is for, in words."""
+    if not servo_ids:
+        return ""
+    return f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"

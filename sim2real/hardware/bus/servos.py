@@ -1,0 +1,244 @@
+"""Servos on one bus, whatever family they are of: what watches them, and every way in which their torque goes off."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Final, Generic, Self, TypeVar
+
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.bus.link import ServoLink
+from sim2real.hardware.bus.models import ServoModel
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
+from sim2real.hardware.bus.port import LinkConfig
+from sim2real.hardware.device import Counters, WithoutHost
+from sim2real.hardware.safety.guardian import Guardian
+
+_LOGGER = logging.getLogger(__name__)
+_SAFE_REPEATS: Final = 5
+_SHARED_PINGS: Final = 3
+_SAFE_PAUSE_S: Final = 0.002
+
+L = TypeVar("L", bound=ServoLink)
+
+
+class GuardedServos(Generic[L]):
+    """Servos on a bus, and the guardian that watches them. All methods may be called from any thread.
+
+    The torque is taken off by `close`, when the context is left, and when the interpreter exits; on a signal only if
+    its handler calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate
+    process that is started before torque goes on.
+
+    Args:
+        config: Port and limits.
+        ids: The servos' ids.
+
+    Attributes:
+        models: Id -> model of the servos that were found, whose torque `close` takes off.
+        armed: Whether torque is on, as far as is known.
+        halted: Whether torque stays off, as `make_safe` or `close` was called.
+    """
+
+    link_type: type[L]
+    """What makes the link of a configuration."""
+
+    def __init__(self, config: LinkConfig, ids: Sequence[int] = ()) -> None:
+        self.config = config
+        self.ids: tuple[int, ...] = ()
+        self.models: dict[int, ServoModel] = {}
+        self.armed = False
+        self.halted = False
+        self._link: L | None = None
+        self.watch(ids)
+
+    def __enter__(self) -> Self:
+        """Return the open servos, with torque off."""
+        self.open()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Take the torque off and close the port."""
+        self.close()
+
+    def open(self) -> None:
+        """Open the port; raise HardwareLost if that cannot be done."""
+        if self._link is not None and not self._link.closed:
+            raise UsageError("the servos are open already", hint="close them first")
+        self.armed = self.halted = False
+        self.models = {}
+        self._link = self.link_type(self.config)
+        atexit.register(self.close)
+
+    @property
+    def link(self) -> L:
+        """The link, once it is open."""
+        if self._link is None:
+            raise HardwareLost(f"the servos on {self.config.port} are not open", hint="call open first")
+        return self._link
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Names of the servos."""
+        return tuple(f"servo {i}" for i in self.ids)
+
+    @property
+    def silence_s(self) -> float:
+        """Longest time without an instruction while torque is on [s]; 0: unlimited."""
+        return self.config.silence_s
+
+    @property
+    def counters(self) -> Counters:
+        """What went over the bus so far."""
+        return Counters() if self._link is None else self._link.counters
+
+    @property
+    def torque_withheld(self) -> bool:
+        """Whether nothing can move a motor; see `withhold_torque`."""
+        return self._link is not None and self._link.torque_withheld
+
+    def require_watching(self) -> None:
+        """Raise SafetyStop if the guardian has taken over, or has died."""
+        if self._link is not None and self._link.guardian is not None:
+            self._link.guardian.require_watching()
+
+    @property
+    def guardian_pid(self) -> int | None:
+        """Process id of the guardian; None before it is started."""
+        guardian = None if self._link is None else self._link.guardian
+        return None if guardian is None else guardian.pid
+
+    def watch(self, servo_ids: Sequence[int]) -> None:
+        """Let `make_safe` and the guardian act on these servos from now on."""
+        if not all(0 <= i < BROADCAST_ID for i in servo_ids):
+            raise UsageError(f"servos {list(servo_ids)}: an id is a number from 0 to {BROADCAST_ID - 1}")
+        form, torque = self.link_type.form, self.link_type.table.torque
+        self.ids = tuple(servo_ids)
+        # Built here, as make_safe must not need any time.
+        self._off_packet = form.write_each(torque, dict.fromkeys(self.ids, 0)) if self.ids else b""
+
+    def find(self, servo_id: int, whose: str = "") -> bytes:
+        """Return what a servo answers to a ping.
+
+        Args:
+            servo_id: The servo.
+            whose: What it moves, for errors.
+
+        Raises:
+            HardwareLost: It does not answer, the message has the ids that do; or two servos have this id.
+        """
+        try:
+            found = self.link.ping(servo_id)
+        except HardwareLost as error:
+            raise HardwareLost(
+                f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
+                f"Available: {sorted(self.link.scan())}",
+                hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
+                "one id garble each other's answers: connect one at a time",
+            ) from error
+        # A late answer to an earlier ping does not come again and again, that of a second servo does.
+        ping, wait_s = self.link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
+        if all(self.link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
+            raise HardwareLost(
+                f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
+                hint="connect one of them at a time, and give each an id of its own",
+            )
+        return found
+
+    def without_host(self) -> tuple[WithoutHost, ...]:
+        """Return for each model of servo found what it does by itself when this process dies."""
+        kinds: dict[ServoModel, list[str]] = {}
+        for servo_id, model in self.models.items():
+            kinds.setdefault(model, []).append(f"servo {servo_id}")
+        return tuple(m.without_host(self.silence_s, tuple(motors)) for m, motors in kinds.items())
+
+    def withhold_torque(self) -> None:
+        """Let nothing pass from now on that could move a motor, for a dry run: neither "torque on" nor any goal.
+
+        There is no way back but to open the bus again. Everything else goes on as it would: watchdog and guardian are
+        armed, goals are checked, and a goal that was withheld is what its register seems to hold. In the place of an
+        instruction that is withheld its register is read, which takes the bus about as long.
+
+        Raises:
+            UsageError: Torque is on.
+        """
+        if self.armed:
+            raise UsageError("torque cannot be withheld: it is on", hint="call withhold_torque before torque goes on")
+        self.link.torque_withheld = True
+
+    def guard(self) -> None:
+        """Let the guardian watch, before torque goes on; start it the first time.
+
+        Raises:
+            SafetyStop: `make_safe` or `close` was called before, or the guardian has taken over.
+            HardwareLost: It does not start.
+        """
+        if self.halted:
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+        if not self.config.guardian:
+            return
+        link = self.link
+        if link.guardian is None:
+            queries = link.form.torque_queries(link.table.torque, self.ids)
+            times_s = self.config.silence_s, self.config.reply_timeout_s
+            link.guardian = Guardian(link.fd, self._off_packet, queries, *times_s)
+        link.guardian.arm()
+
+    @contextmanager
+    def unguarded(self) -> Iterator[None]:
+        """Take the torque off in this block: the guardian watches until its end, unless it has acted already."""
+        self.armed = False
+        guardian = self.link.guardian
+        if guardian is not None and not guardian.settle():
+            guardian.disarm()  # it has taken over or died: take the torque off all the same
+        yield
+        if guardian is not None:
+            guardian.disarm()
+
+    def make_safe(self) -> None:
+        """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
+
+        It takes no lock because the code that a signal interrupts may hold it. The instruction may collide with an
+        answer on the wire and be lost, so it is sent five times within 8 ms. Torque cannot be switched on again
+        afterwards.
+        """
+        self.halted, self.armed = True, False
+        link = self._link
+        if not self._off_packet or link is None or link.closed:
+            return
+        with suppress(OSError):
+            for repeat in range(_SAFE_REPEATS):
+                time.sleep(_SAFE_PAUSE_S if repeat else 0.0)
+                os.write(link.fd, self._off_packet)
+
+    def stop_if_halted(self) -> None:
+        """Take the torque off once more: what switches it on may have passed `make_safe` on its way."""
+        if self.halted:
+            self.make_safe()
+
+    def close(self) -> None:
+        """Take the torque off, and close the port. Never raises; may be called twice, and before `open`.
+
+        If a servo does not confirm, the guardian goes on trying for 10 s.
+        """
+        link = self._link
+        if link is None or link.closed:
+            return
+        self.halted, self.armed = True, False
+        guardian = link.guardian
+        if guardian is not None:
+            guardian.settle()
+        left = [servo_id for servo_id in self.models if not self.release(servo_id)]
+        if left:
+            _LOGGER.error("servos %s did not confirm that their torque is off", left)
+        link.close()
+        if guardian is not None:
+            guardian.end(confirmed=not left)
+        atexit.unregister(self.close)
+
+    def release(self, servo_id: int) -> bool:
+        """Take a servo's torque off, and return whether it has confirmed; never raises."""
+        return self.link.force(servo_id, self.link.table.torque, 0)

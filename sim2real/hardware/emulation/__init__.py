@@ -1,0 +1,1 @@
+"""Emulated servos on an emulated bus, in a process of their own."""

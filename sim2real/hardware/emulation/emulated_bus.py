@@ -1,0 +1,338 @@
+"""The core of emulated half-duplex buses, computed in planned time: what does not depend on a protocol.
+
+The times of all events are computed from the times at which the host's bytes arrive, and do not depend on how late the
+emulator's process runs: an instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud;
+the values that it reads are those of one sensing latency earlier, and its commands take effect one actuation latency
+later.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Final, Protocol
+
+from sim2real.hardware.emulation.settings import Emulation
+from sim2real.hardware.emulation.truth import Kind, TruthLog
+from sim2real.hardware.plant import OperatingMode, Plant, PlantClock
+
+_STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
+
+Sample = tuple[int, tuple[float, float, float]]
+"""When values were sampled [ns], and position [rad], velocity [rad/s] and load."""
+
+
+@dataclass
+class Request:
+    """An instruction that was received.
+
+    Attributes:
+        packet: The instruction.
+        t_ns: When it was complete on the wire.
+        t_host_ns: When its last bytes had reached the emulator.
+        actuation_ns: Delay until its commands take effect, the same for all servos; None until it is drawn.
+    """
+
+    packet: Any
+    t_ns: int
+    t_host_ns: int
+    actuation_ns: int | None = None
+
+
+class PacketParser(Protocol):
+    """Finds packets in a byte stream that arrives in chunks."""
+
+    def clear(self) -> None:
+        """Forget the beginning of an incomplete packet."""
+        ...
+
+    def feed(self, chunk: bytes) -> list[tuple[Any, int]]:
+        """Return the packets that a chunk completes, each with the number of bytes of it up to the packet's end."""
+        ...
+
+
+class Firmware(Protocol):
+    """Registers and firmware of one servo, without time, bus and physics.
+
+    Attributes:
+        servo_id: Its id on the bus.
+        heard_ns: When it last heard an instruction.
+        watchdog_stops: Whether a tripped watchdog stops the motor.
+    """
+
+    servo_id: int
+    heard_ns: int
+    watchdog_stops: bool
+
+    def command(self) -> tuple[int, float]:
+        """Return mode and goal of the motor, as ``Plant.command`` takes them, according to the registers."""
+        ...
+
+    def controller(self) -> tuple[int, int, float]:
+        """Return the position controller's settings, as ``ConfigurablePlant.configure`` takes them."""
+        ...
+
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
+        """Set the registers of present values.
+
+        Args:
+            position_rad: Angle from the encoder's zero [rad].
+            velocity_rad_s: Speed [rad/s].
+            load: Fraction of the largest load, in [-1, 1].
+            tick_ms: Time since power-up [ms].
+        """
+        ...
+
+    def watchdog_deadline_ns(self) -> int | None:
+        """Return when its watchdog trips if no instruction comes before; None if it has none, or it is not armed."""
+        ...
+
+    def trip_watchdog(self) -> None:
+        """Trip the watchdog."""
+        ...
+
+    def overload(self) -> None:
+        """Shut down as after an overload: torque off, and an error reported from now on."""
+        ...
+
+
+class PlannedBus(ABC):
+    """Emulated servos on a half-duplex bus, driving a plant; without port and threads.
+
+    Times are CLOCK_MONOTONIC nanoseconds. A subclass carries out instructions in `execute`, with the help of `measure`,
+    `actuate`, `configure` and `reply`.
+
+    Args:
+        plant: The mechanism.
+        config: Behaviour of bus and servos.
+        truth: Log of true states and latencies.
+        send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+        start_ns: Time 0 of the plant.
+        now_ns: Clock by which lateness is measured.
+        parser: Finds instructions in the host's bytes.
+        servos: Id -> servo, ordered by id.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        config: Emulation,
+        truth: TruthLog,
+        send: Callable[[bytes], bool],
+        start_ns: int,
+        now_ns: Callable[[], int],
+        parser: PacketParser,
+        servos: Mapping[int, Firmware],
+    ) -> None:
+        self._config = config
+        self._truth = truth
+        self._send = send
+        self._start_ns = start_ns
+        self._now_ns = now_ns
+        self.random = random.Random(config.seed)
+        self._byte_ns = 1e10 / config.baud_rate
+        history_s = config.sensing_latency_s + config.sensing_jitter_s
+        self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), start_ns, round(history_s * 1e9), truth)
+        self._firmware = servos
+        self._controllers: dict[int, tuple[int, int, float]] = {}
+        for servo in servos.values():
+            self.configure(servo)
+        self._last_effect_ns = dict.fromkeys(servos, 0)
+        self._parser = parser
+        self._wire_free_ns = start_ns
+        self._last_bytes_ns = start_ns
+        self._delivered_ns = start_ns
+        self._frozen: dict[int, tuple[float, float, float]] = {}
+        self._fault_ns = None if config.on_signal else start_ns
+        self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._sequence = 0
+        if config.overload_after_s is not None:
+            overload_ns = start_ns + round(config.overload_after_s * 1e9)
+            self._at(overload_ns, self._overload, overload_ns)
+
+    @abstractmethod
+    def execute(self, request: Request) -> None:
+        """Carry out an instruction that is complete on the wire, and reply to it."""
+
+    def feed(self, chunk: bytes, now_ns: int) -> None:
+        """Process bytes that the host has sent; `run_until(now_ns)` must be called next."""
+        if self._silent(now_ns):
+            return
+        if now_ns - self._last_bytes_ns > _STALE_PACKET_NS:
+            self._parser.clear()
+        self._last_bytes_ns = now_ns
+        begin_ns = max(now_ns, self._wire_free_ns)
+        self._wire_free_ns = begin_ns + round(len(chunk) * self._byte_ns)
+        for packet, end in self._parser.feed(chunk):
+            t_ns = begin_ns + round(end * self._byte_ns)
+            self._at(t_ns, self.execute, Request(packet, t_ns, now_ns))
+        # These bytes may have waited because this process was late, which must not trip a servo's watchdog.
+        for servo in self._firmware.values():
+            deadline_ns = servo.watchdog_deadline_ns()
+            if deadline_ns is not None and deadline_ns < self._wire_free_ns:
+                servo.heard_ns += self._wire_free_ns - deadline_ns + 1
+
+    def next_due_ns(self) -> int | None:
+        """Return the time of the next event; None if there is none."""
+        due = [deadline for s in self._firmware.values() if (deadline := s.watchdog_deadline_ns()) is not None]
+        if self._events:
+            due.append(self._events[0][0])
+        return min(due, default=None)
+
+    def run_until(self, t_ns: int) -> None:
+        """Process all events up to `t_ns` in order, and advance the plant to that time."""
+        while (due_ns := self.next_due_ns()) is not None and due_ns <= t_ns:
+            self._clock.advance(due_ns)
+            for servo in self._firmware.values():
+                deadline_ns = servo.watchdog_deadline_ns()
+                if deadline_ns is not None and deadline_ns <= due_ns:
+                    self._trip_watchdog(servo, deadline_ns)
+            while self._events and self._events[0][0] <= due_ns:
+                _, _, action, arguments = heapq.heappop(self._events)
+                action(*arguments)
+        self._clock.advance(t_ns)
+
+    def begin_faults(self, t_ns: int) -> None:
+        """Count the times of faults from now on, ``t_ns``."""
+        self._fault_ns = t_ns
+
+    def unplugged(self, t_ns: int) -> bool:
+        """Return whether the port is gone at a time [ns]."""
+        return self._passed(self._config.unplugged_after_s, t_ns)
+
+    def happens(self, probability: float) -> bool:
+        """Return whether a fault happens; draws no random number if its probability is 0."""
+        return probability > 0.0 and self.random.random() < probability
+
+    def ill(self, probability: float, t_ns: int) -> bool:
+        """Return whether an answer to what came at a time [ns] is late, or wild, with this probability."""
+        return self._passed(self._config.ill_after_s, t_ns) and self.happens(probability)
+
+    def configure(self, servo: Firmware) -> None:
+        """Tell the plant a servo's controller settings if they have changed."""
+        controller = servo.controller()
+        if self._controllers.get(servo.servo_id) != controller:
+            self._controllers[servo.servo_id] = controller
+            self._clock.configure(servo.servo_id, *controller)
+
+    def actuate(self, servo: Firmware, request: Request) -> None:
+        """Let what the servo's registers command now take effect one actuation latency after the request."""
+        config = self._config
+        if request.actuation_ns is None:
+            request.actuation_ns = self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
+        planned_ns = request.t_ns + request.actuation_ns
+        # Commands take effect in the order in which they were sent.
+        planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
+        self._last_effect_ns[servo.servo_id] = planned_ns
+        self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, *servo.command())
+
+    def measure(self, servo: Firmware, t_ns: int) -> Sample:
+        """Set a servo's present values to those of one sensing latency before `t_ns`, and return the true ones."""
+        config = self._config
+        sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
+        values = self._clock.sample(servo.servo_id, sampled_ns)
+        shown = values
+        if self._passed(config.frozen_after_s, t_ns):
+            shown = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
+        servo.refresh(*shown, tick_ms=(t_ns - self._start_ns) // 1_000_000)
+        return sampled_ns, values
+
+    def reply(
+        self, servo_id: int, request: Request, answer: bytes, return_delay_s: float, sample: Sample | None = None
+    ) -> None:
+        """Schedule an answer: sent after the return delay when the wire is free, delivered at its last byte.
+
+        Args:
+            servo_id: The servo that answers.
+            request: What it answers.
+            answer: The bytes.
+            return_delay_s: How long the servo waits before it answers [s].
+            sample: What it has measured, if it answers with present values.
+        """
+        begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
+        self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
+        late_ns = round(self._config.late_s * 1e9) if self.ill(self._config.late, request.t_ns) else 0
+        self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
+        self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo_id, answer, request, sample)
+
+    def _at(self, t_ns: int, action: Callable[..., None], *arguments: Any) -> None:
+        self._sequence += 1
+        heapq.heappush(self._events, (t_ns, self._sequence, action, arguments))
+
+    def _silent(self, t_ns: int) -> bool:
+        return self._passed(self._config.silent_after_s, t_ns)
+
+    def _passed(self, after_s: float | None, t_ns: int) -> bool:
+        """Return whether the time of a fault has come."""
+        return after_s is not None and self._fault_ns is not None and t_ns - self._fault_ns >= after_s * 1e9
+
+    def _delay_ns(self, latency_s: float, jitter_s: float) -> int:
+        return round(1e9 * (latency_s + self.random.uniform(-jitter_s, jitter_s)))
+
+    def _deliver(self, planned_ns: int, servo_id: int, answer: bytes, request: Request, sample: Sample | None) -> None:
+        kind = Kind.REPLY if sample is None else Kind.SAMPLE
+        t_ns, values = sample or (request.t_ns, ())
+        if self.random.random() < self._config.corrupt:
+            position = self.random.randrange(len(answer))
+            answer = answer[:position] + bytes((answer[position] ^ 0x10,)) + answer[position + 1 :]
+        lost = self._silent(planned_ns) or self.random.random() < self._config.reply_loss
+        if lost or not self._send(answer):
+            kind = Kind.LOSS
+        now_ns = self._now_ns()
+        self._truth.write(kind, servo_id, request.t_host_ns, t_ns, now_ns, now_ns - planned_ns, values)
+
+    def _trip_watchdog(self, servo: Firmware, t_ns: int) -> None:
+        self.measure(servo, t_ns)
+        servo.trip_watchdog()
+        self._truth.write(Kind.WATCHDOG, servo.servo_id, 0, t_ns, t_ns, 0)
+        if servo.watchdog_stops:
+            self._stop_motor(servo, t_ns, servo.command()[0])
+
+    def _overload(self, t_ns: int) -> None:
+        for servo in self._firmware.values():
+            servo.overload()
+            self._stop_motor(servo, t_ns, OperatingMode.OFF)
+
+    def _stop_motor(self, servo: Firmware, t_ns: int, mode: int) -> None:
+        """Stop the motor by the servo's own firmware: at once, dropping commands that have not taken effect yet."""
+        self._clock.cancel(servo.servo_id)
+        self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
+
+
+@dataclass(frozen=True)
+class BusEmulation(Emulation):
+    """Settings that know which bus they are for; see `Emulation` for what they are."""
+
+    bus_type: ClassVar[Callable[..., PlannedBus]]
+    """What makes the bus: called with plant, settings, truth, ``send`` and ``start_ns``."""
+
+    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
+        """Return the emulated bus with these settings.
+
+        Args:
+            plant: The mechanism.
+            truth: Log of true states and latencies.
+            send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+            start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
+        """
+        return type(self).bus_type(plant, self, truth, send, start_ns)
+
+
+def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, Any]:
+    """Return the header of a truth file.
+
+    Args:
+        plant: The mechanism.
+        config: Behaviour of bus and servos.
+        start_ns: Time 0 of the plant [ns].
+    """
+    return {
+        "start_ns": start_ns,
+        "config": asdict(config),
+        "servo_ids": list(plant.servo_ids),
+        "state_names": list(plant.state()),
+        "truth": plant.truth(),
+    }

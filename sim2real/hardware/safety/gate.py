@@ -1,0 +1,240 @@
+"""The safety gate: checks and limits every command before it is sent to an actuator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sim2real.errors import SafetyStop, UsageError
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """The limits of commands and measurements.
+
+    Args:
+        limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit].
+        slew_per_s: Largest rate of change of a command [the command's unit per second]; None: no limit.
+        command_timeout_s: Age from which a command is stale [s].
+        max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
+            one value or one per joint [rad/s]; None: not checked.
+        node: Name of the actuator's node, for errors.
+        stale: What replaces a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
+        joints: The joints' names, for errors.
+        stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
+            move, or the robot is stopped; one value or one per joint; above 1: not checked. See
+            `sim2real.hardware.safety.plausibility`.
+        stuck_s: How long it must be driven in each direction without a break [s].
+        freeze_rad_s: A joint that is pushed, moved this fast between two readings, and then reads the same to the count
+            for ``freeze_s``, stops the robot: its encoder has frozen, or it hit something [rad/s].
+        freeze_s: See there [s].
+        envelope_rad: Measured positions beyond which the robot is stopped, (low, high), each one value or one per joint
+            [rad]; None: not checked.
+        max_sample_age_s: Age of the newest measurement above which nothing is commanded any more [s].
+        stop_s: Longest time in which a soft stop brings the robot to rest [s].
+    """
+
+    limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
+    slew_per_s: float | None = None
+    command_timeout_s: float = 0.1
+    max_speed_rad_s: float | Sequence[float] | None = None
+    node: str = "actuator"
+    stale: Literal["zero", "hold"] = "zero"
+    joints: tuple[str, ...] = ()
+    stuck_effort: float | Sequence[float] = 0.2
+    stuck_s: float = 0.2
+    freeze_rad_s: float = 2.0
+    freeze_s: float = 0.05
+    envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
+    max_sample_age_s: float = 0.25
+    stop_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check that all limits are in their ranges and fit each other."""
+        low, high = self.range
+        if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
+        if not np.all(low <= high):
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
+        if self.stale == "zero" and not np.all((low <= 0.0) & (high >= 0.0)):
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
+        if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
+            raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
+        positive = ("command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s", "max_sample_age_s", "stop_s")
+        for name in ("slew_per_s", "freeze_rad_s", "freeze_s", *positive):
+            value = getattr(self, name)
+            if value is not None and not np.all(np.asarray(value) > 0.0):
+                raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")
+
+    def joint(self, index: int) -> str:
+        """Return a joint's name for errors."""
+        return f"joint {self.joints[index]!r}" if index < len(self.joints) else f"joint {index}"
+
+    @property
+    def range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest command, each of shape () or (n,)."""
+        low, high = self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
+        return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+
+
+@dataclass
+class GateCounts:
+    """How often the gate was passed, and how often each of its limits changed a command.
+
+    Args:
+        passed: Calls that returned a command.
+        clamped: Calls with a value outside the limit.
+        slewed: Calls with a change that was too fast.
+        stale: Calls with a command that was too old.
+        cut: For each actuator, calls in which a limit changed its command.
+        low: For each actuator, the lowest command that was returned.
+        high: The highest.
+        total: The sum of all.
+    """
+
+    passed: int = 0
+    clamped: int = 0
+    slewed: int = 0
+    stale: int = 0
+    cut: list[int] = field(default_factory=list)
+    low: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+    total: list[float] = field(default_factory=list)
+
+    def add(self, allowed: np.ndarray, cut: np.ndarray) -> None:
+        """Count a command that was returned ``(n,)``, and for which actuators a limit had changed it."""
+        before = (self.low, self.high, self.total, self.cut) if self.passed else (allowed, allowed, 0.0, 0)
+        self.low, self.high = np.minimum(before[0], allowed).tolist(), np.maximum(before[1], allowed).tolist()
+        self.total, self.cut = np.add(before[2], allowed).tolist(), np.add(before[3], cut).tolist()
+        self.passed += 1
+
+
+class SafetyGate:
+    """Clamps commands of one or several actuators, limits their rate of change, and replaces stale ones.
+
+    Once it has raised SafetyStop, every later call raises it again, until `reset`.
+
+    Args:
+        config: The limits.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self.config = config
+        self._low, self._high = config.range
+        self.reset()
+
+    def reset(self, start: np.ndarray | None = None) -> None:
+        """Start again, with counts at zero and no stop.
+
+        Args:
+            start: Shape (n,): the command that the robot follows now, from which the slew limit starts; it may be
+                outside the limits. None: zero, not allowed if stale commands are replaced by the last one.
+        """
+        self.counts = GateCounts()
+        self._last = None if start is None else np.array(start, dtype=np.float64, ndmin=1)
+        self._last_s: float | None = None
+        self._stop: SafetyStop | None = None
+        if self._last is not None:
+            self._require_finite("start", self._last)
+            self._require_shape(self._last)
+
+    @property
+    def fallback(self) -> np.ndarray:
+        """What would replace a stale command now, float64 of shape (n,).
+
+        Raises:
+            UsageError: There was neither a `start` nor a command yet.
+        """
+        if self._last is None:
+            raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
+        return np.zeros_like(self._last) if self.config.stale == "zero" else self._last.copy()
+
+    def apply(
+        self, command: np.ndarray, age_s: float, now_s: float, speed_rad_s: np.ndarray | float | None = None
+    ) -> np.ndarray:
+        """Return the command that may be sent.
+
+        A stale command is replaced by zero or by the last command, as configured; the slew limit does not apply to
+        that.
+
+        Args:
+            command: Shape (n,): the policy's command.
+            age_s: Time since the policy computed it [s]; NaN counts as stale.
+            now_s: A monotonic time, for the slew limit [s].
+            speed_rad_s: Shape (n,) or scalar: measured speeds [rad/s]; None: not checked.
+
+        Returns:
+            Shape (n,), float64.
+
+        Raises:
+            SafetyStop: A value is not finite, or a speed is above its limit.
+            UsageError: The number of commands differs from that of the limits, or there is no last command to hold.
+        """
+        if self._stop is not None:
+            raise self._stop
+        wanted = np.array(command, dtype=np.float64, ndmin=1)
+        self._require_finite("command", wanted)
+        self._require_slow(speed_rad_s)
+        if self._last is None and self.config.stale == "zero":
+            self._last = np.zeros_like(wanted)
+        fallback = self.fallback
+        self._require_shape(wanted)
+        if not age_s <= self.config.command_timeout_s:
+            self.counts.stale += 1
+            allowed, cut = fallback, np.zeros(wanted.shape, bool)
+        else:
+            allowed = self._slew(self._clamp(wanted), now_s)
+            cut = allowed != wanted
+        self._last, self._last_s = allowed, now_s
+        self.counts.add(allowed, cut)
+        return allowed.copy()
+
+    def _clamp(self, wanted: np.ndarray) -> np.ndarray:
+        clamped = np.clip(wanted, self._low, self._high)
+        self.counts.clamped += bool(np.any(clamped != wanted))
+        return clamped
+
+    def _slew(self, wanted: np.ndarray, now_s: float) -> np.ndarray:
+        if self.config.slew_per_s is None or self._last is None:
+            return wanted
+        elapsed_s = 0.0 if self._last_s is None else max(0.0, now_s - self._last_s)
+        if self.config.stale == "hold":
+            # The robot held its position meanwhile: a long pause must not allow a large jump.
+            elapsed_s = min(elapsed_s, self.config.command_timeout_s)
+        largest = self.config.slew_per_s * elapsed_s
+        slewed = np.clip(wanted, self._last - largest, self._last + largest)
+        self.counts.slewed += bool(np.any(slewed != wanted))
+        return slewed
+
+    def _require_shape(self, values: np.ndarray) -> None:
+        for other in (self._low, self._high, self._last):
+            if other is not None and other.ndim and other.shape != values.shape:
+                raise UsageError(
+                    f"gate of {self.config.node!r}: commands of shape {values.shape}, limits or start of {other.shape}"
+                )
+
+    def _require_finite(self, what: str, values: np.ndarray) -> None:
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            index = int(bad[0])
+            self._halt(f"{what}[{index}] = {values[index]} is not finite")
+
+    def _require_slow(self, speed_rad_s: np.ndarray | float | None) -> None:
+        limit = self.config.max_speed_rad_s
+        if limit is None or speed_rad_s is None:
+            return
+        speeds = np.array(speed_rad_s, dtype=np.float64, ndmin=1)
+        self._require_finite("speed_rad_s", speeds)
+        limits = np.broadcast_to(np.asarray(limit, np.float64), speeds.shape)
+        index = int(np.argmax(np.abs(speeds) / limits))
+        if math.fabs(speeds[index]) > limits[index]:
+            what = f"speed_rad_s[{index}] = {speeds[index]:.4g} of {self.config.joint(index)}"
+            self._halt(f"{what} is beyond the limit of {limits[index]:.4g} rad/s")
+
+    def _halt(self, reason: str) -> None:
+        self._stop = SafetyStop(f"node {self.config.node!r} stopped: {reason}")
+        raise self._stop

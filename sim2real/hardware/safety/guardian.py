@@ -1,0 +1,228 @@
+"""The guardian as seen from the control process: starts it, sends it signs of life, and reads its messages."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.hardware.safety import guardian_process as process
+
+_START_TIMEOUT_S: Final = 10.0
+_SETTLE_TIMEOUT_S: Final = 1.0
+_BEATS: Final = 10  # signs of life per allowed silence
+_INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
+# Send buffer for about 50 unread signs of life (on Linux 770 bytes each, of twice this size); when it is full, the
+# guardian hangs.
+_UNHEARD_BYTES: Final = 20_000
+# Longest time without an answer to a sign of life. A guardian that is stopped is noticed at the next one; this is for
+# what the kernel does not report, such as a debugger: so long a busy machine lets no process wait that is due.
+_HEARD_S: Final = 0.5
+_DEAD: Final = "the guardian has died or was stopped: nothing would take the torque off if this process died too"
+
+
+class Guardian:
+    """A separate process that takes the torque off when this one dies, or gives no sign of life while torque is on.
+
+    It shares the open port and its lock, so that no other process gets the port before the torque is off. In normal
+    operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian that died
+    or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel lets it
+    continue (Linux), and it takes the torque off. It reports on stderr what it did.
+
+    Args:
+        port_fd: File descriptor of the open port.
+        off: The packet that takes the torque of all servos off.
+        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
+        silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
+            counts.
+        answer_s: How long a servo's answer may take [s].
+
+    Raises:
+        HardwareLost: It does not start.
+    """
+
+    def __init__(
+        self,
+        port_fd: int,
+        off: bytes,
+        servos: Sequence[tuple[bytes, Sequence[bytes]]],
+        silence_s: float,
+        answer_s: float,
+    ) -> None:
+        self._silence_s = silence_s
+        self._interval_s = silence_s / _BEATS or _INTERVAL_S
+        self._beat_s = 0.0
+        self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
+        self._armed = False
+        self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
+        self._said = b""
+        self._link, other = socket.socketpair()
+        self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
+        longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
+        numbers = [str(port_fd), str(other.fileno()), repr(longest_s), repr(answer_s)]
+        # -I -S: neither the user's site packages nor the working directory may affect what runs here.
+        command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, off.hex()]
+        command += [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
+        try:
+            # In a new session, so that Ctrl-C in a terminal reaches only the control process.
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=(port_fd, other.fileno()),
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._link.close()
+            raise HardwareLost(
+                f"the guardian cannot be started: {error}", hint="torque stays off without it"
+            ) from error
+        finally:
+            other.close()
+        if not self._hears(process.READY, _START_TIMEOUT_S):
+            self._process.kill()
+            self.end(confirmed=True)
+            raise HardwareLost("the guardian does not start", hint="torque stays off without it")
+        self._said = b""
+        self._link.setblocking(False)
+
+    @property
+    def pid(self) -> int:
+        """The guardian's process id."""
+        return self._process.pid
+
+    def arm(self) -> None:
+        """Let it watch for silence from now on; called before torque goes on.
+
+        Raises:
+            SafetyStop: As in `beat`.
+        """
+        with self._lock:
+            self._armed, self._beat_s, self._unheard_s = True, 0.0, None
+        try:
+            self.beat()
+        except SafetyStop:
+            self._armed = False
+            raise
+
+    def disarm(self) -> None:
+        """Let it no longer watch for silence, as torque is off. Never raises; if it has died, the next `arm` raises."""
+        with self._lock, suppress(SafetyStop):  # locked, as a sign of life sent after this message would arm it again
+            self._armed = False
+            self._say(process.REST)
+
+    def beat(self) -> None:
+        """Send a sign of life if one is due; called before every instruction on the bus.
+
+        Raises:
+            SafetyStop: The guardian has taken the torque off, or has died; also at all later calls.
+        """
+        with self._lock:
+            now_s = time.monotonic()
+            if not self._armed or (not self._said and now_s - self._beat_s < self._interval_s):
+                return
+            self._beat_s = now_s
+            self._listen()
+            if not self._said:
+                self._require_running(now_s)
+                self._say(process.BEAT)
+                self._unheard_s = now_s if self._unheard_s is None else self._unheard_s
+                return
+        raise SafetyStop(
+            f"the guardian has taken the torque off: this process was silent for {self._silence_s:g} s",
+            hint="was it stopped, or the machine too busy? servo_watchdog_s sets the limit",
+        )
+
+    def require_watching(self) -> None:
+        """Raise SafetyStop, as `beat` does, but whether or not a sign of life is due: asked when the bus seems lost.
+
+        A guardian that takes over asks the servos itself, and their answers are missed here.
+        """
+        self._beat_s = 0.0
+        self.beat()
+
+    def settle(self) -> bool:
+        """Wait until it has finished taking the torque off, if it is doing so. Never raises.
+
+        Returns:
+            Whether it is still watching: it has neither taken over nor died, and was not stopped.
+        """
+        try:
+            with self._lock:
+                self._listen()
+                if not self._said:
+                    self._require_running(time.monotonic())
+        except SafetyStop:
+            return False
+        if self._said and process.SAFE not in self._said:
+            self._hears(process.SAFE, _SETTLE_TIMEOUT_S)
+        return not self._said
+
+    def end(self, confirmed: bool) -> None:
+        """End the guardian. Never raises.
+
+        Args:
+            confirmed: Whether all servos have confirmed that their torque is off; if not, it goes on trying for 10 s.
+        """
+        if confirmed:
+            with suppress(SafetyStop):
+                self._say(process.LEAVE)
+        self._link.close()
+        if not confirmed:
+            return
+        try:
+            self._process.wait(_SETTLE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _say(self, message: bytes) -> None:
+        try:
+            self._link.send(message)
+        except OSError as error:  # it has died, or does not read
+            raise SafetyStop(_DEAD, hint="start again") from error
+
+    def _require_running(self, now_s: float) -> None:
+        """Raise SafetyStop if the guardian was stopped, or has not answered for long."""
+        stopped = self._unheard_s is not None and now_s - self._unheard_s > _HEARD_S
+        if not stopped and hasattr(os, "waitid"):
+            with suppress(ChildProcessError):  # it has ended, and its socket is closed: `_say` notices
+                flags = os.WSTOPPED | os.WNOHANG | os.WNOWAIT
+                stopped = os.waitid(os.P_PID, self._process.pid, flags) is not None
+        if stopped:
+            raise SafetyStop(_DEAD, hint="start again")
+
+    def _listen(self) -> None:
+        """Read the guardian's messages; raise SafetyStop if it has died."""
+        while True:
+            try:
+                said = self._link.recv(256, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return
+            except OSError:
+                said = b""
+            if not said:
+                raise SafetyStop(_DEAD, hint="start again")
+            if process.HEARD in said:
+                self._unheard_s = None
+            self._said += said.replace(process.HEARD, b"")
+
+    def _hears(self, message: bytes, timeout_s: float) -> bool:
+        """Wait for a message, for a report of failure, or for the guardian's death; return whether the message came."""
+        end_s = time.monotonic() + timeout_s
+        with suppress(SafetyStop):
+            while message not in self._said and process.FAILED not in self._said:
+                left_s = end_s - time.monotonic()
+                if left_s <= 0.0 or not select.select([self._link], [], [], left_s)[0]:
+                    break
+                self._listen()
+        return message in self._said

@@ -1,0 +1,171 @@
+"""The guardian process: takes the torque off when the process that controls the servos has died or is silent.
+
+    python -I -S guardian_process.py PORT_FD LINK_FD SILENCE_S ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
+
+It has the port open from before torque goes on, and writes to it only when the control process no longer does. It
+imports little, so that it starts within 20 ms, and knows no protocol: `sim2real.hardware.safety.guardian` passes the
+packets as hexadecimal arguments.
+"""
+
+import os
+import select
+import signal
+import sys
+import time
+
+READY, BEAT, REST, LEAVE = b"r", b"+", b"-", b"q"
+HEARD, TRIPPED, SAFE, FAILED = b".", b"t", b"s", b"f"
+GIVE_UP_S = 10.0
+_QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
+_PRIORITY = 3  # above the threads that it watches, which have 1: should one never rest, this must not wait for it
+
+
+class Guard:
+    """Decides when to take the torque off, and does it.
+
+    Args:
+        port_fd: File descriptor of the open port.
+        answer_s: How long a servo's answer may take [s].
+        off: The packet that takes the torque of all servos off.
+        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
+    """
+
+    def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
+        self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
+
+    def watch(self, link: int, silence_s: float) -> None:
+        """Wait until the control process says goodbye; act when it dies, or is silent for too long with torque on.
+
+        Args:
+            link: File descriptor of the socket to the control process.
+            silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
+        """
+        armed, tripped, heard_s = False, False, time.monotonic()
+        _write(link, READY)
+        while True:
+            watched = armed and not tripped and silence_s > 0.0
+            wait_s = max(0.0, heard_s + silence_s - time.monotonic()) if watched else None
+            if select.select([link], [], [], wait_s)[0]:  # messages first: this process may be late itself
+                said = _hear(link)
+                if said.endswith(LEAVE):
+                    return
+                if not said:
+                    self.make_safe("the control process is gone")
+                    return
+                armed, heard_s = said.endswith(BEAT), time.monotonic()
+                if armed:
+                    _write(link, HEARD)
+            elif watched and time.monotonic() - heard_s >= silence_s:
+                # Stay until the control process leaves: it may resume, and switch torque on before it notices.
+                tripped = True
+                _write(link, TRIPPED)
+                confirmed = self.make_safe(f"the control process was silent for {silence_s:.2f} s")
+                _write(link, SAFE if confirmed else FAILED)
+
+    def make_safe(self, reason: str) -> bool:
+        """Take the torque off, report it on stderr, and return whether all servos have confirmed."""
+        begin_s = time.monotonic()
+        failure = self._take_torque_off()
+        took_ms = 1e3 * (time.monotonic() - begin_s)
+        if failure:
+            said = f"torque off could NOT be confirmed, {failure}; cut the servos' power"
+        else:
+            said = f"torque is off, confirmed after {took_ms:.0f} ms"
+        _write(2, f"sim2real guardian: {reason}: {said}\n".encode())
+        return not failure
+
+    def _take_torque_off(self) -> str:
+        """Switch all servos off, repeatedly until each has confirmed; return the reason if that failed, else "".
+
+        Repeated, because the first packet is lost if the control process died while it was writing one, and because
+        the control process, if it resumes, may read an answer in place of this one.
+        """
+        end = time.monotonic() + GIVE_UP_S
+        left = self._servos
+        try:
+            self._drain()
+            while left and time.monotonic() < end:
+                self._send(self._off)
+                left = [(query, answers) for query, answers in left if not self._confirms(query, answers)]
+        except OSError as error:
+            return f"the port failed: {error}"
+        return f"{len(left)} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if left else ""
+
+    def _drain(self) -> None:
+        """Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer."""
+        end = time.monotonic() + _LONGEST_ANSWER_S
+        while time.monotonic() < end and self._receive(_QUIET_S):
+            pass
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            os.write(self._fd, packet)
+        except BlockingIOError:  # the buffer is full: the packet is lost, and sent again in the next round
+            time.sleep(_QUIET_S)
+
+    def _confirms(self, query: bytes, answers: list[bytes]) -> bool:
+        self._send(query)
+        end, heard = time.monotonic() + self._answer_s, b""
+        while (left_s := end - time.monotonic()) > 0.0:
+            heard += self._receive(left_s)
+            if any(answer in heard for answer in answers):
+                return True
+        return False
+
+    def _receive(self, wait_s: float) -> bytes:
+        if not select.select([self._fd], [], [], wait_s)[0]:
+            return b""
+        try:
+            data = os.read(self._fd, 4096)
+        except BlockingIOError:  # the control process has resumed and read it
+            return b""
+        if not data:
+            raise OSError("it has been unplugged")
+        return data
+
+
+def _hear(link: int) -> bytes:
+    """Return the control process' messages; empty if it has died."""
+    try:
+        return os.read(link, 4096)
+    except OSError:
+        return b""
+
+
+def _write(fd: int, message: bytes) -> None:
+    """Write to the control process or the terminal, if it still exists."""
+    try:  # noqa: SIM105 - importing contextlib takes a third of the start
+        os.write(fd, message)
+    except OSError:
+        pass
+
+
+def continue_when_host_dies() -> None:
+    """Let the kernel continue this process, should it be stopped, when the control process dies (Linux)."""
+    try:
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+    except (ImportError, OSError, AttributeError):  # on other systems nothing continues it
+        pass
+
+
+def main(arguments: list[str]) -> None:
+    """Run until the control process ends."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    try:  # noqa: SIM105 - as above
+        # Real-time priority, if allowed: on a busy machine this process, which is almost always idle, must not wait.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    except (AttributeError, OSError):
+        pass
+    continue_when_host_dies()
+    port_fd, link, silence_s, answer_s, off, *rest = arguments
+    packets = [text.partition(":") for text in rest]
+    servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
+    Guard(int(port_fd), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,165 @@
+"""Checks whether measured positions are physically possible: no jumps, and no standstill under changing torque."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim2real.errors import SafetyStop
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.leaps import STAMP_S, reach_rad
+
+_KEPT = 0.5
+"""The share of its speed that a joint surely keeps from one reading to the next."""
+_HARD = 10.0
+"""A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
+
+
+class Plausibility:
+    """Checks measured positions against the gate's limits.
+
+    **Jumps.** If a position changes by more than ``max_speed_rad_s`` times the time since the last sample, plus the
+    uncertainty of times and readings, the robot is stopped.
+
+    **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
+    same to the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead. "Surely": between two
+    samples more time may have passed than between their stamps, since the first may have been an older one and the
+    second may have been taken as late as its answer came. An encoder that freezes just after a reading moves by next to
+    nothing until the following one: half the speed from the reading before counts there, too.
+
+    **Envelope.** A position outside of ``envelope_rad`` stops the robot.
+
+    **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
+    holding, with friction, and at a stop. "Push" is the torque that the command asks for:
+
+    - A joint that stands still although it was pushed in both directions, each with more than ``stuck_effort`` of its
+      torque for ``stuck_s`` without a break, is not plausible: the robot is stopped.
+    - If the push has changed by twice that for ``stuck_s``, the joint may lie against something: it is suspicious.
+    - If it was pushed in one direction with twice that for ten times ``stuck_s``, it may hold a weight: it is
+      suspicious.
+
+    Suspicious joints do not stop the robot; they are listed in ``suspects``.
+
+    Args:
+        config: The gate's limits.
+
+    Attributes:
+        suspects: Descriptions of what was suspicious since ``reset``.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self._config = config
+        self._enough_s = config.stuck_s * np.array([[1.0], [1.0], [1.0], [_HARD], [_HARD]])
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all measurements; called when torque goes on or off."""
+        self.suspects: list[str] = []
+        self._t_s: float | None = None
+        self._unsure_s = 0.0
+        self._position = self._since_s = self._start = self._speed = self._before = self._held_s = self._longest_s = (
+            np.zeros(0)
+        )
+
+    def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+        """Check a measurement.
+
+        Args:
+            position_rad: Shape (n,): the joints' positions [rad].
+            t_s: When they were measured [s].
+            unsure_s: Uncertainty of that time [s].
+            effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
+
+        Raises:
+            SafetyStop: A position jumped or lies outside of the envelope, or a joint stands still although it was
+                pushed in both directions.
+        """
+        self._require_inside(position_rad)
+        if self._t_s is None or len(position_rad) != len(self._position):
+            self._begin(position_rad, t_s, unsure_s, effort)
+            return
+        elapsed_s = max(0.0, t_s - self._t_s)
+        self._require_reachable(position_rad, elapsed_s + unsure_s + self._unsure_s)
+        self._t_s, self._unsure_s = t_s, unsure_s
+        moved = position_rad != self._position
+        if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
+            speed = np.abs(position_rad - self._position) / (elapsed_s + STAMP_S + unsure_s)
+            self._speed[moved] = np.maximum(speed, _KEPT * self._before)[moved]
+            self._before = speed
+        self._position = position_rad.copy()
+        self._since_s[moved], self._start[moved] = t_s + unsure_s, effort[moved]
+        self._require_no_freeze(t_s, effort)
+        self._held_s[:, moved] = self._longest_s[:, moved] = 0.0
+        self._require_motion(effort, elapsed_s)
+
+    def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+        n = len(position_rad)
+        self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
+        # Of each joint [rad/s]: before it stood still, and between the last two samples.
+        self._speed, self._before = np.zeros(n), np.zeros(n)
+        self._since_s, self._start = np.full(n, t_s), effort.copy()
+        # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
+        # differs from that at the start of the standstill, pushed hard up, pushed hard down.
+        self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+        fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
+        self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
+        self._stuck = np.broadcast_to(np.asarray(self._config.stuck_effort, np.float64), n)
+
+    def _require_inside(self, position_rad: np.ndarray) -> None:
+        if self._config.envelope_rad is None:
+            return
+        low, high = (np.broadcast_to(np.asarray(e, np.float64), position_rad.shape) for e in self._config.envelope_rad)
+        beyond = np.maximum(low - position_rad, position_rad - high)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > 0.0:
+            raise SafetyStop(
+                f"{self._config.joint(worst)} is at {position_rad[worst]:.4g} rad, outside of its envelope, "
+                f"{low[worst]:.4g} to {high[worst]:.4g} rad",
+                hint="bring it back by hand; envelope_rad sets what is allowed",
+            )
+
+    def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
+        limit = self._fastest
+        most = reach_rad(limit, elapsed_s)
+        leap = np.abs(position_rad - self._position)
+        if (leap > most).any():
+            worst = int(np.argmax(leap - most))
+            raise SafetyStop(
+                f"{self._config.joint(worst)} reads {position_rad[worst]:.6g} rad, {leap[worst]:.6g} rad from the last "
+                f"reading: at its fastest, {limit[worst]:.4g} rad/s, it can have moved by {most[worst]:.3g} rad",
+                hint="look at the encoder and the cable; max_speed_rad_s sets what is possible",
+            )
+
+    def _require_no_freeze(self, t_s: float, effort: np.ndarray) -> None:
+        fast = self._speed > self._config.freeze_rad_s
+        if not fast.any():
+            return
+        still = t_s - self._since_s >= self._config.freeze_s
+        for i in np.flatnonzero(fast & still & (effort != 0.0)):
+            raise SafetyStop(
+                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s or more just before",
+                hint="is its encoder stuck, or did it hit something? freeze_rad_s sets the limit",
+            )
+
+    def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
+        limit, more = self._stuck, 2.0 * self._stuck
+        other = np.abs(effort - self._start) >= more
+        pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
+        self._held_s = (self._held_s + elapsed_s) * pushed
+        before = self._longest_s
+        self._longest_s = np.maximum(before, self._held_s)
+        long = self._longest_s >= self._enough_s
+        if not long.any():
+            return
+        was_long = before >= self._enough_s
+        for i in np.flatnonzero(long[0] & long[1]):
+            raise SafetyStop(
+                f"{self._standing(int(i))}, though it was pushed both ways with more than {limit[i]:.0%} of its torque",
+                hint="is it blocked, its encoder stuck, its supply off? stuck_effort sets the limit",
+            )
+        for i in np.flatnonzero(long[2:].any(axis=0) & ~was_long[2:].any(axis=0)):
+            how = "what pushes it changed by" if long[2, i] else "it is pushed with"
+            self.suspects.append(f"{self._standing(int(i))}, though {how} {more[i]:.0%} of its torque")
+
+    def _standing(self, index: int) -> str:
+        lasted_s = (self._t_s or 0.0) - self._since_s[index]
+        return f"{self._config.joint(index)} has read {self._position[index]:.6g} rad for {lasted_s:.2f} s"

@@ -1,0 +1,1 @@
+"""Whether a later log is still of the robot that was identified."""

@@ -1,0 +1,1 @@
+"""Recordings as segments with residuals, and the compiled programs that evaluate them."""

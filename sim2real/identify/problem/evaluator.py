@@ -1,0 +1,181 @@
+"""How the residuals of a problem are evaluated: by compiled programs, or on C MuJoCo between two programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.identify.problem.programs import OnCompile
+from sim2real.identify.problem.residuals import LinearisedSegments, SegmentResiduals
+from sim2real.identify.problem.robust import tamed
+from sim2real.identify.problem.segments import Data
+
+Stacked = Callable[[np.ndarray], np.ndarray]
+
+
+class Evaluator(Protocol):
+    """Evaluates residuals; arrays are padded as ``Data`` is.
+
+    Attributes:
+        precision: Relative change of the loss below which a descent sees rounding, or the noise of finite differences.
+        fresh: Whether ``around`` linearises initial states at every point again.
+    """
+
+    precision: float
+    fresh: bool
+
+    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
+        """Return the residuals of the fitted segments and their derivatives at a point.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            data: What is fitted.
+            on_compile: Called around a compilation.
+        """
+        ...
+
+    def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
+        """Return the loss at a point, initial states linearised there.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            data: What is fitted.
+            on_compile: Called around a compilation.
+        """
+        ...
+
+    def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
+        """Return functions of points ``(P,)`` near ``z`` for a descent.
+
+        Returns:
+            The first returns the residuals with the robust loss ``(N,)``, those of priors behind them; the second
+            their Jacobian ``(N, P)``.
+        """
+        ...
+
+    def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
+        """Return the loss of each candidate, ``(N,)``, their initial states linearised around one point.
+
+        Args:
+            candidates: Shape ``(N, P)``.
+            around: Shape ``(P,)``.
+            data: What is fitted.
+        """
+        ...
+
+    def searched(self, data: Data) -> Any:
+        """Return the losses of a generation, as ``search`` takes them."""
+        ...
+
+    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
+        """Return the residuals ``(R, K, F)`` of segments whose initial states are fitted to their first parts.
+
+        Args:
+            values: Parameters by name, ``(R, ...)``.
+            eps: Shape ``(R,)``: numbers of the segments.
+            fit_s: Shape ``(R,)``: lengths of the first parts [s].
+            data: The recordings.
+        """
+        ...
+
+    def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
+        """Return the robust residuals ``(G, S, K, F)`` with some values given.
+
+        Args:
+            z: Shape ``(P,)``: initial states are linearised there.
+            rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
+            data: What is fitted.
+        """
+        ...
+
+
+class CompiledEvaluator:
+    """Evaluates the residuals by programs that hold the rollouts.
+
+    Args:
+        residuals: The residuals.
+    """
+
+    precision, fresh = 1e-6, True
+
+    def __init__(self, residuals: SegmentResiduals) -> None:
+        self._residuals = residuals
+        self._last: tuple[bytes, Data, LinearisedSegments] | None = None
+
+    def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
+        """See ``Evaluator``; the last point is kept: descents ask for value, derivative and loss in turn."""
+        point = np.asarray(z, np.float32)
+        if self._last is None or self._last[0] != point.tobytes() or self._last[1] is not data:
+            program = self._residuals.program("linearised", self._residuals.linearised)
+            self._last = point.tobytes(), data, program(point, data, on_compile=on_compile)
+        return self._last[2]
+
+    def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
+        """See ``Evaluator``."""
+        return float(self.linearised(z, data, on_compile).loss)
+
+    def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
+        """See ``Evaluator``: initial states are linearised at every point again."""
+        return lambda y: stacked(self.linearised(y, data))[0], lambda y: stacked(self.linearised(y, data))[1]
+
+    def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
+        """See ``Evaluator``."""
+        program = self._residuals.program("losses", self._residuals.losses)
+        return np.asarray(program(_single(candidates), _single(around), data), np.float64)
+
+    def searched(self, data: Data) -> Any:
+        """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""
+        del data
+        return self._residuals.losses
+
+    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
+        """See ``Evaluator``."""
+        many = jax.vmap(self._residuals.predict, in_axes=(0, 0, 0, None))
+        program = self._residuals.program("predict", many)
+        own = {n: _single(v) for n, v in values.items()}
+        return np.asarray(program(own, jnp.asarray(eps, jnp.int32), _single(fit_s), data), np.float64)
+
+    def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
+        """See ``Evaluator``."""
+        program = self._residuals.program("with_values", self._with_values)
+        return np.asarray(program(_single(z), _single(rows), data), np.float64)
+
+    def _with_values(self, z: Any, rows: Any, data: Data) -> Any:
+        own = self._residuals
+        states = own.initial_states(z, data, data.fitted)
+
+        def one(row: Any) -> Any:
+            values = replaced(own, z, row)
+            r = jax.vmap(lambda e, s: own.projected(values, e, s, data))(data.fitted, states)
+            return tamed(r, own.config.loss, own.config.reach)
+
+        return jax.vmap(one)(rows)
+
+
+def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
+    """Return parameters by name at a point, with some values given; traceable.
+
+    Args:
+        residuals: Has the table.
+        z: Shape ``(P,)``: the point.
+        row: Shape ``(P,)``: values that replace those at ``z``, where they are no NaN.
+    """
+    values = residuals.table.decode(z)
+    for i, c in enumerate(residuals.table.columns):
+        if c.recording is None:
+            values[c.label] = jnp.where(jnp.isnan(row[i]), values[c.label], row[i])
+    return values
+
+
+def stacked(at: LinearisedSegments) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals ``(N,)`` and Jacobian ``(N, P)``, those of the priors behind them."""
+    r, J, prior, slope = (np.asarray(a, np.float64) for a in (at.residuals, at.jacobian, at.prior, at.prior_jacobian))
+    return np.concatenate([r.reshape(-1), prior]), np.concatenate([J.reshape(-1, J.shape[-1]), slope])
+
+
+def _single(a: Any) -> jax.Array:
+    return jnp.asarray(np.asarray(a), jnp.float32)

@@ -1,0 +1,183 @@
+"""Initial states of segments that C MuJoCo simulates: Gauss-Newton steps on the host, with derivatives by differences.
+
+Rollouts take the time. Joints of separate kinematic trees move without each other, so that one rollout serves a state
+of each tree; and the states at the last points are kept, as a descent asks for them again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.identify.problem.residuals import STATE_DIFFERENCE, InitialState, SegmentResiduals
+from sim2real.identify.problem.segments import Data
+
+_STEPS = 2
+"""Gauss-Newton steps of an initial state; they share the derivatives of the first point."""
+_KEPT = 3
+"""Points whose states are kept: a descent evaluates its end, then begins its next round there."""
+_RESPONDS = 1e-9
+"""Share of the largest derivative below which a residual does not depend on a state: decoupled ones are exactly 0."""
+Errors = Callable[[Mapping[str, np.ndarray], np.ndarray, np.ndarray, Data], np.ndarray]
+"""Residuals ``(N, K, F)`` of segments ``(N,)`` with parameters ``(N, ...)`` by name and shifts ``(N, n)``."""
+
+
+class InitialStates:
+    """Fits the initial states of segments.
+
+    Args:
+        residuals: The residuals.
+        errors: Rolls segments out.
+        model: The ``MjModel``.
+    """
+
+    def __init__(self, residuals: SegmentResiduals, errors: Errors, model: Any) -> None:
+        self._errors, self._n = errors, len(residuals.prior)
+        self._groups: list[tuple[int, ...]] | None = None if _trees_are_apart(model) else _each(self._n)
+        self._responds = np.ones((self._n, len(residuals.fields)), bool)
+        self._last: list[tuple[bytes, Data, bool, InitialState]] = []
+
+    def fitted(self, z: np.ndarray, values: Mapping[str, np.ndarray], data: Data, again: bool = False) -> InitialState:
+        """Return the initial states of the segments that have a weight, leaves ``(S, ...)``.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            values: The same by name, ``(1, ...)``.
+            data: What is fitted.
+            again: Whether the derivatives are taken once more, at the states that were found.
+        """
+        for point, own, there, states in self._last:
+            if point == z.tobytes() and own is data and there is again:
+                return states
+        live = np.flatnonzero(np.asarray(data.weight) > 0.0)
+        segments = np.asarray(data.fitted)[live]
+        spread = {n: np.repeat(v, len(live), axis=0) for n, v in values.items()}
+        if again:
+            before = self.fitted(z, values, data)
+            found = InitialState(*(leaf[live] for leaf in before))
+            found = found._replace(slope=self._slopes(spread, segments, found.shift, data)[0])
+        else:
+            found = self.best(spread, segments, np.full(len(live), float(data.length_s)), data, 1)
+        whole = [np.zeros((len(data.fitted), *leaf.shape[1:])) for leaf in found]
+        for leaf, own in zip(whole, found, strict=True):
+            leaf[live] = own
+        states = InitialState(*whole)
+        self._last = [(z.tobytes(), data, again, states), *self._last[: _KEPT - 1]]
+        return states
+
+    def best(
+        self,
+        values: Mapping[str, np.ndarray],
+        eps: np.ndarray,
+        fit_s: np.ndarray,
+        data: Data,
+        steps: int = _STEPS + 1,
+    ) -> InitialState:
+        """Fit the initial states of segments; return shifts, derivatives at no shift, and residuals.
+
+        The residuals are those at the best of the points that the steps lead to.
+
+        Args:
+            values: Parameters of each by name, ``(R, ...)``.
+            eps: Shape ``(R,)``: the segments.
+            fit_s: Shape ``(R,)``: length of the first part of each, to which its state is fitted [s].
+            data: The recordings.
+            steps: How many.
+        """
+        still = np.zeros((len(eps), self._n))
+        slope, errors = self._slopes(values, eps, still, data)
+        ts = np.asarray(data.ts)[eps]
+        counts = ((ts >= 0.0) & (ts <= fit_s[:, None]))[..., None]
+        best = InitialState(still, slope, errors)
+        least, candidate = _cost(best, counts), next_shift(best, counts)
+        for _ in range(steps):
+            here = InitialState(candidate, slope, self._errors(values, eps, candidate, data))
+            cost = _cost(here, counts)
+            better = cost < least
+            shift = np.where(better[:, None], here.shift, best.shift)
+            residuals = np.where(better[:, None, None], here.residuals, best.residuals)
+            best, least = InitialState(shift, slope, residuals), np.where(better, cost, least)
+            # Near kinks, such as friction that sticks, a whole step may make it worse.
+            candidate = np.where(better[:, None], next_shift(best, counts), (candidate + shift) / 2.0)
+        return best
+
+    def _slopes(
+        self, values: Mapping[str, np.ndarray], eps: np.ndarray, shift: np.ndarray, data: Data
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives ``(R, n, K, F)`` by initial states at shifts ``(R, n)``, and residuals ``(R, K, F)``."""
+        groups = self._groups or _each(self._n)
+        member = np.array([[i in group for i in range(self._n)] for group in groups], float)
+        moves = STATE_DIFFERENCE * np.concatenate([np.zeros((1, self._n)), member, -member])
+        spread = {k: np.repeat(v, len(moves), axis=0) for k, v in values.items()}
+        shifts = (shift[:, None] + moves).reshape(-1, self._n)
+        errors = self._errors(spread, np.repeat(eps, len(moves)), shifts, data)
+        errors = errors.reshape(len(eps), len(moves), *errors.shape[1:])
+        count = len(groups)
+        change = (errors[:, 1 : count + 1] - errors[:, count + 1 :]) / (2.0 * STATE_DIFFERENCE)
+        slope = np.empty((len(eps), self._n, *errors.shape[2:]))
+        for i, group in enumerate(groups):
+            for k in group:
+                slope[:, k] = np.where(self._responds[k], change[:, i], 0.0)
+        if self._groups is None:
+            self._groups, self._responds = separated(np.max(np.abs(slope), axis=(0, 2)))
+        return slope, errors[:, 0]
+
+
+def separated(slope: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
+    """Return which columns can be moved together since no residual depends on two of them, and what depends on each.
+
+    Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). A column on which nothing depends here is moved alone,
+    as something may depend on it elsewhere.
+
+    Args:
+        slope: Shape ``(n, F)``: largest derivative of each residual by each column.
+
+    Returns:
+        The groups; and shape ``(n, F)``, bool: which residuals belong to the tree of each column.
+    """
+    responds = slope > _RESPONDS * slope.max(initial=0.0)
+    alone = [i for i in range(len(slope)) if not responds[i].any()]
+    # Columns and residuals that depend on each other, directly or by way of others, are of one tree.
+    edges = np.block([[np.zeros((len(slope),) * 2), responds], [responds.T, np.zeros((slope.shape[1],) * 2)]])
+    label = connected_components(csr_array(edges), directed=False)[1]
+    columns, rows = label[: len(slope)], label[len(slope) :]
+    own = columns[:, None] == rows[None]
+    own[alone] = True
+    trees = [[i for i in np.flatnonzero(columns == k) if i not in alone] for k in np.unique(columns)]
+    groups = [tuple(int(i) for i in group if i is not None) for group in zip_longest(*trees)]
+    return [g for g in groups if g] + [(i,) for i in alone], own
+
+
+def next_shift(at: InitialState, counts: np.ndarray) -> np.ndarray:
+    """Return the shifts ``(R, n)`` after a Gauss-Newton step.
+
+    Args:
+        at: The states, leaves ``(R, ...)``.
+        counts: Shape ``(R, K, 1)``, bool: which measurements they are fitted to.
+    """
+    J = np.where(counts[:, None], at.slope, 0.0).reshape(*at.slope.shape[:2], -1)
+    r = np.where(counts, at.residuals, 0.0).reshape(len(J), -1)
+    H = J @ J.transpose(0, 2, 1) + np.eye(J.shape[1])
+    pull = np.einsum("rnk,rk->rn", J, r) + at.shift
+    return at.shift - np.linalg.solve(np.nan_to_num(H), np.nan_to_num(pull)[..., None])[..., 0]
+
+
+def _cost(at: InitialState, counts: np.ndarray) -> np.ndarray:
+    return np.sum(np.where(counts, at.residuals, 0.0) ** 2, axis=(1, 2)) + np.sum(at.shift**2, axis=1)
+
+
+def _each(n: int) -> list[tuple[int, ...]]:
+    return [(i,) for i in range(n)]
+
+
+def _trees_are_apart(model: Any) -> bool:
+    """Return whether nothing but the bodies between them couples two joints: no contact, equality or tendon."""
+    contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
+    touching = contacts and (model.npair > 0 or bool(np.any(model.geom_contype) and np.any(model.geom_conaffinity)))
+    return model.ntree > 1 and not touching and model.neq == 0 and model.ntendon == 0

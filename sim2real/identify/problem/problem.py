@@ -1,0 +1,243 @@
+"""Recordings cut into segments, with the programs that compute their residuals.
+
+Each segment is simulated with the recorded commands and timing, from an initial state of its own. Every evaluation
+solves for these states: a search is over dynamics and delays alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.schedule import draw
+from sim2real.identify.config import FitConfig
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.engine import check_devices, choose
+from sim2real.identify.problem.evaluator import CompiledEvaluator, Evaluator
+from sim2real.identify.problem.host_evaluator import OutsideEvaluator
+from sim2real.identify.problem.programs import OnCompile
+from sim2real.identify.problem.residuals import SegmentResiduals
+from sim2real.identify.problem.segments import Data, Retimed, Span, cut, data_of
+from sim2real.identify.problem.sizes import padded, rounded
+from sim2real.runtime.compilation.bursts import make_room
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The residuals of the fitted segments at a point, in numpy.
+
+    Attributes:
+        residuals: Shape ``(S, K, F)``, in deviations of the measurement, with the robust loss; 0 where nothing counts.
+        jacobian: Shape ``(S, K, F, P)``: d residual / d z.
+        raw: Shape ``(S, K, F)``: the residuals without the robust loss.
+        prior: Shape ``(Q,)``: the residuals of the priors.
+        prior_jacobian: Shape ``(Q, P)``: their derivatives.
+        loss: Half the mean square of the residuals, and the priors.
+    """
+
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    raw: np.ndarray
+    prior: np.ndarray
+    prior_jacobian: np.ndarray
+    loss: float
+
+
+class Problem:
+    """Segments of recordings, ready to be simulated for any parameters.
+
+    Args:
+        model: The pipeline's model.
+        recordings: The logs.
+        spans: The segments.
+        length_s: Their length [s].
+        config: How residuals are made.
+        table: The parameters; default: the model's.
+        moved: Changes the recorded timing of the segments before it is simulated.
+        like: Another problem of the same model, table and configuration, whose programs this one shares.
+
+    Attributes:
+        residuals: The residuals as functions of parameters and data.
+        evaluator: Evaluates them.
+        data: The segments, as an argument of programs.
+        spans: The segments, recording by recording.
+        segments: How many there are.
+        train: Numbers of the fitted segments.
+
+    Raises:
+        Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
+        UsageError: When a segment holds too few measurements.
+    """
+
+    def __init__(
+        self,
+        model: IdentifiableModel,
+        recordings: Sequence[Episode],
+        spans: Sequence[Span],
+        length_s: float,
+        config: FitConfig = FitConfig(),  # noqa: B008 - frozen
+        table: ParameterTable | None = None,
+        moved: Retimed = lambda recorded: recorded,
+        like: Problem | None = None,
+    ) -> None:
+        self.model, self.config, self._recordings = model, config, recordings
+        self.table = like.table if like else (table or model.parameters).for_recordings(len(recordings))
+        self.residuals = like.residuals if like else self._residuals()
+        nodes = self.residuals.graph.nodes
+        # Commands sent before a segment still act in it, up to the largest delay.
+        cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
+        self.spans, self.segment_s, self.given = cuts.spans, length_s, cuts.given
+        self.timeline = draw(nodes, length_s + model.ahead_s, recorded=moved(cuts.timeline))
+        make_room(nodes, self.timeline)  # after a hiccup commands leave in a burst
+        self.segments = len(cuts.spans)
+        self.begins_s = np.array([s.begin_s for s in cuts.spans])
+        self.recording = np.array([s.recording for s in cuts.spans])
+        self.train = np.flatnonzero([s.fitted for s in cuts.spans])
+        # Before this a measurement shows the world from before the segment's start.
+        from_s = max(config.max_delay_s + 1.0 / min(n.rate for n in nodes.values()), config.skip_s)
+        if not np.any(cuts.ts >= from_s):
+            raise UsageError(
+                f"segments of {length_s:g} s leave nothing to compare after their first {from_s:g} s",
+                hint="make them longer, or max_delay_s or skip_s smaller",
+            )
+        tables = self.residuals.graph.tables(self.timeline, cuts.given)
+        steps = cuts.ts.shape[1]
+        tables[model.sensor] = padded(tables[model.sensor], rounded(steps), axis=1)
+        self.data: Data = data_of(cuts, tables, from_s, len(self.fields), len(self.table))
+        self._measured, self._ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
+        if like is None:
+            self.residuals.choose_derivative(self.data)
+        on_c = self.engine.name == "c"
+        self.evaluator: Evaluator = like.evaluator if like else _evaluator(self.residuals, on_c)
+
+    def _residuals(self) -> SegmentResiduals:
+        nodes = self.model.nodes(self.config.max_delay_s)
+        engine = choose(self.config.engine, nodes, self.model.given, self.config.jacobian)
+        check_devices(self.config.devices, engine)
+        return SegmentResiduals(self.model, nodes, self.table, self.config, engine)
+
+    @property
+    def engine(self) -> Any:
+        """What rolls segments out."""
+        return self.residuals.engine
+
+    @property
+    def channels(self) -> Any:
+        """What is measured."""
+        return self.model.channels
+
+    @property
+    def fields(self) -> Any:
+        """The columns of the residuals: field, deviation, and how to take the channel's entry of it."""
+        return self.residuals.fields
+
+    @property
+    def ts(self) -> np.ndarray:
+        """When each measurement was made ``(E, K)`` [s from the segment's start]; -1 where nothing is compared."""
+        return self._ts
+
+    @property
+    def measurements(self) -> int:
+        """Measured numbers in the fitted segments."""
+        return int(self.data.count)
+
+    def measured(self, column: int) -> np.ndarray:
+        """Return the measurements that a column's residuals compare with, ``(E, K)``."""
+        field, _, entry = self.fields[column]
+        return np.asarray(entry(self._measured[field]))
+
+    def part(self, left_out: Any = (), kept: Any = None) -> Data:
+        """Return the data without some segments, and with some of the parameters.
+
+        Args:
+            left_out: Numbers of the segments that do not count.
+            kept: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
+        """
+        weight = np.asarray(self.data.weight).copy()
+        weight[: len(self.train)][np.isin(self.train, np.asarray(left_out, int))] = 0.0
+        kept = self.data.kept if kept is None else jnp.asarray(np.asarray(kept, bool))
+        return self.data._replace(weight=jnp.asarray(weight), kept=kept)
+
+    def at(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> Evaluation:
+        """Return the residuals of the fitted segments at a point, and their derivatives.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            data: What is fitted; default: all fitted segments.
+            on_compile: Called around a compilation.
+        """
+        found = self.evaluator.linearised(np.asarray(z), self.data if data is None else data, on_compile)
+        count = len(self.train)
+        steps = self._ts.shape[1]
+        r, J, raw = (np.asarray(a, np.float64)[:count, :steps] for a in found[:3])
+        prior, slope = (np.asarray(a, np.float64) for a in (found.prior, found.prior_jacobian))
+        return Evaluation(r, J, raw, prior, slope, float(found.loss))
+
+    def loss(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
+        """Return the loss at a point.
+
+        Args:
+            z: Shape ``(P,)``: the parameters.
+            data: What is fitted; default: all fitted segments.
+            on_compile: Called around a compilation.
+        """
+        return self.evaluator.loss(np.asarray(z), self.data if data is None else data, on_compile)
+
+    def losses(self, candidates: Any, around: Any, data: Data | None = None) -> np.ndarray:
+        """Return the loss of each candidate ``(N,)``, their initial states linearised around one point.
+
+        Args:
+            candidates: Shape ``(N, P)``.
+            around: Shape ``(P,)``.
+            data: What is fitted; default: all fitted segments.
+        """
+        own = self.data if data is None else data
+        return self.evaluator.losses(np.asarray(candidates), np.asarray(around), own)
+
+    def predict(self, values: Any, segments: np.ndarray, fit_s: np.ndarray) -> np.ndarray:
+        """Return the residuals of segments whose initial states are fitted to their first parts, ``(R, K, F)``.
+
+        Args:
+            values: Parameters by name, ``(R, ...)``: each segment with its own.
+            segments: Shape ``(R,)``: their numbers.
+            fit_s: Shape ``(R,)``: lengths of the first parts [s].
+        """
+        # Always as many at a time: one program serves all, and to compile one takes longer than to run it.
+        size = len(self.data.recording)
+        found = []
+        for first in range(0, len(segments), size):
+            rows = np.minimum(np.arange(first, first + size), len(segments) - 1)
+            own = {n: np.asarray(v)[rows] for n, v in values.items()}
+            found.append(self.evaluator.predict(own, segments[rows], fit_s[rows], self.data))
+        return np.concatenate(found)[: len(segments), : self._ts.shape[1]].astype(np.float64)
+
+    def with_values(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the robust residuals of the fitted segments with some values given, ``(G, S, K, F)``.
+
+        Args:
+            z: Shape ``(P,)``: the parameters; initial states are linearised there.
+            rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
+        """
+        found = self.evaluator.with_values(np.asarray(z), rows, self.data)
+        return found[:, : len(self.train), : self._ts.shape[1]]
+
+    def recut(self, spans: Sequence[Span], length_s: float, moved: Retimed = lambda recorded: recorded) -> Problem:
+        """Return the same recordings cut into other segments; it shares the programs.
+
+        Args:
+            spans: The segments.
+            length_s: Their length [s].
+            moved: Changes their recorded timing.
+        """
+        return Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
+
+
+def _evaluator(residuals: SegmentResiduals, on_c: bool) -> Evaluator:
+    return OutsideEvaluator(residuals, residuals.outside) if on_c else CompiledEvaluator(residuals)

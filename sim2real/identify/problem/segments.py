@@ -1,0 +1,293 @@
+"""Recordings cut into segments: the timing, the commands and the measurements of each, padded to one width."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import Vertex
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.problem.sizes import padded, rounded
+
+Retimed = Callable[[Timeline], Timeline]
+"""From segments' recorded timing to another."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part of a recording.
+
+    Attributes:
+        recording: Which recording.
+        begin_s: Where it starts [s].
+        fitted: Whether it is part of the loss; else it is held out.
+    """
+
+    recording: int
+    begin_s: float
+    fitted: bool = True
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Spans of one length, side by side.
+
+    Attributes:
+        spans: E of them.
+        length_s: Their length [s].
+        timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's is ``ahead_s`` later.
+        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        measured: Field -> ``(E, N, ...)``.
+        ts: Shape ``(E, N)``: when each measurement was made [s from the segment's start]; 0 behind the last.
+        starts: Shape ``(E, channels, 4)``: a cubic in time through each channel's measurements around the start.
+    """
+
+    spans: tuple[Span, ...]
+    length_s: float
+    timeline: Timeline
+    given: Mapping[str, Any]
+    measured: Mapping[str, np.ndarray]
+    ts: np.ndarray
+    starts: np.ndarray
+
+
+class Data(NamedTuple):
+    """Segments as an argument of compiled programs: one program serves all recordings whose counts round up alike.
+
+    E is the number of segments, S that of the fitted ones, K that of the sensor's steps; all are rounded up, and what
+    was added repeats the last entry and has no weight.
+
+    Attributes:
+        tables: Timing of the simulated steps, as ``OpenLoopGraph.tables`` returns it.
+        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        measured: Field -> ``(E, K, ...)``: the measurement that each of the sensor's steps predicts.
+        ts: Shape ``(E, K)``: when it was made [s from the segment's start]; -1 where nothing is compared.
+        starts: Shape ``(E, channels, 4)``, as in ``Segments``.
+        recording: Shape ``(E,)``: number of the segment's recording.
+        length_s: Length of a segment [s].
+        fitted: Shape ``(S,)``: numbers of the fitted segments.
+        weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for one that is left out.
+        kept: Shape ``(P,)``, bool: which free parameters are part of the model.
+        count: How many numbers the fitted segments hold.
+    """
+
+    tables: Any
+    given: Mapping[str, Any]
+    measured: Mapping[str, Any]
+    ts: Any
+    starts: Any
+    recording: Any
+    length_s: Any
+    fitted: Any
+    weight: Any
+    kept: Any
+    count: Any
+
+
+def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters: int) -> Data:
+    """Return segments as an argument of compiled programs.
+
+    Args:
+        cuts: The segments.
+        tables: Their timing.
+        from_s: Measurements before this time are not compared [s from the segment's start].
+        fields: How many numbers are compared of each measurement.
+        parameters: How many free parameters there are.
+    """
+    segments = len(cuts.spans)
+    fitted = np.flatnonzero([s.fitted for s in cuts.spans])
+    ts = np.where(cuts.ts >= from_s, cuts.ts, -1.0)
+    steps, size = rounded(ts.shape[1]), rounded(segments)
+    ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
+    measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
+    given = {
+        n: jax.tree_util.tree_map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree)
+        for n, tree in cuts.given.items()
+    }
+    rows = (tables, given, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
+            np.array([s.recording for s in cuts.spans], np.int32))  # fmt: skip
+    counts = rounded(max(len(fitted), 1))
+    return jax.tree_util.tree_map(
+        jnp.asarray,
+        Data(
+            *padded(rows, size),
+            length_s=np.float32(cuts.length_s),
+            fitted=np.pad(fitted, (0, counts - len(fitted))).astype(np.int32),
+            weight=(np.arange(counts) < len(fitted)).astype(np.float32),
+            kept=np.ones(parameters, bool),
+            count=np.float32(max(int((ts[fitted] >= 0.0).sum()) * fields, 1)),
+        ),
+    )
+
+
+def cut(
+    model: IdentifiableModel,
+    nodes: Mapping[str, BaseNode],
+    recordings: Sequence[Episode],
+    spans: Sequence[Span],
+    length_s: float,
+    lead_s: float,
+) -> Segments:
+    """Cut recordings into segments.
+
+    Args:
+        model: Says which nodes and fields matter.
+        nodes: Its nodes.
+        recordings: The logs.
+        spans: Which parts, recording by recording.
+        length_s: Length of each [s].
+        lead_s: Commands of this long before a segment are kept, because they still act in it [s].
+
+    Raises:
+        Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
+        UsageError: When there are too few measurements around the start of a segment.
+    """
+    if not spans:
+        raise UsageError("there is no segment to identify from")
+    timelines, firsts, ordered = [], [], []
+    for r, episode in enumerate(recordings):
+        own = [s for s in spans if s.recording == r]
+        if not own:
+            continue
+        check_log(episode, model)
+        recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
+        lead = {n: to_ticks(lead_s) for n in model.given}
+        parts, first = recorded.cut([to_ticks(s.begin_s) for s in own], to_ticks(length_s), lead)
+        timelines.append(parts)
+        firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(own))]
+        ordered += own
+    timeline = Timeline.stack(timelines)
+    start = timeline.vertices[model.sensor].start / TICKS_PER_S
+
+    def rows(node: str, field: str) -> np.ndarray:
+        width = timeline.vertices[node].start.shape[1]
+        return np.stack([_rows(recordings[r].outputs[node][field], f[node], width) for r, f in firsts])
+
+    fields = {f for c in model.channels for f, _ in c.fields}
+    return Segments(
+        spans=tuple(ordered),
+        length_s=length_s,
+        timeline=_later(timeline, model.sensor, to_ticks(model.ahead_s)),
+        given={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
+        measured={f: rows(model.sensor, f) for f in sorted(fields)},
+        ts=np.where(start < length_s, start, 0.0),
+        starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
+    )
+
+
+def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
+    """Return the timeline with one node's steps later."""
+    v = timeline.vertices[node]
+    moved = Vertex(v.start + ticks, v.end + ticks, v.count)
+    return Timeline({**timeline.vertices, node: moved}, timeline.edges)
+
+
+def require_moved(episode: Episode, name: str = "the log") -> None:
+    """Raise if a log is of a dry run: its commands never reached the motors.
+
+    Raises:
+        Sim2RealError: It is.
+    """
+    if episode.metadata.get("dry_run") is True:
+        raise Sim2RealError(
+            f"{name} is of a dry run: torque was off, and none of its commands was sent",
+            hint="record without --dry-run",
+        )
+
+
+def check_log(episode: Episode, model: IdentifiableModel) -> None:
+    """Raise unless the log holds the sensor's channels and the commands, as numbers, and those were sent."""
+    require_moved(episode)
+    hint = "identify from a log of this pipeline's record stage, or one imported with its mapping"
+    for name in (model.sensor, *model.given):
+        if name not in episode.steps or not len(episode.steps[name]):
+            raise Sim2RealError(
+                f"the log has no steps of node {name!r}. Available: {', '.join(episode.steps) or 'none'}", hint=hint
+            )
+    wanted = [(model.sensor, f) for c in model.channels for f, _ in c.fields]
+    wanted += [(node, f) for node, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    for node, field in wanted:
+        data = episode.outputs[node].get(field)
+        if data is None:
+            raise Sim2RealError(
+                f"node {node!r} has no field {field!r} in this log. Available: {', '.join(episode.outputs[node])}",
+                hint=hint,
+            )
+        finite = np.isfinite(data.reshape(len(data), -1)).all(axis=1)
+        if not finite.all():
+            raise Sim2RealError(
+                f"field {field!r} of node {node!r} holds values that are no numbers, the first in step "
+                f"{int(np.argmin(finite))}",
+                hint="record again: a NaN cannot be identified from",
+            )
+
+
+def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
+    """Return ``width`` recorded rows from ``first`` on; what is missing repeats the last."""
+    return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
+
+
+def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
+    """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
+    t = episode.steps[model.sensor].begun_s
+    period = float(np.median(np.diff(t)))
+    near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
+    near = near[np.abs(t[near] - begin_s) < 12 * period]
+    if near.size < 4:
+        raise UsageError(f"the log has {near.size} measurements around {begin_s:.3f} s, too few to start a segment")
+    x = (t[near] - begin_s)[:, None]
+    powers = x ** np.arange(4)
+    slopes = np.concatenate([np.zeros_like(x), np.ones_like(x), 2 * x, 3 * x**2], axis=1)
+    fits = []
+    for c in model.channels:
+        data = [c.of(episode.outputs[model.sensor][f][near]) / s for f, s in c.fields]
+        rows = [p / s for p, (_, s) in zip((powers, slopes), c.fields, strict=False)]
+        fits.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate(data), rcond=None)[0])
+    return np.stack(fits)
+
+
+def beyond(
+    model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float, share: float = 0.1
+) -> list[str]:
+    """Return sentences about signals whose held-out part leaves the range that was fitted: there, a model extrapolates.
+
+    Args:
+        model: Says which nodes and fields matter.
+        recordings: The logs.
+        spans: Fitted and held-out segments.
+        length_s: Their length [s].
+        share: Only what goes beyond by more than this share of the fitted range is reported.
+    """
+    fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]
+    said = []
+    for node, field in fields:
+        ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
+        for span in spans:
+            t = recordings[span.recording].steps[node].begun_s
+            inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
+            if inside.any():
+                rows = recordings[span.recording].outputs[node][field][inside]
+                ends[span.fitted].append(np.stack([rows.min(axis=0), rows.max(axis=0)]).reshape(2, -1))
+        if not (ends[True] and ends[False]):
+            continue
+        (low, high), (least, most) = (
+            (np.min([e[0] for e in ends[k]], axis=0), np.max([e[1] for e in ends[k]], axis=0)) for k in (True, False)
+        )
+        room = share * (high - low) + 1e-9 * np.abs(high)
+        for i in np.flatnonzero((least < low - room) | (most > high + room))[:3]:
+            name = field if low.size == 1 else f"{field}[{i}]"
+            said.append(
+                f"held-out data extrapolates: {name!r} of {node!r} reaches [{least[i]:.3g}, {most[i]:.3g}], fitted was "
+                f"[{low[i]:.3g}, {high[i]:.3g}]"
+            )
+    return said

@@ -1,0 +1,1 @@
+"""From a starting point to the minimum of the loss: global search, then local refinement."""

@@ -1,0 +1,162 @@
+"""The minimum of any loss within bounds, by the search that identification uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.artifacts.summary import Rows, Shown
+from sim2real.errors import UsageError
+from sim2real.identify.config import FitConfig
+from sim2real.identify.search.search import search
+
+_DECADE = 10.0
+"""Positive bounds with at least this ratio are searched on a logarithmic scale."""
+_INSIDE = 1e-3
+"""The search begins at least so far from a bound, as a share of the bounds' width."""
+
+
+@dataclass(frozen=True, repr=False)
+class Minimum(Shown):
+    """What minimising a loss found.
+
+    Attributes:
+        parameters: Name -> value, as ``loss`` takes them.
+        loss: The loss there.
+        start: The loss where the search began.
+        history: Shape ``(generations,)``: the best loss up to each generation.
+        evaluations: How often the loss was computed.
+    """
+
+    parameters: dict[str, np.ndarray]
+    loss: float
+    start: float
+    history: np.ndarray
+    evaluations: int
+
+    def about(self) -> dict[str, Any]:
+        """Return what to say about it: name -> value."""
+        return {"loss": self.loss, "start": self.start, "evaluations": self.evaluations}
+
+    def rows(self) -> Rows:
+        """Return a row for each parameter."""
+        return ("parameter", "value"), [[n, np.array2string(v, precision=5)] for n, v in self.parameters.items()]
+
+
+class _Scale:
+    """Between parameters in bounds and a vector without bounds, in which 1 is about a quarter of the bounds' width."""
+
+    def __init__(self, parameters: Mapping[str, Any], bounds: Mapping[str, Any]) -> None:
+        self.start = {n: np.asarray(v, np.float64) for n, v in parameters.items()}
+        rows = [_checked(n, v, bounds[n]) for n, v in self.start.items()]
+        self.value, self.low, self.high = (np.concatenate([row[i] for row in rows]) for i in range(3))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.log = (self.low > 0) & (self.high >= _DECADE * self.low)
+
+    def first(self) -> np.ndarray:
+        """Return where the search begins, ``(P,)``."""
+        low, high, value = (np.where(self.log, np.log(np.where(self.log, v, 1.0)), v) for v in self._ends())
+        share = np.clip((value - low) / (high - low), _INSIDE, 1.0 - _INSIDE)
+        return np.log(share / (1.0 - share))
+
+    def parameters(self, z: Any, np_: Any = jnp) -> dict[str, Any]:
+        """Return the parameters at ``z (P,)``, in numpy or JAX."""
+        share = 1.0 / (1.0 + np_.exp(-z))
+        low = np.where(self.log, self.low, 1.0)
+        scaled = low * np_.exp(share * np.log(np.where(self.log, self.high / low, 1.0)))
+        flat = np_.where(self.log, scaled, self.low + (self.high - self.low) * share)
+        found, at = {}, 0
+        for name, like in self.start.items():
+            found[name] = flat[at : at + like.size].reshape(like.shape)
+            at += like.size
+        return found
+
+    def _ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.low, self.high, self.value
+
+
+def minimise(
+    loss: Callable[[dict[str, Any]], Any],
+    parameters: Mapping[str, Any],
+    bounds: Mapping[str, Any],
+    config: FitConfig | Mapping[str, Any] | None = None,
+    compiled: bool = True,
+) -> Minimum:
+    """Return the parameters within bounds at which a loss of one's own is least.
+
+    Args:
+        loss: Parameters -> a number; a rollout of a graph, say. JAX compiles it for a whole generation of candidates.
+        parameters: Name -> where to begin, a number or an array.
+        bounds: Name -> (lowest, highest), numbers or arrays. Positive bounds of a decade or more are searched on a
+            logarithmic scale.
+        config: Strategy, population, generations, restarts, spread and seed of the search; a dict has what is different
+            from the default.
+        compiled: False: the loss is plain Python, and called for one candidate after the other.
+
+    Raises:
+        UsageError: When parameters and bounds do not fit each other, or the loss is not one number.
+        Sim2RealError: When the loss is nowhere finite.
+    """
+    if lacking := sorted(set(parameters) ^ set(bounds)):
+        raise UsageError(f"{', '.join(lacking)}: parameters and bounds must have the same names")
+    if not parameters:
+        raise UsageError("there is no parameter to search for")
+    config, scale = replace(_configured(config), batch=0), _Scale(parameters, bounds)
+
+    def one(z: Any) -> Any:
+        value = jnp.asarray(loss(scale.parameters(z)))
+        if value.shape:
+            raise UsageError(f"the loss must be one number, got an array of shape {value.shape}", hint="sum it up")
+        return value
+
+    def number(z: np.ndarray) -> float:
+        return float(np.asarray(loss(scale.parameters(np.asarray(z, np.float64), np))))
+
+    begin, size = scale.first(), scale.value.size
+    if compiled:
+        alone = jax.jit(one)
+        at = lambda z: float(alone(jnp.asarray(z, jnp.float32)))  # noqa: E731
+        found = search(lambda c, around, data, pick: jax.vmap(one)(c), begin, config, alone=at)
+    else:
+        at = number
+        found = search(lambda c, *rest: np.array([number(z) for z in c]), begin, config, alone=at, host=True)
+    first = at(begin)
+    better = found.loss < first or not np.isfinite(first)
+    values = scale.parameters(np.asarray(found.z if better else begin, np.float64).reshape(size), np)
+    return Minimum(
+        {n: np.asarray(v) for n, v in values.items()},
+        found.loss if better else first,
+        first,
+        found.history,
+        found.evaluations + 1,
+    )
+
+
+def _configured(config: FitConfig | Mapping[str, Any] | None) -> FitConfig:
+    usual = FitConfig(generations=150)
+    if config is None or isinstance(config, FitConfig):
+        return config or usual
+    if unknown := [name for name in config if name not in {f.name for f in fields(usual)}]:
+        raise UsageError(f"config has no {', '.join(unknown)}. Available: {', '.join(f.name for f in fields(usual))}")
+    return replace(usual, **config)
+
+
+def _checked(name: str, value: np.ndarray, bounds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a parameter's values and bounds, each ``(size,)``."""
+    try:
+        low, high = (np.broadcast_to(np.asarray(b, np.float64), value.shape).ravel() for b in bounds)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"{name}: bounds must be two numbers, or arrays of shape {value.shape}; got {bounds!r}"
+        ) from error
+    flat = value.ravel()
+    if not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise UsageError(f"{name}: bounds must be finite, the lower below the higher; got {bounds!r}")
+    if not ((flat >= low) & (flat <= high)).all():
+        raise UsageError(f"{name} begins outside of its bounds: {value} is not in {bounds!r}")
+    return flat, low, high

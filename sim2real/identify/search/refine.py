@@ -1,0 +1,258 @@
+"""Local refinement by least squares, and whether it converged.
+
+scipy's trust-region method takes the steps on the host; an evaluator computes residuals and derivatives at a point. The
+loss that decides is that with initial states solved for at the point itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import Sim2RealError
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.programs import OnCompile
+from sim2real.identify.problem.segments import Data
+from sim2real.identify.uncertainty.uncertainty import (
+    centred,
+    determined,
+    linearise,
+    loss_variance,
+    root_of_inverse,
+    shift_range,
+    time_shift,
+)
+
+_COARSE = 1e-3
+"""Relative gain of the loss at which the descent from each start ends; that from the best goes on."""
+_ROUGH = 1e-2
+"""The same for a model that others are compared with by percents."""
+_ROUNDS, _BACK = 4, 4
+"""Most rounds of a descent, and how often a round goes half the way back to its start."""
+_NEAR = 1e-5
+"""Relative change of the point at which a descent ends, where the evaluator resolves it."""
+_PIN = 10.0
+"""How stiffly the delays' common shift is held in the middle at first: what all of it costs, in norms of the residuals.
+A log does not determine the shift, and the loss has a minimum for each tick of the world: descents from all starts end
+in the one next to the middle."""
+_LEFT = 0.1
+"""A descent has converged where less is left of the next Gauss-Newton step, in standard errors."""
+_POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
+"""Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
+their loss must be lower. Where friction sticks, the derivative at a point says little about the points around it."""
+_TRIES = 3
+OnStep = Callable[[float, np.ndarray], None]
+"""Called with the best loss and point ``(P,)`` so far, after every evaluation."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Where refinement ended.
+
+    Attributes:
+        z: Shape ``(P,)``: the best point.
+        loss: Its loss.
+        before: Loss of the best start.
+        steps: Evaluations, of all starts.
+        left: Length of the next Gauss-Newton step at the end [standard errors], of the parameter that it moves most.
+        converged: Whether the loss has a minimum there: little is left, or no point around is better.
+        ends: Where the descent from each start ended, ``(P,)``, and the loss there.
+    """
+
+    z: np.ndarray
+    loss: float
+    before: float
+    steps: int
+    left: float
+    converged: bool
+    ends: tuple[tuple[np.ndarray, float], ...] = ()
+
+
+def refine(
+    problem: Problem,
+    starts: np.ndarray,
+    data: Data | None = None,
+    coarse: bool = False,
+    settle: bool = True,
+    on_step: OnStep | None = None,
+    on_compile: OnCompile | None = None,
+) -> Refined:
+    """Descend from each start, and from the best end to the minimum.
+
+    Args:
+        problem: The residuals.
+        starts: Shape ``(K, P)``.
+        data: What is fitted; default: all fitted segments.
+        coarse: Whether the first descents do: to compare with a model by percents.
+        settle: Whether the end is tested, and points around it tried where it is no minimum.
+        on_step: Called after every evaluation.
+        on_compile: Called around a compilation.
+
+    Raises:
+        Sim2RealError: When no start has a finite loss.
+    """
+    descent = _Descent(problem, problem.data if data is None else data, on_step, on_compile)
+    first = [descent.at(np.asarray(z, np.float64)) for z in starts]
+    if not np.isfinite(first).any():
+        raise Sim2RealError(
+            "no start of the refinement can be simulated: every loss is infinite or no number",
+            hint="search first, with generations above 0, or check the nominal values",
+        )
+    fine = problem.evaluator.precision
+    first_gain = _ROUGH if coarse else _COARSE if settle else fine
+    ends = [descent.down(z, first_gain, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
+    z, loss = min(ends, key=lambda end: end[1])
+    if coarse or not settle:
+        return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
+    if descent.shift.any():
+        z, loss = descent.down(z, fine, _PIN)
+    z, loss = descent.down(z, fine)
+    left, converged = remaining(problem, z, data), False
+    for _ in range(_TRIES):
+        if converged := left < _LEFT:
+            break
+        better = descent.around(z, loss)
+        if converged := better is None:
+            break
+        z, loss = descent.down(better, fine)
+        left = remaining(problem, z, data)
+    return Refined(z, loss, float(np.nanmin(first)), descent.steps, left, converged, tuple(ends))
+
+
+def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> float:
+    """Return how much is left of a descent: the largest move of the next Gauss-Newton step [standard errors].
+
+    A scale-free test of convergence (Bates and Watts, Technometrics 23, 1981). Where the step leaves the bounds it ends
+    there. The delays' common shift, which a log does not determine, does not count.
+
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the point.
+        data: What is fitted; default: all fitted segments.
+    """
+    at, rest = linearise(problem, z, data), determined(problem)
+    if data is not None:
+        rest = rest[np.asarray(data.kept)[rest]]
+    J, variance = at.jacobian.reshape(-1, len(at.x))[:, rest], loss_variance(problem, at)
+    root = root_of_inverse(J.T @ J / variance + at.prior[np.ix_(rest, rest)])
+    covariance = root @ root.T
+    step = -covariance @ (J.T @ at.residuals.reshape(-1)) / variance
+    low, high = problem.table.low[rest] - at.x[rest], problem.table.high[rest] - at.x[rest]
+    return float(np.max(np.abs(np.clip(step, low, high)) / np.sqrt(np.diag(covariance)), initial=0.0))
+
+
+class _Descent:
+    """Descends on one problem and data.
+
+    Args:
+        problem: The residuals.
+        data: What is fitted.
+        on_step: Called after every evaluation.
+        on_compile: Called around a compilation.
+
+    Attributes:
+        shift: Shape ``(P,)``: the delays' common shift, which a log does not determine; zeros where initial states are
+            not fitted, and the log does.
+        steps: Evaluations so far.
+    """
+
+    def __init__(self, problem: Problem, data: Data, on_step: OnStep | None, on_compile: OnCompile | None) -> None:
+        self._problem, self._data, self._on_step, self._on_compile = problem, data, on_step, on_compile
+        self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
+        free = problem.config.initial_state == "free"
+        self.shift = time_shift(problem.table) if free else np.zeros(len(problem.table))
+        self.steps = 0
+
+    def at(self, z: np.ndarray) -> float:
+        """Return the loss at a point, where initial states are linearised there."""
+        loss = self._problem.loss(z, self._data, self._on_compile)
+        self._report(loss, z)
+        return loss
+
+    def down(self, z: np.ndarray, gain: float, pin: float = 0.0) -> tuple[np.ndarray, float]:
+        """Descend from a point until a round gains a smaller share of the loss; return where that ends, and its loss.
+
+        In a round initial states may keep the derivatives that they have at its start. Where the loss is larger at its
+        end once they are linearised there, the round goes back towards its start.
+
+        Args:
+            z: Shape ``(P,)``: the point.
+            gain: The share.
+            pin: How stiffly the delays' common shift is held in the middle, see ``_PIN``.
+        """
+        z = np.asarray(z, np.float64)
+        if pin and self.shift.any():
+            z = centred(self._problem.table, z)
+        loss = self.at(z)
+        for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
+            end = self._round(z, gain, pin)
+            after = self.at(end)
+            for _ in range(_BACK):
+                if after <= loss:
+                    break
+                end = (z + end) / 2.0
+                after = self.at(end)
+            if not after < loss:
+                break
+            gained, z, loss = loss - after, end, after
+            if gained < gain * loss:
+                break
+        return z, loss
+
+    def around(self, z: np.ndarray, loss: float) -> np.ndarray | None:
+        """Return a point within about a standard error that is better; None if none of those tried is."""
+        table = self._problem.table
+        at = linearise(self._problem, z, self._data)
+        J, variance = at.jacobian.reshape(-1, len(at.x)), loss_variance(self._problem, at)
+        root = root_of_inverse(J.T @ J / variance + at.prior)
+        for draw in np.random.default_rng(0).normal(size=(_POLLED, len(at.x))):
+            there = table.at_scale(at.x + _REACH * root @ draw)
+            if self.at(there) < (1.0 - _BETTER) * loss:
+                return there
+        return None
+
+    def _round(self, z: np.ndarray, gain: float, pin: float) -> np.ndarray:
+        """Return where least squares ends from a point."""
+        from scipy.optimize import least_squares  # 0.2 s
+
+        value, slope = self._problem.evaluator.around(z, self._data)
+        first = value(z)
+        if not (np.isfinite(first).all() and np.isfinite(slope(z)).all()):
+            return z
+        pin *= float(np.linalg.norm(first))
+
+        def pinned(y: np.ndarray) -> np.ndarray:
+            self._report(np.inf, y)
+            return np.nan_to_num(np.concatenate([value(y), pin * self._pinned(y)[0]]), nan=np.inf)
+
+        def pinned_slope(y: np.ndarray) -> np.ndarray:
+            return np.concatenate([slope(y), pin * self._pinned(y)[1]])
+
+        most = max(1, self._problem.config.refine_steps)
+        near = max(_NEAR, self._problem.evaluator.precision)
+        options: Any = {"jac": pinned_slope, "gtol": None}  # scipy's stubs have neither functions nor None
+        found = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
+        return np.asarray(found.x, np.float64)
+
+    def _report(self, loss: float, z: np.ndarray) -> None:
+        self.steps += 1
+        if loss < self._best[0]:
+            self._best = (loss, z.copy())
+        if self._on_step and np.isfinite(self._best[0]):
+            self._on_step(*self._best)
+
+    def _pinned(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far the delays' common shift is from its middle, ``(1,)`` in shares of it, and the slope."""
+        table, shift = self._problem.table, self.shift
+        if not shift.any():
+            return np.zeros(0), np.zeros((0, z.size))
+        x, stretch = table.scale(z)
+        width = float(table.span[shift != 0.0].min())
+        middle = lambda x: sum(shift_range(table, x, shift)) / 2.0 / width  # noqa: E731
+        step = 1e-3 * width
+        moves = step * np.diag((shift != 0.0).astype(float))
+        slope = np.array([(middle(x + m) - middle(x - m)) / (2.0 * step) for m in moves])
+        return np.array([middle(x)]), (slope * stretch)[None]

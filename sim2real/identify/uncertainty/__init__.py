@@ -1,0 +1,1 @@
+"""How well recordings determine parameters: covariance, intervals, profiles, alternative models, noise."""

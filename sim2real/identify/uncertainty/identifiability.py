@@ -1,0 +1,171 @@
+"""What recordings can determine, judged before a search: conditioning, and combinations that nothing determines."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, linearise, time_shift
+
+_PART = 0.1
+"""A parameter takes part in a direction when its entry is at least this share of the largest."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What can be identified, judged at one point.
+
+    Attributes:
+        condition: Condition number of the Jacobian, its columns in widths of the bounds.
+        expected_error: Shape ``(P,)``: standard error to expect from the data at hand [the parameter's unit].
+        per_minute: Shape ``(P,)``: the same from one minute of such data.
+        determined: What is determined of each group in ``undetermined``, such as ``K / (R J)``; empty if nothing.
+        undetermined: Groups of parameters that are not determined one by one.
+        duration_s: Length of all segments [s].
+    """
+
+    condition: float
+    expected_error: np.ndarray
+    per_minute: np.ndarray
+    determined: tuple[str, ...]
+    undetermined: tuple[tuple[str, ...], ...]
+    duration_s: float
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What to tell the user about each direction that is not determined."""
+        return tuple(
+            f"only {what} is determined: fix {len(names) - what.count(' and ') - 1} of {', '.join(names)}, or accept "
+            "what is determined"
+            if what
+            else f"nothing in this data determines {', '.join(names)}: excite it, fix it or give it a prior"
+            for what, names in zip(self.determined, self.undetermined, strict=True)
+        )
+
+
+def check(problem: Problem, z: np.ndarray) -> Check:
+    """Judge what the problem's segments determine, at ``z (P,)``.
+
+    The noise is what the channels say; errors of the model at ``z`` do not count here.
+    """
+    return from_linearised(problem, linearise(problem, z))
+
+
+def from_linearised(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Check:
+    """Judge a linearised point.
+
+    Args:
+        problem: The residuals.
+        at: The point.
+        without: Names of parameters that may be absent: whether the data determines them does not count.
+    """
+    table = problem.table
+    J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
+    held = np.isin(table.names, list(without))
+    J[:, held] = 0.0
+    shift = time_shift(table) / table.span
+    if shift.any():  # what the residuals say about it is no information: see ``uncertainty``
+        unit = shift / np.linalg.norm(shift)
+        J = J - np.outer(J @ unit, unit)
+    information = J.T @ J
+    weights, axes = np.linalg.eigh(information)
+    largest = float(weights[-1])
+    gone = int(shift.any()) + int(held.sum())  # the shift, and what may be absent, are 0 by construction
+    least = float(weights[gone]) if gone < len(weights) else largest
+    condition = float(np.sqrt(largest / max(least, largest * 1e-14, 1e-300)))
+    loose = weights < 1.0 / VAGUE**2
+    prior = at.prior * np.outer(table.span, table.span)
+    duration_s = problem.segment_s * len(problem.train)
+    slope = np.abs(table.slope(at.x)) * table.span
+    error = np.sqrt(np.diag(np.linalg.inv(information + prior))) * slope
+    minute = np.sqrt(np.diag(np.linalg.inv(information * 60.0 / duration_s + prior))) * slope
+    open_axes = np.where(held[:, None], 0.0, axes)[:, loose]
+    # In widths of the bounds, so that a second is no smaller than a logarithm.
+    open_axes = open_axes[:, np.abs(open_axes).max(axis=0, initial=0.0) > 1e-9]
+    groups = _groups(open_axes)
+    return Check(
+        condition=condition,
+        expected_error=error,
+        per_minute=minute,
+        determined=tuple(_determined(table, open_axes * table.span[:, None], g) for g in groups),
+        undetermined=tuple(tuple(table.names[i] for i in g) for g in groups),
+        duration_s=duration_s,
+    )
+
+
+def _groups(directions: np.ndarray) -> list[list[int]]:
+    """Return which parameters move together along directions ``(P, k)`` that the data does not determine."""
+    if not directions.shape[1]:
+        return []
+    spread = directions @ directions.T  # (P, P): the projection onto them, the same in any basis
+    own = np.sqrt(np.diag(spread))
+    taking = own > _PART * own.max()
+    groups: list[list[int]] = []
+    for i in np.flatnonzero(taking):
+        for group in groups:
+            if any(abs(spread[i, j]) > _PART**2 * own[i] * own[j] for j in group):
+                group.append(int(i))
+                break
+        else:
+            groups.append([int(i)])
+    return groups
+
+
+def _determined(table: ParameterTable, directions: np.ndarray, group: list[int]) -> str:
+    """Return which combination of a group is determined: a product of powers, or a sum; empty if none."""
+    part = directions[group]
+    u, size, _ = np.linalg.svd(part, full_matrices=True)
+    rank = int((size > 0.05 * size[0]).sum())
+    kept = u[:, rank:].T  # orthogonal to the directions: determined
+    if not len(kept):
+        return ""
+    reduced = _row_reduce(kept)
+    columns = [table.columns[i] for i in group]
+    scales = {c.parameter.transform for c in columns}
+    names = [c.label for c in columns]
+    write = _product if scales == {"log"} else _sum
+    return " and ".join(write(names, row) for row in reduced)
+
+
+def _row_reduce(rows: np.ndarray) -> np.ndarray:
+    """Return the rows in reduced echelon form, with entries rounded to small fractions where they nearly are."""
+    rows = rows.copy()
+    pivots: list[int] = []
+    for r in range(len(rows)):
+        free = [c for c in range(rows.shape[1]) if c not in pivots]
+        largest = max(abs(rows[r, c]) for c in free)
+        # Of equals the first, whatever the last digit says.
+        pivot = next(c for c in free if abs(rows[r, c]) >= 0.9 * largest)
+        pivots.append(pivot)
+        rows[r] /= rows[r, pivot]
+        for other in range(len(rows)):
+            if other != r:
+                rows[other] -= rows[other, pivot] * rows[r]
+    rounded = np.vectorize(lambda v: float(Fraction(float(v)).limit_denominator(4)))(rows)
+    return np.where(np.abs(rounded - rows) < 0.1, rounded, rows)
+
+
+def _product(names: list[str], powers: np.ndarray) -> str:
+    def factor(name: str, power: float) -> str:
+        return name if abs(abs(power) - 1.0) < 1e-9 else f"{name}^{abs(power):.2g}"
+
+    above = [factor(n, p) for n, p in zip(names, powers, strict=True) if p > 0.05]
+    below = [factor(n, p) for n, p in zip(names, powers, strict=True) if p < -0.05]
+    if not below:
+        return " ".join(above)
+    return f"{' '.join(above) or '1'}/{below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+
+
+def _sum(names: list[str], weights: np.ndarray) -> str:
+    text = ""
+    for name, weight in zip(names, weights, strict=True):
+        if abs(weight) < 0.05:
+            continue
+        size = "" if abs(abs(weight) - 1.0) < 1e-9 else f"{abs(weight):.2g} "
+        text += (" - " if weight < 0 else " + " if text else "") + size + name
+    return text.strip()

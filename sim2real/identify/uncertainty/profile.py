@@ -1,0 +1,117 @@
+"""How much worse a model is for values of one parameter, all others fitted anew to the linearised residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty, loss_variance
+
+ONE_SIDED = 1.645
+"""Standard deviations below which 95 % of a normal distribution lie; squared, what the loss may grow by at a bound."""
+_VALUES = 12
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How much worse the model is for values of one parameter, all others fitted anew.
+
+    Attributes:
+        values: Shape ``(V,)``, from that without effect on: ascending, for a limit descending.
+        worse: Shape ``(V,)``: sum of squares over its variance, above the smallest; 1 is one standard deviation.
+        moves: Shape ``(V, P)``: how the others move, on their scales.
+        residuals: Shape ``(V, N)``: without that move.
+    """
+
+    values: np.ndarray
+    worse: np.ndarray
+    moves: np.ndarray
+    residuals: np.ndarray
+
+    def last(self) -> int | None:
+        """Return the number of the last value in a one-sided interval of 95 %; None where nothing bounds it."""
+        good = np.flatnonzero(self.worse <= ONE_SIDED**2)
+        return int(good[-1]) if len(good) and good[-1] + 1 < len(self.values) else None
+
+    def bound(self) -> float | None:
+        """Return the end of a one-sided interval of 95 %; None where the data does not bound the parameter."""
+        if (a := self.last()) is None:
+            return None
+        # The square root grows like the value itself, as in a linear model.
+        return float(np.interp(ONE_SIDED, np.sqrt(self.worse[[a, a + 1]]), self.values[[a, a + 1]]))
+
+    def moved(self, value: float) -> np.ndarray:
+        """Return how the others move at a value, ``(P,)``."""
+        sign = np.sign(self.values[-1] - self.values[0])
+        return np.array([np.interp(sign * value, sign * self.values, own) for own in self.moves.T])
+
+    def effect(self, value: float) -> np.ndarray:
+        """Return what the next of the values does to the residuals, ``(N,)``."""
+        sign = np.sign(self.values[-1] - self.values[0])
+        return self.residuals[np.searchsorted(sign * self.values, sign * value)] - self.residuals[0]
+
+
+def profile(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, column: int) -> Profile:
+    """Return how much worse the model is for values of a parameter, from where it has no effect on.
+
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the estimate.
+        at: The residuals there.
+        spread: Its uncertainty.
+        column: Number of the parameter.
+    """
+    p = problem.table.columns[column].parameter
+
+    def over(values: np.ndarray) -> Profile:
+        rows = np.full((_VALUES, len(at.x)), np.nan)
+        rows[:, column] = values
+        worse, moves, residuals = worse_with(problem, z, at, spread, rows, np.array([column]))
+        return Profile(values, worse - min(worse.min(), 0.0), moves, residuals)
+
+    if not p.limits:
+        return over(np.concatenate([[0.0], np.geomspace(p.low, p.high, _VALUES - 1)]))
+    found = over(np.geomspace(p.high, p.low, _VALUES))
+    # The model is as good down to what was reached, and soon much worse: where, the wide steps do not say.
+    if (a := found.last()) is None:
+        return found
+    return over(np.concatenate([[p.high], np.geomspace(found.values[a], found.values[a + 1], _VALUES - 1)]))
+
+
+def worse_with(
+    problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, rows: np.ndarray, held: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how much worse the model is with some values given, ``(G,)``; how all others move, ``(G, P)``; residuals.
+
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the estimate.
+        at: The residuals there.
+        spread: Its uncertainty.
+        rows: Shape ``(G, P)``: values; NaN: the estimate, from which the parameter is fitted anew.
+        held: Numbers of those that are not fitted anew in any row.
+    """
+    size = len(at.x)
+    # Rows of one number: one program serves all.
+    padded = np.full((-(-len(rows) // _VALUES) * _VALUES, size), np.nan)
+    padded[: len(rows)] = rows
+    found = [problem.with_values(z, part) for part in padded.reshape(-1, _VALUES, size)]
+    r = np.concatenate(found)[: len(rows)].reshape(len(rows), -1)
+    variance = loss_variance(problem, at) * float(np.median(spread.widening)) ** 2
+    worse, moves = np.empty(len(rows)), np.zeros((len(rows), size))
+    for k, row in enumerate(rows):
+        rest = np.setdiff1d(np.flatnonzero(np.isnan(row)), held)
+        before, _ = _refitted(at.residuals.reshape(-1), at, rest, variance)
+        worse[k], moves[k, rest] = _refitted(r[k], at, rest, variance)
+        worse[k] -= before
+    return np.where(np.isfinite(worse), worse, np.inf) / variance, np.nan_to_num(moves), np.nan_to_num(r)
+
+
+def _refitted(r: np.ndarray, at: Linearised, rest: np.ndarray, variance: float) -> tuple[float, np.ndarray]:
+    """Return the sum of squares after a linear fit of some parameters to residuals ``(N,)``, and their step."""
+    J = at.jacobian.reshape(-1, len(at.x))[:, rest]
+    gradient = J.T @ r
+    step = -np.linalg.solve(J.T @ J + variance * at.prior[np.ix_(rest, rest)], gradient)
+    return float(r @ r + gradient @ step), step

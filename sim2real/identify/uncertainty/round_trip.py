@@ -1,0 +1,86 @@
+"""The sum of all delays, which a log determines even where it cannot tell them apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.uncertainty.uncertainty import AT_BOUND, Uncertainty, sum_of, time_shift
+
+SURE_S = 0.005
+"""A round trip with a larger standard error is not identified [s]."""
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """How long it takes from a command to the first measurement that shows its effect; times in [s].
+
+    Attributes:
+        parts: Delays that were identified.
+        held: Delays that were fixed.
+        apart: Whether the log tells the parts apart; else only their sum is known.
+        estimate: The sum.
+        standard_error: Of the sum.
+        low: Lower end of the 95 % interval.
+        high: Upper end.
+        lower: Sum of the parts' lower bounds, and of what is held.
+        upper: Sum of their upper bounds.
+    """
+
+    parts: tuple[str, ...]
+    held: tuple[str, ...]
+    apart: bool
+    estimate: float
+    standard_error: float
+    low: float
+    high: float
+    lower: float
+    upper: float
+
+    @property
+    def at_bound(self) -> str:
+        """``lower`` or ``upper`` where the sum lies at a bound, else empty."""
+        near = AT_BOUND * (self.upper - self.lower)
+        return "lower" if self.estimate - self.lower < near else "upper" if self.upper - self.estimate < near else ""
+
+    @property
+    def verdict(self) -> str:
+        """``accepted``, ``not identifiable`` or ``at a bound``."""
+        if self.standard_error >= SURE_S:
+            return "not identifiable"
+        return "at a bound" if self.at_bound else "accepted"
+
+    def __str__(self) -> str:
+        """Return the sum with its interval in ms."""
+        return f"{1e3 * self.estimate:.1f} ms [{1e3 * self.low:.1f}, {1e3 * self.high:.1f}]"
+
+
+def round_trip(table: ParameterTable, x: np.ndarray, spread: Uncertainty) -> RoundTrip | None:
+    """Return the sum of all delays; None where none is identified.
+
+    Args:
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        spread: Its uncertainty.
+    """
+    free = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
+    if not free:
+        return None
+    held = [p for p in table if p.kind == "delay" and not p.free]
+    fixed_s = sum(p.nominal for p in held)
+    bounds = [(table.columns[i].parameter.low, table.columns[i].parameter.high) for i in free]
+    lower, upper = (fixed_s + sum(b[side] for b in bounds) for side in (0, 1))
+    total, error = float(table.unscale(x)[free].sum()) + fixed_s, sum_of(spread, free)
+    return RoundTrip(
+        parts=tuple(table.names[i] for i in free),
+        held=tuple(p.name for p in held),
+        apart=not time_shift(table).any(),
+        estimate=total,
+        standard_error=error,
+        low=max(lower, total - 1.96 * error),
+        high=min(upper, total + 1.96 * error),
+        lower=lower,
+        upper=upper,
+    )

@@ -1,0 +1,377 @@
+"""How well the recordings determine the parameters: covariance, intervals, and what is not determined at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import chdtrc, stdtrit
+
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Data
+
+VAGUE = 0.15
+"""Standard errors above this share of the bounds' width are not identifiable (a uniform distribution has 0.29)."""
+AT_BOUND = 0.005
+"""An estimate within this share of the bounds' width of a bound counts as at the bound."""
+_BLOCK_S = 1.0
+"""Residuals further apart than this count as independent [s]."""
+_BLOCKS = 20
+"""How many blocks there are at least, where the recordings are long enough: fewer leave too few degrees of freedom."""
+_INSIDE = 5e-3
+"""Share of the bounds' width from a bound within which derivatives are taken further inside: a servo's by a delay of up
+to 20 ms were mostly rounding at 1e-4 of it."""
+_RESOLVED = 1e-13
+"""Least eigenvalue of a precision with a diagonal of ones: what is below is rounding of doubles."""
+_LEAST_FREEDOM = 2.0
+"""With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
+_ALONE = 0.5
+"""Share of the information about a parameter above which one part stands alone with what it says."""
+_BY_CHANCE = (0.2, 0.05)
+"""Intervals begin to widen where chance alone would make blocks differ as much in this share of recordings, and widen
+in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals and their Jacobian at a point, on the parameters' scales.
+
+    Attributes:
+        residuals: Shape ``(S, C, F)``.
+        jacobian: Shape ``(S, C, F, P)``: d residual / d scale.
+        prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
+        x: Shape ``(P,)``: the point.
+        raw: Shape ``(S, C, F)``: the residuals without a robust loss.
+    """
+
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    prior: np.ndarray
+    x: np.ndarray
+    raw: np.ndarray
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How uncertain an estimate is.
+
+    Attributes:
+        covariance: Shape ``(P, P)``, of the values, in their units.
+        scale_covariance: Shape ``(P, P)``, on the parameters' scales.
+        standard_error: Shape ``(P,)``.
+        low: Shape ``(P,)``: lower end of the 95 % interval, within the bounds.
+        high: Shape ``(P,)``: upper end.
+        verdict: One a parameter: ``accepted``, ``negligible``, ``not reached``, ``not identifiable`` or ``at a bound``.
+        correlation: Shape ``(P, P)``.
+        inflation: Factor on the variance for residuals that are correlated in time.
+        misfit: Root mean square of the residuals in deviations of the measurement, without a robust loss: 1 where the
+            model explains everything but the noise.
+        widening: Shape ``(P,)``: factor on the linearised standard error where blocks of the recordings disagree, with
+            Student's factor for the number of blocks; 1 where they disagree no more than by chance.
+    """
+
+    covariance: np.ndarray
+    scale_covariance: np.ndarray
+    standard_error: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    verdict: tuple[str, ...]
+    correlation: np.ndarray
+    inflation: float
+    misfit: float
+    widening: np.ndarray
+
+
+def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
+    """Return ``z (P,)`` with the delays on either side of the world shifted to the middle of what their bounds admit.
+
+    The log does not tell them apart, so how a search shared their sum between them means nothing.
+    """
+    x, _ = table.scale(z)
+    shift = time_shift(table)
+    down, up = shift_range(table, x, shift)
+    moved = table.unscale(x + shift * (down + up) / 2)
+    scaled = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, moved, strict=True)])
+    share = np.clip((scaled - table.low) / table.span, 1e-6, 1 - 1e-6)
+    return np.where(shift != 0.0, np.log(share / (1 - share)), z)
+
+
+def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Linearised:
+    """Compute residuals and Jacobian at a point.
+
+    At a bound nothing changes with ``z`` any more, but it does with the parameter: there both are computed at a point a
+    little inside, and the residuals carried on to the estimate along the Jacobian.
+
+    Args:
+        problem: The residuals.
+        z: Shape ``(P,)``: the point.
+        data: What is fitted; default: all fitted segments.
+    """
+    table = problem.table
+    most = np.log((1.0 - _INSIDE) / _INSIDE)
+    inside = np.clip(z, -most, most)
+    found = problem.at(inside, data)
+    at, stretch = table.scale(inside)
+    x, J = table.scale(z)[0], found.jacobian / stretch
+    onward = J @ (x - at)
+    priors = found.prior_jacobian / stretch
+    prior = priors.T @ priors + np.diag(12.0 / table.span**2)
+    return Linearised(found.residuals + onward, J, prior, x, found.raw + onward)
+
+
+def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
+    """Return the uncertainty of the estimate ``z (P,)``."""
+    return from_linearised(problem, linearise(problem, z))
+
+
+def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
+    """Return the uncertainty at a linearised point.
+
+    The bounds act as a weak prior, so that a direction which the log does not determine gets the width of its bounds
+    and not infinity. Residuals that are correlated in time carry less information than their number: the variance is
+    scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next. Where the model is wrong, that
+    is still too small: standard errors then grow to what the estimate varies by between blocks of the recordings, but
+    only where blocks differ more than by chance, as a standard error from a few blocks is itself off by a fifth.
+
+    A log does not tell the delays on either side of the world apart: with one longer and the other shorter by as much,
+    and a world that starts that much earlier or later, every message stays the same. Residuals do change a little along
+    this shift, but only by rounding to the world's ticks and by noise in the initial states. So the shift counts as
+    unknown within the bounds, and neither delay is ever accepted by itself. Where initial states are free no other
+    estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
+    """
+    table, size = problem.table, len(at.x)
+    J, (count, free, inflation) = at.jacobian.reshape(-1, size), _freedom(problem, at)
+    variance = loss_variance(problem, at)
+    shift, rest = time_shift(table), determined(problem)
+    precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
+    cov = np.zeros((size, size))
+    root = root_of_inverse(precision)
+    cov[np.ix_(rest, rest)] = root @ root.T
+    quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
+    linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
+    error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
+    wider[rest] = _widening(error / linear[rest], freedom, quantile)
+    # No standard error grows beyond that of a uniform distribution within the bounds.
+    wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
+    cov *= np.outer(wider, wider)
+    down, up = shift_range(table, at.x, shift)
+    reach = quantile * np.sqrt(np.diag(cov))
+    low = table.unscale(at.x - reach + np.minimum(down * shift, up * shift))
+    high = table.unscale(at.x + reach + np.maximum(down * shift, up * shift))
+    cov += np.outer(shift, shift) * (up - down) ** 2 / 12.0
+    error = np.sqrt(np.diag(cov))
+    slope = table.slope(at.x)
+    margin = np.minimum(at.x - table.low, table.high - at.x) / table.span
+    return Uncertainty(
+        covariance=cov * np.outer(slope, slope),
+        scale_covariance=cov,
+        standard_error=error * np.abs(slope),
+        low=low,
+        high=high,
+        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shift, strict=True)),
+        correlation=cov / np.outer(error, error),
+        inflation=inflation,
+        misfit=float(np.sqrt(np.sum(at.raw**2) / max(count, 1))),
+        widening=wider,
+    )
+
+
+def determined(problem: Problem) -> np.ndarray:
+    """Return the numbers of the parameters that are judged one by one: without the delay that carries the shift."""
+    shift = time_shift(problem.table)
+    fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
+    return np.setdiff1d(np.arange(len(shift)), fixed)
+
+
+def loss_variance(problem: Problem, at: Linearised) -> float:
+    """Return the variance of a residual, larger where residuals are correlated in time."""
+    count, free, inflation = _freedom(problem, at)
+    return float(np.sum(at.residuals**2)) / max(count - free, 1) * inflation
+
+
+def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
+    """Return how many residuals there are, how many numbers were fitted, and the factor for correlation in time."""
+    states = 2 * len(problem.channels) * len(at.residuals) * bool(problem.config.initial_state == "free")
+    rho = _correlation_in_time(at.residuals)
+    return int(np.count_nonzero(at.residuals)), len(at.x) + states, (1 + rho) / (1 - rho)
+
+
+def between_parts(
+    spread: Uncertainty, table: ParameterTable, x: np.ndarray, moved: np.ndarray, share: np.ndarray
+) -> Uncertainty:
+    """Return wider intervals where estimates without a part of the recordings differ more than by chance.
+
+    The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). Parts are
+    recordings, or long blocks: it holds what differs from one to the next, which shorter blocks do not show. It says
+    nothing about a parameter of which a single part says more than all others together: such intervals stay.
+
+    Args:
+        spread: The uncertainty without it.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        moved: Shape ``(K, P)``: estimates without each part, on the scales.
+        share: Shape ``(K, P)``: which share of the information about each parameter a part holds.
+    """
+    parts = len(moved)
+    error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
+    own = np.sqrt(np.diag(spread.scale_covariance))
+    shifts = time_shift(table) != 0.0
+    factor = _widening(error / np.maximum(own, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
+    factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
+    factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(own, 1e-30)))
+    return scaled(spread, table, x, factor)
+
+
+def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np.ndarray) -> Uncertainty:
+    """Return intervals that are wider by a factor each.
+
+    Args:
+        spread: The uncertainty without it.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        factor: Shape ``(P,)``: on standard errors and on the reach of intervals.
+    """
+    shifts = time_shift(table) != 0.0
+    cov = spread.scale_covariance * np.outer(factor, factor)
+    middle = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, table.unscale(x), strict=True)])
+    low, high = (
+        np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, ends, strict=True)])
+        for ends in (spread.low, spread.high)
+    )
+    margin = np.minimum(x - table.low, table.high - x) / table.span
+    error = np.sqrt(np.diag(cov))
+    return replace(
+        spread,
+        covariance=spread.covariance * np.outer(factor, factor),
+        scale_covariance=cov,
+        standard_error=spread.standard_error * factor,
+        low=table.unscale(middle - factor * (middle - low)),
+        high=table.unscale(middle + factor * (high - middle)),
+        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shifts, strict=True)),
+        widening=spread.widening * factor,
+    )
+
+
+def sum_of(spread: Uncertainty, columns: list[int]) -> float:
+    """Return the standard error of the sum of some values [their unit]."""
+    return float(np.sqrt(max(spread.covariance[np.ix_(columns, columns)].sum(), 0.0)))
+
+
+def time_shift(table: ParameterTable) -> np.ndarray:
+    """Return the shift of time between delays as a direction ``(P,)``: +1 for measurements, -1 for commands.
+
+    Zeros where delays are identified on one side only. How initial states are found does not matter.
+    """
+    side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in table.columns]
+    direction = np.array([{"measurement": 1.0, "command": -1.0}.get(s, 0.0) for s in side])
+    return direction if {-1.0, 1.0} <= set(direction) else np.zeros_like(direction)
+
+
+def _verdict(error: float, margin: float, shifts: bool) -> str:
+    """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width.
+
+    A delay that trades with another (``shifts``) is never identifiable, however narrow its bounds. An estimate at a
+    bound is reported as that, even if it is vague as well.
+    """
+    if shifts:
+        return "not identifiable"
+    if margin < AT_BOUND:
+        return "at a bound"
+    return "not identifiable" if error > VAGUE else "accepted"
+
+
+def shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
+    """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift.
+
+    Args:
+        table: The parameters.
+        x: Shape ``(P,)``: the point, on their scales.
+        shift: Shape ``(P,)``: what ``time_shift`` returns.
+    """
+    moved = shift != 0.0
+    if not moved.any():
+        return 0.0, 0.0
+    room = np.stack([(table.low - x)[moved] / shift[moved], (table.high - x)[moved] / shift[moved]])
+    return float(room.min(axis=0).max()), float(room.max(axis=0).min())
+
+
+def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradient ``(B, Q)`` and information ``(B, Q, Q)`` of blocks of the recordings, for some parameters.
+
+    A block is a segment, or several in a row where there are many, to include slower changes. Segments are split only
+    where they are few: parts that share an initial state are not independent.
+    """
+    segments, places = at.residuals.shape[:2]
+    parts = min(-(-_BLOCKS // segments), max(1, int(problem.segment_s / _BLOCK_S)))
+    edges = np.linspace(0, places, parts + 1).astype(int)
+    gradients, informations = [], []
+    for s in range(segments):
+        for a, b in pairwise(edges):
+            J = at.jacobian[s, a:b].reshape(-1, len(at.x))[:, columns]
+            gradients.append(J.T @ at.residuals[s, a:b].reshape(-1))
+            informations.append(J.T @ J)
+    firsts = np.arange(0, len(gradients), max(1, segments // _BLOCKS))
+    return np.add.reduceat(gradients, firsts), np.add.reduceat(informations, firsts)
+
+
+def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard errors ``(Q,)`` that blocks show, and their degrees of freedom ``(Q,)``.
+
+    The variance is the sum of squares of how far each block moves the estimate, whatever the residuals within a block
+    are like (a "sandwich" estimate). Blocks that weigh much have residuals that are too small, since the fit follows
+    them: they are scaled up so that the variance is unbiased for white noise (Bell and McCaffrey, Survey Methodology
+    28, 2002). A bootstrap over blocks was 1.15 times too large with ten blocks that differ.
+
+    Args:
+        gradients: Shape ``(B, Q)``.
+        informations: Shape ``(B, Q, Q)``.
+        prior: Shape ``(Q, Q)``: what the prior adds to the information.
+    """
+    root = root_of_inverse(informations.sum(axis=0) + prior)
+    shares = root.T @ informations @ root  # they sum to the identity, less the prior's
+    left, axes = np.linalg.eigh(np.eye(len(root)) - shares)
+    scaled = (axes / np.sqrt(np.maximum(left, 1e-3))[:, None, :]) @ axes.transpose(0, 2, 1)
+    moves = np.einsum("pq,bqr->pbr", root, scaled)
+    variance = np.sum(np.einsum("pbr,br->pb", moves, gradients @ root) ** 2, axis=1)
+    # Satterthwaite's degrees of freedom, from the covariance that white noise gives the moves of blocks.
+    seen = np.einsum("pbr,brs->pbs", moves, shares)
+    own = np.einsum("pbr,pbr->pb", seen, moves)[:, :, None] * np.eye(len(shares))
+    between = own - seen @ seen.transpose(0, 2, 1)
+    trace, square = np.trace(between, axis1=1, axis2=2), np.sum(between**2, axis=(1, 2))
+    return np.sqrt(variance), trace**2 / np.maximum(square, 1e-300)
+
+
+def root_of_inverse(precision: np.ndarray) -> np.ndarray:
+    """Return ``R (Q, Q)`` with ``R R' = precision^-1``, for a matrix that rounding may have made indefinite.
+
+    What was measured a million times, and what only the bounds say, differ by more than doubles resolve: the inverse
+    had negative variances there.
+    """
+    unit = 1.0 / np.sqrt(np.diag(precision))
+    values, axes = np.linalg.eigh(precision * np.outer(unit, unit))
+    return unit[:, None] * axes / np.sqrt(np.maximum(values, _RESOLVED))
+
+
+def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.ndarray:
+    """Return factors by which intervals widen, ``(Q,)``.
+
+    Args:
+        ratio: Shape ``(Q,)``: standard error by blocks over the linearised one.
+        freedom: Shape ``(Q,)``: degrees of freedom of the former.
+        quantile: What the latter is multiplied by for an interval of 95 %.
+    """
+    freedom = np.maximum(freedom, 1.0)
+    begin, full = _BY_CHANCE
+    share = np.clip((begin - chdtrc(freedom, freedom * ratio**2)) / (begin - full), 0.0, 1.0)
+    wider = np.maximum(ratio * stdtrit(freedom, 0.975) / quantile, 1.0)
+    return np.where(freedom >= _LEAST_FREEDOM, 1.0 + share * (wider - 1.0), 1.0)
+
+
+def _correlation_in_time(r: np.ndarray) -> float:
+    """Return the correlation of successive residuals within segments, ``(E, C, F)``, between 0 and 0.95."""
+    now, later = r[:, :-1], r[:, 1:]
+    both = (now != 0.0) & (later != 0.0)
+    rho = float((now * later)[both].sum() / np.maximum((now**2)[both].sum(), 1e-12))
+    return float(np.clip(rho, 0.0, 0.95))

@@ -1,0 +1,278 @@
+"""Whether an identification can be used: judged on held-out data, position by position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sim2real.artifacts.identification import Prediction
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.uncertainty.bounds import is_physical, way_out, way_out_of
+from sim2real.identify.uncertainty.identifiability import Check
+from sim2real.identify.uncertainty.round_trip import RoundTrip
+from sim2real.identify.uncertainty.uncertainty import Uncertainty
+
+Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
+_BETTER = 0.95
+"""The error on held-out data must be below this share of every baseline's."""
+_ALIKE = 1.05
+"""Up to this factor two errors count as the same."""
+_NOISE = 2.0
+"""Errors below this many deviations of the measurement cannot be told from its noise."""
+_MOST = 3
+"""How many positions the reasons name one by one, the worst first."""
+NO_DELAY = "no delay"
+"""The same model fitted without delays. Where it is as good, the data needs no delays; that is no failure."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """A measured position that is judged.
+
+    Attributes:
+        column: Its name in tables of errors, ``position[1]``.
+        name: What people call it.
+        unit: Its unit.
+        sigma: Deviation of a measurement.
+    """
+
+    column: str
+    name: str
+    unit: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """How far one position is off on held-out data, at the longest horizon.
+
+    Attributes:
+        position: Which one.
+        horizon_s: The horizon [s].
+        own: Root mean square error of what was identified; infinite where it diverged.
+        others: The same of each baseline.
+    """
+
+    position: Position
+    horizon_s: float
+    own: float
+    others: Mapping[str, float]
+
+    @property
+    def closest(self) -> str | None:
+        """The best baseline; None without any."""
+        return min(self.others, key=lambda m: self.others[m], default=None)
+
+    @property
+    def excess(self) -> float:
+        """The error over that of the best baseline; errors below the noise of the measurement count as the noise."""
+        noise = _NOISE * self.position.sigma
+        best = min(self.others.values(), default=math.inf)
+        return max(self.own, noise) / max(best, noise) if math.isfinite(best) else 0.0
+
+    @property
+    def beaten_by(self) -> list[str]:
+        """The baselines that are as good; ``no delay`` only where it is better."""
+        if self.own <= _NOISE * self.position.sigma:
+            return []
+        return [m for m, e in self.others.items() if self.own > (_ALIKE if m == NO_DELAY else _BETTER) * e]
+
+    @property
+    def needs_delay(self) -> bool:
+        """Whether the same model without delays is worse."""
+        return NO_DELAY not in self.others or self.own < _BETTER * self.others[NO_DELAY]
+
+    def __str__(self) -> str:
+        """Return how far it is off, and what that is beside the best baseline."""
+        p = self.position
+        said = f"{p.name} is off by {self.own:.2g} {p.unit}".rstrip()
+        closest = self.closest
+        if closest is None or not math.isfinite(self.others[closest]):
+            return said
+        best = self.others[closest]
+        return f"{said}, {self.own / best:.2g} times {closest}" if best else f"{said}, where {closest} is exact"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement.
+
+    Attributes:
+        status: The first that applies of: not converged, no improvement, hit a bound, not identifiable, accepted.
+        reasons: Sentences.
+        flags: Flags with which to identify again, where that is the way out.
+    """
+
+    status: Status
+    reasons: tuple[str, ...]
+    flags: str = ""
+
+
+def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[Score]:
+    """Return how far each position is off on held-out data at the longest horizon, the worst first.
+
+    Args:
+        prediction: What ``prediction.errors`` returned.
+        positions: What is judged.
+    """
+    columns = [p.column for p in positions]
+    held_out = [row for row in prediction if row.held_out and any(row.rmse.get(c) is not None for c in columns)]
+    horizon_s = max((row.horizon_s for row in held_out), default=None)
+    last = {row.model: row.rmse for row in held_out if row.horizon_s == horizon_s}
+    if horizon_s is None or "identified" not in last:
+        return []
+    found = []
+    for p in positions:
+        errors = {m: e for m, rmse in last.items() if (e := rmse.get(p.column)) is not None}
+        # A prediction that diverged to NaN is infinitely wrong.
+        errors = {m: e if math.isfinite(e) else math.inf for m, e in errors.items()}
+        if "identified" in errors:
+            found.append(Score(p, horizon_s, errors.pop("identified"), errors))
+    return sorted(found, key=lambda s: (not s.beaten_by, -s.excess))
+
+
+def judge(
+    found: Sequence[Score],
+    table: ParameterTable,
+    x: np.ndarray,
+    spread: Uncertainty,
+    check: Check,
+    *,
+    trip: RoundTrip | None = None,
+    max_delay_s: float = 1.0,
+    beyond: Sequence[str] = (),
+    left: float | None = None,
+) -> Verdict:
+    """Judge an identification.
+
+    Args:
+        found: How far each position is off, the worst first.
+        table: The parameters.
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+        spread: Its uncertainty.
+        check: What the data determines at the estimate.
+        trip: The sum of the delays.
+        max_delay_s: For which delays the model is made [s].
+        beyond: Where held-out data goes beyond what was fitted: sentences.
+        left: Length of the next step of a fit that did not converge [standard errors]; None: it converged.
+    """
+    improves, reasons = _on_held_out(found)
+    reasons += beyond
+    if left is not None:
+        return Verdict("not converged", (_not_converged(left), *reasons))
+    known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
+    bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
+    reasons += bounded
+    reasons += _absent(table, spread)
+    reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
+    together = trip.parts if trip and not trip.apart else ()
+    groups = zip(check.undetermined, check.messages, strict=True)
+    loose = [message for group, message in groups if not set(group) <= set(together)]
+    if trip and together:
+        loose += [f"not even their sum is known: {trip}"] * (trip.verdict == "not identifiable")
+        reasons.append(f"{' and '.join(together)} cannot be told apart from a log; what is known is their sum, {trip}")
+    reasons += loose
+    if spread.misfit > 3.0:
+        reasons.append(
+            f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
+            "part, and intervals follow how much estimates vary from block to block"
+        )
+    status: Status = "accepted"
+    if not improves:
+        status = "no improvement on held-out data"
+    elif bounded:
+        status = "hit a bound"
+    elif loose:
+        status = "not identifiable"
+    return Verdict(status, tuple(reasons), flags)
+
+
+def _not_converged(left: float) -> str:
+    """Return why a fit has no intervals."""
+    return (
+        f"the fit ended before its loss had a minimum: the next step would move an estimate by {left:.2g} standard "
+        "errors, so there are no intervals"
+    )
+
+
+def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
+    """Return a sentence about each parameter that may as well be absent."""
+    said = []
+    for i, name in enumerate(table.names):
+        unit = table.columns[i].parameter.unit
+        if spread.verdict[i] == "negligible":
+            bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
+            said.append(f"{name} is negligible: {bound}, and without it the model predicts the same")
+        elif spread.verdict[i] == "not reached":
+            bound = f"it is at least {spread.low[i]:.2g} {unit} (95 %)"
+            above = "no value above that changes what the model says of these recordings"
+            said.append(f"{name} is not reached: {bound}, and {above}")
+    return said
+
+
+def _on_held_out(found: Sequence[Score]) -> tuple[bool, list[str]]:
+    """Return whether every position beats every baseline on held-out data, and what to say of it."""
+    if not found:
+        return True, ["nothing was held out: how well it predicts is not known"]
+    ahead = f"{found[0].horizon_s:g} s ahead on held-out data"
+    worse = [s for s in found if s.beaten_by]
+    if worse:
+        reasons = [f"{ahead} {s.position.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
+        return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
+    reasons = [f"{ahead} {s}" for s in found[:_MOST]]
+    if len(found) > _MOST:
+        reasons.append(f"{len(found) - _MOST} more positions improve at least as much")
+    if not any(s.needs_delay for s in found):
+        reasons.append("without any delay it predicts as well: this data does not need one")
+    return True, reasons
+
+
+def _errors(s: Score) -> str:
+    """Return what beats a position, with the errors."""
+    unit = f" {s.position.unit}".rstrip()
+    better = ", ".join(f"{m} ({s.others[m]:.2g}{unit})" for m in s.beaten_by)
+    return f"{better}; its own error is {s.own:.2g}{unit}"
+
+
+def _at_bounds(
+    table: ParameterTable,
+    x: np.ndarray,
+    spread: Uncertainty,
+    known: Sequence[int],
+    trip: RoundTrip | None,
+    max_delay_s: float,
+) -> tuple[list[str], list[str], str]:
+    """Return a sentence about each estimate at a bound, names of those at 0 that cannot be less, and flags to widen.
+
+    Only parameters in ``known`` count: for one that the data does not determine, other bounds do not help.
+    """
+    said, least, flags = [], [], []
+    for i in known:
+        if spread.verdict[i] != "at a bound":
+            continue
+        label, p = table.columns[i].label, table.columns[i].parameter
+        upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
+        if is_physical(p, upper):
+            least.append(label)
+        else:
+            flags.append(way_out(p, upper, max_delay_s))
+            said.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
+    if trip and not trip.apart and trip.verdict == "at a bound":
+        parts = {c.label: c.parameter for c in table.columns if c.label in trip.parts}
+        upper = trip.at_bound == "upper"
+        if all(is_physical(p, upper) for p in parts.values()):
+            least.append("the sum of the delays")
+        else:
+            flags.append(way_out_of(trip, parts, max_delay_s))
+            bound = trip.upper if upper else trip.lower
+            said.append(_bound("the sum of the delays", upper, f"{1e3 * bound:.4g} ms", flags[-1]))
+    return said, least, " ".join(dict.fromkeys(f for f in flags if f))
+
+
+def _bound(name: str, upper: bool, bound: str, flags: str) -> str:
+    what = f"identify again with {flags}, or doubt the model" if flags else "no flag moves it: doubt the model"
+    return f"at a bound: {name} is at its {'upper' if upper else 'lower'} one, {bound.rstrip()}; {what}"

@@ -1,0 +1,1 @@
+"""Readers of other recorders' files: tables, arrays, ROS bags, LeRobot data sets."""

@@ -1,0 +1,86 @@
+"""Reads arrays in npz files: by their headers first, so that an archive unpacks no more than the budget."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.log.importing.files.budget import WHOLE, require_memory, require_signals, why_left_out
+from sim2real.log.importing.files.raw_file import RawSignals
+
+DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
+"""What the libraries raise for damaged content."""
+
+
+def read_npz(path: Path) -> RawSignals:
+    """Read an archive of arrays.
+
+    Raises:
+        UsageError: When it is no ZIP archive, or no array in it is one of numbers within the budget.
+    """
+    # numpy would try to read anything but a ZIP archive as a pickle.
+    if not zipfile.is_zipfile(path):
+        raise UsageError(f"{path} is no npz file, or is cut off", hint=WHOLE)
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
+    notes, total = [], 0.0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            require_signals(len(names), path)
+            for name in names:
+                key = name.removesuffix(".npy")
+                try:
+                    shapes[key] = _shape(archive, name)
+                except (*DAMAGED, UnicodeError) as error:
+                    notes.append(f"left out: {key!r}: its header is damaged ({str(error)[:80]})")
+    except DAMAGED as error:
+        if isinstance(error, UsageError):
+            raise
+        raise UsageError(f"{path} is no npz file, or is damaged: {error}", hint=WHOLE) from None
+    keys = []
+    for key, (shape, dtype) in shapes.items():
+        if why := why_left_out(shape, dtype.kind, dtype.itemsize):
+            notes.append(f"left out: {key!r}: {why}")
+        else:
+            keys.append(key)
+            total += 8.0 * math.prod(shape)
+    if not keys:
+        raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no arrays'}", hint=WHOLE)
+    require_memory(total, str(path))
+
+    def load(name: str) -> Any:
+        if name not in (key.removesuffix(".npy") for key in names):
+            raise KeyError(name)
+        shape, dtype = shapes.get(name, ((), np.dtype(float)))
+        if dtype.hasobject:
+            raise UsageError(
+                f"{name!r} in {path} holds Python objects, which could run any code when loaded",
+                hint="save it again as an array of numbers",
+            )
+        require_memory(float(math.prod(shape)) * dtype.itemsize, f"{name!r} in {path}")
+        # Opened again for each signal, so that one that is damaged does not prevent reading the others.
+        with np.load(path, allow_pickle=False) as data:
+            return data[name]
+
+    return RawSignals(keys, load, notes=tuple(notes))
+
+
+def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of an array in an archive, by its header alone.
+
+    Raises:
+        ValueError: When it has no such header.
+    """
+    with archive.open(name) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    if any(n < 0 for n in shape):
+        raise ValueError("a size below 0")
+    return shape, dtype

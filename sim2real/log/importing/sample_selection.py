@@ -1,0 +1,110 @@
+"""Which samples of a node are imported: those that are whole, and whose positions a joint can have had."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.log.importing import plausibility
+from sim2real.log.importing.mapping import ImportMapping, NodeMapping
+from sim2real.log.importing.signal_names import meaning
+
+
+def kept_samples(
+    node: NodeMapping, signals: Mapping[str, np.ndarray], stamps: np.ndarray | None, first: int, stop: int
+) -> np.ndarray:
+    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep.
+
+    Args:
+        node: Its mapping.
+        signals: Field -> values, shape ``(N, ...)``, or ``()`` for a constant.
+        stamps: Shape ``(N,)``; None without any.
+        first: The first sample to take.
+        stop: The one after the last.
+    """
+    kept = np.arange(first, stop)
+    series = [v for v in (*signals.values(), stamps) if v is not None and v.ndim]
+    if node.missing == "drop":
+        good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
+        kept = kept[good]
+    if node.repeated == "first" and stamps is not None and len(kept):
+        own = stamps[kept]
+        kept = kept[np.concatenate([[True], own[1:] != own[:-1]])]
+    return kept
+
+
+def plausible_samples(
+    where: str, node: NodeMapping, signals: Mapping[str, np.ndarray], t_s: np.ndarray, kept: np.ndarray
+) -> np.ndarray:
+    """Return the numbers of those samples whose positions a joint can have had.
+
+    Args:
+        where: The node and the file, for errors.
+        node: Its mapping.
+        signals: Field -> values, shape ``(N, ...)``, unscaled.
+        t_s: Stamps of the samples that are kept so far [s].
+        kept: Their numbers.
+
+    Raises:
+        UsageError: When positions leap away and back, and the mapping does not say to drop such samples; jump at the
+            end of a turn that is not to be counted; or change by more than a joint can move.
+    """
+    if len(kept) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
+        return kept  # the errors of stamps say more
+    for field, how in node.fields.items():
+        if how.unit != "rad" or meaning(field).side == "command" or meaning(field).quantity != "position":
+            continue
+        values = signals[field]
+        angle = np.atleast_2d(values[kept].reshape(len(kept), -1) * np.asarray(how.scale)) if values.ndim else None
+        if angle is None or not np.isfinite(angle).all():
+            continue
+        what = f"field {field} of {where}"
+        if not how.turn and (over := plausibility.turns(angle, plausibility.TURN_RAD)).any():
+            raise UsageError(
+                f"column {int(over.argmax())} of {what} jumps by 2 pi at the end of a turn",
+                hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
+            )
+        leapt = plausibility.glitches(t_s, angle)
+        if leapt.any() and node.implausible == "refuse":
+            k, i = (int(x[0]) for x in np.nonzero(leapt))
+            raise UsageError(
+                f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {kept[k]}: it leaps away and back, as no "
+                f"joint can, in {int(leapt.any(axis=1).sum())} samples",
+                hint='implausible = "drop" in the mapping leaves such samples out',
+            )
+        kept, angle, t_s = (x[~leapt.any(axis=1)] for x in (kept, angle, t_s))
+        if (jump := plausibility.leap(t_s, angle)) is not None:
+            raise UsageError(
+                f"column {jump[1]} of {what} changes by {jump[2]:.4g} rad before sample {kept[jump[0]]}, within "
+                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: no joint can, so its zero or its unit has changed",
+                hint="cut the file there with --samples A:B, or leave this joint out",
+            )
+    return kept
+
+
+def align_turns(mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, Any]) -> None:
+    """Bring positions and commands whose turns were counted, each from its own beginning, to the same turn.
+
+    Args:
+        mapping: Says where turns were counted.
+        outputs: Node -> field -> values, changed in place.
+        ticks: Node -> stamps.
+    """
+    angles = [
+        (name, field, how)
+        for name, node in mapping.nodes.items()
+        for field, how in node.fields.items()
+        if how.unit in ("rad", "")  # without a unit where a robot has hinges and slides
+    ]
+    for name, field, how in angles:
+        for other, goal, its in angles:
+            a, b = outputs[name][field], outputs[other][goal]
+            if meaning(field).side == "command" or meaning(goal).side != "command" or not (how.turn or its.turn):
+                continue
+            if meaning(field).quantity != "position" or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
+                continue
+            flat, t = [x.reshape(len(x), -1) for x in (b, a)], [np.asarray(ticks[n], float) for n in (other, name)]
+            outputs[other][goal] = plausibility.same_turn(flat[0], t[0], flat[1], t[1]).reshape(b.shape)

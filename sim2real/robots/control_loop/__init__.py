@@ -1,0 +1,1 @@
+"""Robots in the loop of sensor, agent, actuator and world."""

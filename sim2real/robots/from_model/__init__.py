@@ -1,0 +1,1 @@
+"""Robots from a model file and a recording, without Python of their own."""

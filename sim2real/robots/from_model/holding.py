@@ -1,0 +1,308 @@
+"""Joints of a model that were not recorded: which are held and where, and which something else moves."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+from sim2real.robots.from_model.couplings import Coupling, below, couplings_of, groups, upwards
+
+_HOME = "home"
+"""The keyframe that is taken where a model has several."""
+_ROUNDED = 1e-3
+"""By how much a keyframe may be outside a joint's range [rad or m]: it is rounded."""
+_FREE, _BALL, _SLIDE = (int(getattr(mj.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE"))
+
+
+@dataclass(frozen=True)
+class Held:
+    """A joint that was not recorded, and is held.
+
+    Attributes:
+        joint: Its number in the file's model.
+        name: Its name, or that of its body.
+        value: Where: an angle [rad] or a length [m]; of a ball a quaternion, of a floating base nothing.
+        unit: Unit of the value.
+        source: Why it is held there.
+        passive: Whether no actuator of the file drives it.
+    """
+
+    joint: int
+    name: str
+    value: tuple[float, ...]
+    unit: str
+    source: str
+    passive: bool
+
+    def __str__(self) -> str:
+        """Return a line for people."""
+        where = f"at {', '.join(f'{v:.4g}' for v in self.value)}{self.unit and f' {self.unit}'}, " if self.value else ""
+        return f"{self.name} {where}{self.source}{'; no actuator of the model drives it' if self.passive else ''}"
+
+
+@dataclass(frozen=True)
+class Holding:
+    """What becomes of the joints that were not recorded.
+
+    Attributes:
+        held: Those that are held.
+        moved: Those that stay free, by number, and what moves them.
+        dropped: Couplings between held joints alone, and tendons without a force.
+        key: Number of the keyframe; -1: none.
+    """
+
+    held: tuple[Held, ...]
+    moved: Mapping[int, str]
+    dropped: tuple[Coupling, ...]
+    key: int = -1
+
+
+def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: bool, path: Any) -> Holding:
+    """Return which joints are held and where.
+
+    A joint that a loop, an equality or a tendon moves together with a recorded one stays free. Others are held at a
+    named value, else at the keyframe, else at the model's zero.
+
+    Args:
+        model: The compiled model of the file.
+        recorded: The joints that were recorded.
+        hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        fix_base: Whether a floating base is held.
+        path: The file, for messages.
+
+    Raises:
+        UsageError: A joint would be held outside its range, a value is named for a joint that moves, the base floats,
+            or only an actuator of a tendon moves a joint together with a recorded one.
+    """
+    couplings = couplings_of(model)
+    numbers = {model.joint(name).id for name in recorded}
+    moved = _moved(model, couplings, numbers, fix_base)
+    key, named = _named(model, hold, numbers, moved, path)
+    _refuse_tendons(model, couplings, numbers, {*moved, *named}, path)
+    held = []
+    free = {int(model.jnt_bodyid[i]) for i in numbers | moved.keys()}
+    carrying = set().union(*(upwards(model, body) for body in free))
+    for i in range(model.njnt):
+        if i in numbers or i in moved:
+            continue
+        if int(model.jnt_type[i]) == _FREE and not fix_base:
+            raise UsageError(
+                f"the base of {path} floats: joint {model.joint(i).name or 'without a name'!r} was not recorded",
+                hint="--fix-base holds it where the model has it, as on a stand",
+            )
+        body = int(model.jnt_bodyid[i])
+        matters = body in carrying or bool(upwards(model, body) & free)
+        held.append(_held(model, i, named.get(i), key, matters))
+    _refuse_outside(model, held, path)
+    at = {h.joint for h in held}
+    dropped = tuple(c for c in couplings if not c.acts or not c.joints or c.joints <= at)
+    return Holding(tuple(held), moved, dropped, key)
+
+
+def apply(spec: Any, model: Any, holding: Holding) -> None:
+    """Hold joints of a model: their bodies stand as they do at the values, and the joints are gone.
+
+    Args:
+        spec: ``mujoco.MjSpec`` whose elements have the compiled model's numbers; it is changed.
+        model: The compiled model of the file.
+        holding: What ``plan`` returned.
+    """
+    held, dropped = {h.joint: h for h in holding.held}, holding.dropped
+    joints = {int(j.id): j for j in spec.joints}
+    equalities = {c.equality for c in dropped} | {i for i in range(model.neq) if not model.eq_active0[i]}
+    if int(model.opt.disableflags) & int(mj.mjtDisableBit.mjDSBL_EQUALITY):
+        equalities |= set(range(model.neq))
+    tendons = {c.tendon for c in dropped}
+    gone = [e for e in spec.equalities if int(e.id) in equalities]
+    gone += [t for t in spec.tendons if int(t.id) in tendons]
+    for element in (*spec.sensors, *spec.actuators, *spec.keys, *spec.tuples, *gone):
+        spec.delete(element)
+    for body in sorted({int(model.jnt_bodyid[i]) for i in held}):
+        _pose(model, body, held, joints)
+    if holding.moved and holding.key >= 0:
+        left = [i for i in range(model.njnt) if i not in held]
+        start = np.concatenate([model.key_qpos[holding.key, _address(model, i)] for i in left])
+    else:
+        start = None
+    for number in held:
+        spec.delete(joints[number])
+    if start is not None:
+        spec.add_key(name="start", qpos=start)
+
+
+def _moved(model: Any, couplings: Sequence[Coupling], recorded: set[int], fix_base: bool) -> dict[int, str]:
+    """Return the joints that stay free, and what moves each."""
+    together = [group for group in groups(couplings) if group & recorded]
+    found: dict[int, str] = {}
+    for c in couplings:
+        alone = c.equality >= 0 and int(model.eq_type[c.equality]) == int(mj.mjtEq.mjEQ_JOINT) and len(c.joints) == 1
+        if c.acts and (alone or any(c.joints <= group for group in together)):
+            found |= {i: c.name for i in sorted(c.joints - recorded) if i not in found}
+    bases = [i for i in found if int(model.jnt_type[i]) == _FREE and below(model, i) & recorded]
+    return {i: name for i, name in found.items() if not (fix_base and i in bases)}
+
+
+def _named(
+    model: Any, hold: Sequence[str], recorded: set[int], moved: Mapping[int, str], path: Any
+) -> tuple[int, dict[int, float]]:
+    """Return the number of the keyframe, -1 for none, and the named values by joint."""
+    keys = [model.key(i).name for i in range(model.nkey)]
+    names = {model.joint(i).name: i for i in range(model.njnt)}
+    chosen, values = None, {}
+    for entry in hold:
+        name, _, text = entry.rpartition("=")
+        if entry in keys:
+            chosen = keys.index(entry)
+            continue
+        if name not in names:
+            raise UsageError(
+                f"{path} has no joint {name or entry!r} to hold. Joints: {', '.join(filter(None, names))}; "
+                f"keyframes: {', '.join(filter(None, keys)) or 'none'}",
+                hint="write JOINT=VALUE, or the name of a keyframe",
+            )
+        number = names[name]
+        if number in recorded or number in moved:
+            cause = f"{moved[number]} moves it" if number in moved else "it was recorded"
+            raise UsageError(f"joint {name!r} cannot be held: {cause}", hint=f"leave {entry!r} out")
+        try:
+            values[number] = float(text)
+        except ValueError:
+            values[number] = float("nan")
+        if not np.isfinite(values[number]) or int(model.jnt_type[number]) in (_FREE, _BALL):
+            raise UsageError(f"joint {name!r} cannot be held at {text!r}", hint="write a number, in rad or m")
+    return _key(model, keys, chosen, recorded, {*moved, *values}, path), values
+
+
+def _key(model: Any, keys: Sequence[str], chosen: int | None, recorded: set[int], others: set[int], path: Any) -> int:
+    """Return the number of the keyframe at which joints are held; -1: none."""
+    if chosen is not None or len(keys) < 2:
+        return len(keys) - 1 if chosen is None else chosen
+    if _HOME in keys:
+        return keys.index(_HOME)
+    at = [_address(model, i) for i in range(model.njnt) if i not in recorded | others]
+    if any(not np.allclose(model.key_qpos[:, a], model.key_qpos[0, a]) for a in at):
+        raise UsageError(
+            f"{path} has {len(keys)} keyframes with different values of joints that were not recorded: "
+            f"{', '.join(k or 'one without a name' for k in keys)}",
+            hint="name the keyframe at which they are held, or their values: --hold KEYFRAME or --hold JOINT=VALUE",
+        )
+    return 0
+
+
+def _refuse_tendons(
+    model: Any, couplings: Sequence[Coupling], recorded: set[int], settled: set[int], path: Any
+) -> None:
+    """Refuse a joint that only the actuator of a tendon moves together with a recorded one."""
+    of_tendon = model.actuator_trntype == int(mj.mjtTrn.mjTRN_TENDON)
+    pulled = {int(t) for t in model.actuator_trnid[of_tendon, 0]}
+    for c in couplings:
+        lost = sorted(c.joints - recorded - settled)
+        if c.tendon in pulled and c.joints & recorded and lost:
+            name = model.joint(lost[0]).name
+            raise UsageError(
+                f"in {path} an actuator of {c.name} moves joint {name!r} together with recorded ones, so it cannot "
+                "be held",
+                hint=f"record it; or, if it was blocked, name where: --hold {name}=VALUE",
+            )
+
+
+def _refuse_outside(model: Any, held: Sequence[Held], path: Any) -> None:
+    """Refuse joints that would be held outside their ranges: they change the inertia of the others."""
+    outside = []
+    for h in held:
+        low, high = model.jnt_range[h.joint]
+        if h.unit and model.jnt_limited[h.joint] and not low <= h.value[0] <= high:
+            outside.append((h, f"{h.name} at {h.value[0]:.4g} {h.unit} ({h.source}), outside {low:.4g} to {high:.4g}"))
+    if outside:
+        flags = " ".join(f"--hold {shlex.quote(h.name)}=VALUE" for h, _ in outside)
+        raise UsageError(
+            f"{path}: joints that were not recorded would be held outside of their ranges: "
+            f"{'; '.join(line for _, line in outside)}",
+            hint=f"{flags} names where each was, in rad or m; a keyframe 'home' of the model does, too",
+        )
+
+
+def _held(model: Any, number: int, named: float | None, key: int, matters: bool) -> Held:
+    """Return where a joint is held; one that no free joint carries, or is carried by, is moved into its range."""
+    kind, name = int(model.jnt_type[number]), model.joint(number).name
+    at, low_high = _address(model, number), model.jnt_range[number]
+    shown = name or f"a joint of body {model.body(int(model.jnt_bodyid[number])).name!r}"
+    driven = (model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)) & (model.actuator_trnid[:, 0] == number)
+    passive = model.nu > 0 and kind != _FREE and not driven.any()
+    if kind == _FREE:
+        return Held(number, shown, (), "", "where the model has it", passive)
+    source = "named" if named is not None else "the model's zero"
+    value = np.array([named]) if named is not None else np.array(model.qpos0[at])
+    if named is None and key >= 0:
+        value, source = np.array(model.key_qpos[key, at]), f"keyframe {model.key(key).name!r}"
+    if kind == _BALL:
+        return Held(number, shown, tuple(map(float, value)), "", source, passive)
+    unit = "m" if kind == _SLIDE else "rad"
+    nearest = np.clip(value, *low_high) if model.jnt_limited[number] else value
+    if abs(nearest - value)[0] <= _ROUNDED or not (matters or named is not None):
+        source += "" if nearest[0] == value[0] else ", moved into its range"
+        value = nearest
+    return Held(number, shown, (float(value[0]),), unit, source, passive)
+
+
+def _address(model: Any, number: int) -> slice:
+    begin = int(model.jnt_qposadr[number])
+    return slice(begin, begin + {_FREE: 7, _BALL: 4}.get(int(model.jnt_type[number]), 1))
+
+
+def _pose(model: Any, body: int, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
+    """Set the pose of a body with held joints, and the joints of it that are left, which stand before held ones."""
+    pos, quat = np.array(model.body_pos[body]), np.array(model.body_quat[body])
+    first = int(model.body_jntadr[body])
+    left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for i in range(first, first + int(model.body_jntnum[body])):
+        anchor, axis = np.array(model.jnt_pos[i]), np.array(model.jnt_axis[i])
+        if i not in held:
+            left[i] = anchor, axis
+            continue
+        step, turn = _step(model, i, held[i].value, anchor, axis)
+        pos, quat = pos + _turned(quat, step), _product(quat, turn)
+        back = turn * np.array([1, -1, -1, -1])
+        left = {k: (_turned(back, a - step), _turned(back, x)) for k, (a, x) in left.items()}
+    element = joints[first].parent
+    element.set_frame(element.parent.add_frame(pos=pos, quat=quat))
+    element.pos, element.quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    element.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
+    for i, (anchor, axis) in left.items():
+        joints[i].pos, joints[i].axis = anchor, axis
+
+
+def _step(
+    model: Any, number: int, value: Sequence[float], anchor: np.ndarray, axis: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how a joint at a value moves its body, seen from the body: a translation [m], and a quaternion."""
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    kind = int(model.jnt_type[number])
+    if kind == _FREE:
+        return np.zeros(3), turn
+    beyond = np.array(value) - model.qpos0[_address(model, number)]
+    if kind == _SLIDE:
+        return axis * beyond[0], turn
+    if kind == _BALL:
+        turn = np.array(value) / np.linalg.norm(value)
+    else:
+        mj.mju_axisAngle2Quat(turn, axis, beyond[0])
+    return anchor - _turned(turn, anchor), turn
+
+
+def _turned(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    found = np.zeros(3)
+    mj.mju_rotVecQuat(found, vector, quat)
+    return found
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    found = np.zeros(4)
+    mj.mju_mulQuat(found, a, b)
+    return found

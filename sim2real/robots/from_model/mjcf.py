@@ -1,0 +1,194 @@
+"""A robot's MJCF or URDF, made ready for identification: its joints, and a drive on each that was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+from sim2real.robots.from_model import model_file
+from sim2real.robots.from_model.holding import Holding, apply, plan
+
+NO_LIMIT = 1e6
+_LEAST_FRICTION = 1e-9
+_OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
+              "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
+"""Units of hinges -> units of slides."""
+
+
+def read_spec(path: Path, contacts: bool = False) -> Any:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``model_file.read``, and what that raises."""
+    return model_file.read(path, contacts)[0]
+
+
+def read_model(path: Path) -> Any:
+    """Return the compiled model of an MJCF or URDF file; see ``read_spec``."""
+    return read_spec(path).compile()
+
+
+def joints_of(model: Any) -> tuple[str, ...]:
+    """Return the names of a model's hinges and slides, in its order."""
+    kinds = {int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE)}
+    return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
+
+
+def slides_of(model: Any, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return those of a model's joints that are slides: their units have m for rad, and N for N m."""
+    return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
+
+
+def unit_for(unit: str, slide: bool) -> str:
+    """Return the unit of a hinge's quantity, or what takes its place at a slide."""
+    return _OF_SLIDES.get(unit, unit) if slide else unit
+
+
+def driven(
+    path: Path,
+    joints: Sequence[str],
+    step_s: float,
+    fix_base: bool,
+    contacts: bool,
+    rubbing: bool = True,
+    hold: Sequence[str] = (),
+) -> Any:
+    """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
+
+    First stand those of force, in the order of the joints, then those of stiffness, whose force is ``-ctrl * angle``,
+    then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the file's own actuators.
+    Joints that were not recorded are held, but for those that something moves together with recorded ones: see
+    ``holding.plan``. Where some are moved, the keyframe that the others are held at is the model's only one.
+
+    Args:
+        path: MJCF or URDF.
+        joints: The joints that were recorded.
+        step_s: Time step [s].
+        fix_base: Whether a floating base is held where the model has it.
+        contacts: Whether bodies touch.
+        rubbing: Whether joints have dry friction, be it little: MJX leaves it out for good where the model has none.
+        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+
+    Raises:
+        UsageError: When a joint is missing or is no hinge or slide, the base floats, or a joint cannot be held.
+    """
+    spec = read_spec(path, contacts)
+    model = spec.compile()
+    holding = held_in(path, model, joints, fix_base, hold)
+    limits = {j: limit_of(model, j) for j in joints}
+    apply(spec, model, holding)
+    for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
+        for joint in joints:
+            part: Any = spec.add_actuator(name=f"{joint}_{what}", target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+            part.gaintype = mj.mjtGain.mjGAIN_AFFINE
+            part.gainprm[:3] = gain
+    for joint in joints:
+        most = limits[joint] or NO_LIMIT
+        spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
+        if rubbing:
+            spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
+    option = spec.option
+    option.timestep, option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0
+    if not contacts:
+        option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise UsageError(
+            f"{path} does not compile with joints held: {model_file.one_line(error)}",
+            hint="take what needs them out of the model",
+        ) from None
+
+
+def held_in(path: Path, model: Any, joints: Sequence[str], fix_base: bool, hold: Sequence[str]) -> Holding:
+    """Return which joints of a file's compiled model are held, as ``driven`` holds them.
+
+    Args:
+        path: The file, for messages.
+        model: Its model.
+        joints: The joints that were recorded.
+        fix_base: Whether a floating base is held.
+        hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+
+    Raises:
+        UsageError: When a joint is missing, the base floats, or a joint cannot be held.
+    """
+    own = joints_of(model)
+    if unknown := [j for j in joints if j not in own]:
+        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    return plan(model, joints, hold, fix_base, path)
+
+
+@dataclass(frozen=True)
+class JointDrive:
+    """One actuator of a joint.
+
+    Attributes:
+        told: What its control is.
+        stiffness: Of one that is told a position [N m/rad].
+        damping: Of its own [N m s/rad]; of one that is told a velocity its gain, too.
+        gain: Torque for each unit of the control, of one that is told neither [N m].
+        most: Largest torque [N m]; None: no limit.
+    """
+
+    told: Literal["position", "velocity", "torque"]
+    stiffness: float
+    damping: float
+    gain: float
+    most: float | None
+
+
+def set_drives(spec: Any, drives: Mapping[str, JointDrive]) -> None:
+    """Give joints of a model one actuator each: the file's own where it has just one, else a new one.
+
+    Args:
+        spec: ``mujoco.MjSpec`` of the model; it is changed.
+        drives: By joint.
+    """
+    fixed, affine = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+    for joint, drive in drives.items():
+        own = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
+        for element in own[1:]:
+            spec.delete(element)
+        part: Any = own[0] if own else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+        gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.told]
+        stiffness = drive.stiffness if drive.told == "position" else 0.0
+        part.gaintype, part.biastype, part.dyntype = fixed, affine, mj.mjtDyn.mjDYN_NONE
+        part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        part.gainprm[:3], part.biasprm[:3] = [gain, 0.0, 0.0], [0.0, -stiffness, -drive.damping]
+        part.ctrllimited = False  # what the file allowed may have been a torque
+        part.forcelimited = False
+        if drive.most is not None:  # the joint's, as in identification: MuJoCo then still takes damping implicitly
+            spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-drive.most, drive.most]
+
+
+def limit_of(model: Any, joint: str) -> float | None:
+    """Return the largest torque that the file's own actuator or joint allows [N m or N]; None: no limit."""
+    number = model.joint(joint).id
+    ranges = [model.actuator_forcerange[i] for i in _actuators(model, number) if model.actuator_forcelimited[i]]
+    # A motor's torque is its control, so a limit of that is one, too.
+    ranges += [
+        model.actuator_ctrlrange[i] * model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
+        for i in _actuators(model, number)
+        if model.actuator_ctrllimited[i] and model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_NONE)
+    ]
+    ranges += [model.jnt_actfrcrange[number]] if model.jnt_actfrclimited[number] else []
+    limits = [float(np.abs(r).max()) for r in ranges if np.abs(r).max() > 0]
+    return min(limits, default=None)
+
+
+def gains_of(model: Any, joint: str) -> tuple[float, float] | None:
+    """Return stiffness and damping of the file's own position or velocity servo; None: the joint has none."""
+    for i in _actuators(model, model.joint(joint).id):
+        if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_AFFINE):
+            return float(-model.actuator_biasprm[i, 1]), float(-model.actuator_biasprm[i, 2])
+    return None
+
+
+def _actuators(model: Any, joint: int) -> list[int]:
+    of_joint = model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)
+    return [int(i) for i in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == joint))]

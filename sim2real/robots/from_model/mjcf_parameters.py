@@ -1,0 +1,384 @@
+"""Parameters of a robot's model by pattern: for all joints, for a group, or for each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import Parameter, Transform
+from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
+
+What = Literal[
+    "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
+    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "tilt_x", "tilt_y",
+    "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
+]  # fmt: skip
+ALL = ".*"
+_WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
+         "armature": (30, 30), "frictionloss": (50, 20), "stribeck_rad_s": (10, 20)}  # fmt: skip
+"""By which factors bounds lie below and above the nominal value."""
+FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
+             "frictionloss": 0.1, "stribeck_rad_s": 0.1}  # fmt: skip
+"""Nominal values where the model has none."""
+_ABOUT = {
+    "kp": ("N m/rad", "stiffness of the drive"),
+    "kd": ("N m s/rad", "damping of the drive"),
+    "gain": ("N m", "torque for each unit of the command"),
+    "torque": ("N m", "largest torque of the drive"),
+    "speed": ("rad/s", "speed without load under the largest torque: the damping is that torque over it"),
+    "released": ("1", "share of the drive's damping with torque off"),
+    "damping": ("N m s/rad", "viscous friction"),
+    "armature": ("kg m^2", "rotor behind the gears"),
+    "frictionloss": ("N m", "dry friction"),
+    "zero": ("rad", "encoder at the model's zero"),
+    "payload": ("kg", "mass added at the body's centre of mass"),
+    "load": ("1", "dry friction of gears, as a share of the drive's torque"),
+    "static": ("N m", "dry friction at rest beyond that in motion"),
+    "stribeck_rad_s": ("rad/s", "speed at which 1/e of that is left"),
+    "drag": ("N m s^2/rad^2", "friction by the square of the speed"),
+    "bias": ("N m", "dry friction upwards beyond the mean of both directions"),
+    "back_emf": ("N m s/rad", "damping by the motor's voltage, with torque on, beyond its limit"),
+    "play": ("rad", "error of the angle that the drive leaves alone: dead zone, play of gears"),
+    "tilt_x": ("rad", "turn of the direction of gravity about the model's x axis"),
+    "tilt_y": ("rad", "turn of the direction of gravity about the model's y axis"),
+    "eccentric_cos": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's cosine"),
+    "eccentric_sin": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's sine"),
+    "cogging_cos": ("N m", "torque that repeats with the angle, by the cosine"),
+    "cogging_sin": ("N m", "torque that repeats with the angle, by the sine"),
+    "cogging_per_turn": ("1", "how often that torque repeats in a turn"),
+}
+_EXCITE = {
+    "kp": "goals that change while the joint bears a load",
+    "kd": "motion with torque off (`enabled`) besides that with torque on, to tell the joint's damping from it",
+    "gain": "torques or duties that change",
+    "torque": "commands that the drive cannot follow, so that it is at its limit",
+    "speed": "commands that the drive cannot follow, so that it is at its limit",
+    "released": "motion with torque off (`enabled`)",
+    "damping": "fast motion of each joint, at several speeds",
+    "armature": "fast changes of the command, up to a few hertz",
+    "frictionloss": "slow motion of each joint, with reversals",
+    "zero": "motion of each joint against gravity, up and down",
+    "payload": "motion of each joint against gravity, up and down",
+    "load": "the same motion with and without a load",
+    "static": "slow motion of each joint, with reversals",
+    "stribeck_rad_s": "motion of each joint at many speeds, from slow to fast, with reversals",
+    "drag": "fast motion of each joint, at several speeds",
+    "bias": "slow motion of each joint, with reversals",
+    "back_emf": "commands that the drive cannot follow, so that it is at its limit",
+    "play": "slow motion of each joint, with reversals, and goals that change little",
+    "tilt_x": "motion of joints whose axes are not upright, against gravity, up and down",
+    "tilt_y": "motion of joints whose axes are not upright, against gravity, up and down",
+    "eccentric_cos": "motion of each joint over most of a turn",
+    "eccentric_sin": "motion of each joint over most of a turn",
+    "cogging_cos": "slow motion of each joint over many of its repeats, both ways",
+    "cogging_sin": "slow motion of each joint over many of its repeats, both ways",
+    "cogging_per_turn": "slow motion of each joint over many of its repeats, both ways",
+}
+"""Which motion tells a quantity."""
+_VANISHING = ("kd", "damping", "armature", "frictionloss")
+"""Quantities that a joint may be without."""
+_FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
+          "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
+          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
+          "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
+_OF_MODEL = {
+    "static": ("frictionloss", 5.0),
+    "bias": ("frictionloss", 5.0),
+    "drag": ("damping", 5.0),
+    "back_emf": ("damping", 30.0),
+    "cogging_cos": ("frictionloss", 5.0),
+    "cogging_sin": ("frictionloss", 5.0),
+}
+"""Terms without a usual size: up to a factor of what the model has of another quantity."""
+_BOTH_WAYS = ("bias", "cogging_cos", "cogging_sin")
+"""Those of them that may be negative."""
+OPTIONAL = {
+    "load": ("load",),
+    "stribeck": ("static", "stribeck_rad_s"),
+    "drag": ("drag",),
+    "direction": ("bias",),
+    "back_emf": ("back_emf",),
+    "play": ("play",),
+    "tilt": ("tilt_x", "tilt_y"),
+    "eccentricity": ("eccentric_cos", "eccentric_sin"),
+    "cogging": ("cogging_cos", "cogging_sin"),
+}
+"""Optional terms, and the quantities that each has."""
+TILT = OPTIONAL["tilt"]
+ASKED = ("tilt", "eccentricity", "cogging")
+"""Those that ``auto`` leaves out unless a parameter names them: few robots tell them from a zero or a stiffness."""
+LAWS = (*(q for own in OPTIONAL.values() if own != TILT for q in own), "cogging_per_turn")
+"""Quantities that are set before every step."""
+_ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
+ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
+
+
+@dataclass(frozen=True)
+class ParameterPattern:
+    """One quantity of some joints, identified as one value or as one for each.
+
+    Attributes:
+        what: The quantity; of a body, where it is ``payload``.
+        joints: Regular expression that a whole name must match.
+        each: Whether each joint has a value of its own.
+        nominal: The value to start from; None: the model's own, or a usual one.
+        low: Lower bound; None: a factor below the nominal value.
+        high: Upper bound; None: a factor above.
+        name: Name of the parameter; default: the quantity, with the pattern's letters where it is for a group.
+        free: Whether it is identified; else it is held at ``nominal``.
+        term: Optional term of the model that it belongs to; "": of none.
+    """
+
+    what: What
+    joints: str = ALL
+    each: bool = False
+    nominal: float | None = None
+    low: float | None = None
+    high: float | None = None
+    name: str = ""
+    free: bool = True
+    term: str = ""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a model."""
+        if self.what not in _ABOUT:
+            raise UsageError(f"unknown parameter {self.what!r} of a joint. Available: {', '.join(_ABOUT)}")
+        try:
+            re.compile(self.joints)
+        except re.error as error:
+            raise UsageError(
+                f"{self.joints!r} is no pattern for joints: {error}", hint="such as .*_hip_joint"
+            ) from None
+        if self.what == "cogging_per_turn" and self.free:
+            raise UsageError(
+                "cogging_per_turn is counted, not identified",
+                hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
+            )
+        if self.what in TILT and (self.each or self.joints != ALL):
+            raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
+
+    @staticmethod
+    def parse(text: str) -> ParameterPattern:
+        """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, such as ``frictionloss:each`` or ``kp@.*_calf_joint``.
+
+        Raises:
+            UsageError: When it is none.
+        """
+        found = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
+        if not found:
+            raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
+        what: Any = found[1]
+        value = float(found[4]) if found[4] else None
+        return ParameterPattern(what, found[3] or ALL, bool(found[2]), value, free=value is None)
+
+    def label(self) -> str:
+        """Return the name of a value that several joints share."""
+        return self.name or (self.what if self.joints == ALL else f"{self.what}_{_letters(self.joints)}")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A parameter, and where its value belongs.
+
+    Attributes:
+        parameter: The parameter.
+        what: The quantity.
+        at: Numbers of the joints in the robot's order; of ``payload``, of the model's bodies.
+    """
+
+    parameter: Parameter
+    what: str
+    at: tuple[int, ...]
+
+
+def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any, own: Any) -> list[Placed]:
+    """Return the parameters of a model.
+
+    Args:
+        terms: By pattern.
+        joints: The joints that were recorded.
+        model: The model with drives.
+        own: The model as it is in the file, for nominal values.
+
+    Raises:
+        UsageError: When a pattern matches nothing, or two parameters have one name.
+    """
+    found: list[Placed] = []
+    for term in terms:
+        names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
+        offset = 1 if term.what == "payload" else 0
+        at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name, re.DOTALL)]
+        if not at:
+            raise UsageError(
+                f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",
+                hint="a pattern matches whole names: .*_hip_joint",
+            )
+        sliding = set() if term.what == "payload" else set(slides_of(own, names))
+        if term.each:
+            groups = [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at]
+        else:
+            groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
+        for group, name in groups:
+            nominal = _nominal(term, [names[i] for i in group], own)
+            unit = unit_for(_ABOUT[term.what][0], term.what not in TILT and names[group[0]] in sliding)
+            p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], own)), unit=unit)
+            found.append(Placed(p, term.what, tuple(i + offset for i in group)))
+    return found
+
+
+def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) -> list[tuple[list[int], str]]:
+    """Return the groups of joints that may share a value, and what is added to its name: slides are in other units."""
+    slides = [i for i in at if names[i] in sliding]
+    hinges = [i for i in at if names[i] not in sliding]
+    if what in TILT or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
+        return [(at, "")]
+    return [(hinges, ""), (slides, "_slide")]
+
+
+def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[ParameterPattern, ...]:
+    """Return patterns with optional terms added that none of them is of: one value for all joints, not identified.
+
+    Terms are chosen with ``--terms``; without, they are 0.
+
+    Args:
+        terms: What there is.
+        wanted: ``auto``, ``all``, or names with commas between, which are offered beside those of ``auto``. Of a term
+            that ``auto`` leaves out, parameters that were named are offered without its others.
+
+    Raises:
+        UsageError: When cogging is wanted, and nobody said how often it repeats.
+    """
+    said, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
+    if "cogging" in names and "cogging_per_turn" not in said:
+        raise UsageError("how often does cogging repeat in a turn?", hint="add --parameter cogging_per_turn=N")
+    there = {name for name in OPTIONAL if name not in ASKED or name in names}
+    if wanted == "all":
+        there |= set(ASKED) - (set() if "cogging_per_turn" in said else {"cogging"})
+    return (
+        *(replace(term, term=own) if (own := _term_of(term.what)) else term for term in terms),
+        *(
+            ParameterPattern(what, free=False, term=name)
+            for name, quantities in OPTIONAL.items()
+            if name in there
+            for what in quantities
+            if what not in said
+        ),
+    )
+
+
+def _term_of(what: str) -> str:
+    return next((name for name, quantities in OPTIONAL.items() if what in quantities), "")
+
+
+def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints: np.ndarray, dofs: np.ndarray) -> Any:
+    """Return the world's parameters with values in their places.
+
+    Args:
+        placed: What ``expand`` returned.
+        values: Parameters by name.
+        base: ``DriveParams`` with nominal values.
+        joints: Shape ``(joints,)``: their numbers in the model.
+        dofs: Shape ``(joints,)``: where the model's arrays have each joint.
+    """
+    drive: dict[str, Any] = {}
+    model: dict[str, Any] = {}
+    terms: Any = base.terms
+    # A speed without load makes a damping of the torque limit, so that comes first.
+    for p in sorted(placed, key=lambda p: p.what == "speed"):
+        if p.what in TILT:
+            continue
+        value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
+        if p.what in _ON_DRIVE:
+            drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
+        elif p.what in LAWS:
+            terms = terms.replace(**{p.what: getattr(terms, p.what).at[at].set(value)})
+        elif p.what in ("torque", "speed"):
+            limits = model.get("jnt_actfrcrange", jnp.asarray(base.model.jnt_actfrcrange))
+            if p.what == "torque":
+                model["jnt_actfrcrange"] = limits.at[joints[at]].set(value * jnp.array([-1.0, 1.0]))
+            else:
+                damping = model.get("dof_damping", base.model.dof_damping)
+                model["dof_damping"] = damping.at[dofs[at]].set(limits[joints[at], 1] / value)
+        elif p.what == "payload":
+            model["body_mass"] = model.get("body_mass", base.model.body_mass).at[at].add(value)
+        else:
+            field = ON_DOF[p.what]
+            model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
+    if any(p.what in TILT for p in placed):
+        model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
+    return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
+
+
+def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) -> Any:
+    """Return gravity ``(3,)`` [m/s^2] turned about the model's x axis, then about its y axis.
+
+    Args:
+        placed: What ``expand`` returned.
+        values: Parameters by name.
+        gravity: As the model has it, ``(3,)`` [m/s^2].
+    """
+    angle = {p.what: values[p.parameter.name] for p in placed if p.what in TILT}
+    if not angle:
+        return gravity
+    x, y = (jnp.asarray(angle.get(what, 0.0), float) for what in TILT)
+    g = jnp.asarray(gravity, float)
+    g = jnp.array([g[0], jnp.cos(x) * g[1] - jnp.sin(x) * g[2], jnp.sin(x) * g[1] + jnp.cos(x) * g[2]])
+    return jnp.array([jnp.cos(y) * g[0] + jnp.sin(y) * g[2], g[1], jnp.cos(y) * g[2] - jnp.sin(y) * g[0]])
+
+
+def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
+    unit, about = _ABOUT[term.what]
+    transform: Transform = "log"
+    kind: Any = "measurement" if term.what == "zero" else "dynamics"
+    if term.what in _FIXED:
+        _, low, high = _FIXED[term.what]
+        transform = "linear"
+    elif term.what in _OF_MODEL:
+        low, high, transform = -own_size if term.what in _BOTH_WAYS else 0.0, own_size, "linear"
+    else:
+        below, above = _WIDE[term.what]
+        low, high = nominal / below, nominal * above
+    low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
+        vanishes=term.what in _VANISHING, limits=term.what == "torque", term=term.term,
+        off=nominal if term.term and not term.free else None,
+    )  # fmt: skip
+
+
+def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
+    """Return the value that joints start from: the median of the model's own."""
+    if term.nominal is not None:
+        return term.nominal
+    if term.what in _FIXED:
+        return _FIXED[term.what][0]
+    if term.what in _OF_MODEL:
+        return 0.0
+    values: list[float] = []
+    for name in names:
+        if term.what in ON_DOF:
+            values.append(float(getattr(own, ON_DOF[term.what])[own.joint(name).dofadr[0]]))
+        elif term.what in ("kp", "kd") and (gains := gains_of(own, name)):
+            values.append(gains[term.what == "kd"])
+        elif term.what == "torque" and (limit := limit_of(own, name)):
+            values.append(limit)
+    known = [v for v in values if v > 0]
+    return float(np.median(known)) if known else FALLBACK[term.what]
+
+
+def _size(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
+    """Return how large a term can be that has no usual size of its own; 0 for others."""
+    if term.what not in _OF_MODEL:
+        return 0.0
+    quantity, factor = _OF_MODEL[term.what]
+    return factor * _nominal(replace(term, what=quantity, nominal=None), names, own)
+
+
+def _letters(pattern: str) -> str:
+    """Return the letters and digits of a name or a pattern, words apart."""
+    return re.sub(r"\W+", "_", pattern.replace(".*", "")).strip("_") or "all"

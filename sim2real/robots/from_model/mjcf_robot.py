@@ -1,0 +1,396 @@
+"""A robot of which there is a model and a recording: no Python of its own."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from flax import struct
+
+from sim2real.artifacts.files import check
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.log.toml_text import toml_value
+from sim2real.robots.from_model.holding import Holding
+from sim2real.robots.from_model.mjcf import (
+    NO_LIMIT,
+    JointDrive,
+    driven,
+    held_in,
+    joints_of,
+    limit_of,
+    read_model,
+    read_spec,
+    set_drives,
+    slides_of,
+    unit_for,
+)
+from sim2real.robots.from_model.mjcf_parameters import (
+    FALLBACK,
+    LAWS,
+    ON_DOF,
+    ParameterPattern,
+    Placed,
+    expand,
+    optional,
+    place,
+    tilted,
+)
+from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
+from sim2real.worlds.drive_terms import DriveTerms
+from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
+from sim2real.worlds.recorded import RecordedActuator
+
+ROBOT_FILE = "robot.toml"
+COMMANDS = tuple(f.name for f in fields(DriveCommand))
+DRIVING = ("goal", "goal_velocity", "torque", "duty")
+"""Commands of which there must be one."""
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """What there is to know about a robot that was recorded.
+
+    Attributes:
+        model: MJCF or URDF.
+        joints: The joints that were recorded, in the order of the log.
+        commands: Fields of the log that drive: some of ``COMMANDS``.
+        shared: Those of them that are one number for all joints.
+        velocity: Whether velocities were measured, and count.
+        rate_hz: Samples per second of the log, at most [Hz].
+        step_s: Time step of the simulation [s].
+        sigma_rad: Deviation of a measured position [rad].
+        sigma_rad_s: Deviation of a measured velocity [rad/s].
+        kp_unit: What 1 stands for in the log's own stiffness.
+        kd_unit: What 1 stands for in the log's own damping.
+        fix_base: Whether a floating base is held.
+        contacts: Whether bodies touch.
+        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        terms: What is identified.
+    """
+
+    model: Path
+    joints: tuple[str, ...]
+    commands: tuple[str, ...]
+    shared: tuple[str, ...] = ()
+    velocity: bool = False
+    rate_hz: float = 200.0
+    step_s: float = 0.0025
+    sigma_rad: float = 0.002
+    sigma_rad_s: float = 0.1
+    kp_unit: float = 1.0
+    kd_unit: float = 1.0
+    fix_base: bool = False
+    contacts: bool = False
+    hold: tuple[str, ...] = ()
+    terms: tuple[ParameterPattern, ...] = ()
+
+    def driven(self, rubbing: bool = True) -> Any:
+        """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
+        return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
+
+    def held(self) -> Holding:
+        """Return what becomes of the joints that were not recorded."""
+        return held_in(self.model, read_model(self.model), self.joints, self.fix_base, self.hold)
+
+    def to_toml(self, model: str) -> str:
+        """Return the text of a ``robot.toml`` that names the model's file."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "terms"}
+        plain = {f.name: f.default for f in fields(self)}
+        lines = [
+            "# A robot that was recorded: sim2real.robots.from_model.mjcf_robot.RobotConfig says what each key is."
+        ]
+        own["model"] = model
+        lines += [f"{k} = {toml_value(v)}" for k, v in own.items() if v != plain[k]]
+        for term in self.terms:
+            usual = asdict(ParameterPattern(term.what))
+            said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
+            lines += ["", "[[terms]]", *(f"{k} = {toml_value(v)}" for k, v in said.items())]
+        return "\n".join(lines) + "\n"
+
+    @staticmethod
+    def load(path: Path) -> RobotConfig:
+        """Read a ``robot.toml``; its model lies where that says, seen from it.
+
+        Raises:
+            UsageError: When a key is unknown, missing or of the wrong kind.
+        """
+        known = [f.name for f in fields(RobotConfig)]
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+            terms = tuple(ParameterPattern(**row) for row in table.pop("terms", []))
+            check(table.keys() <= set(known), f"unknown key {min(table.keys() - set(known), default='')!r}")
+            found = msgspec.convert(table, RobotConfig, dec_hook=lambda _, text: Path(text))
+            return replace(found, model=path.parent / found.model, terms=terms)
+        except UsageError:
+            raise
+        except (ValueError, TypeError, OSError) as error:
+            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(known)}") from None
+
+
+@struct.dataclass
+class Measured(Base):
+    """What the encoders say, each of shape ``(joints,)`` [rad, rad/s]; no velocity where there is none."""
+
+    position: Any
+    velocity: Any = None
+
+
+class Encoders(BaseNode):
+    """Reads the joints of a ``DrivenWorld``.
+
+    Args:
+        name: Unique in the graph.
+        rate: Samples per second [Hz].
+        world: The world.
+        velocity: Whether velocities are measured.
+    """
+
+    def __init__(self, name: str, rate: float, world: DrivenWorld, velocity: bool) -> None:
+        super().__init__(name, rate)
+        self._world, self._velocity = world, velocity
+
+    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> EncoderParams:
+        """Return encoders that read 0 at the model's zero."""
+        own = self._world.init_params(rng, graph_state)
+        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), own.terms)
+
+    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measured:
+        """Return zeros."""
+        del rng, graph_state
+        still = jnp.zeros(len(self._world.qpos_at))
+        return Measured(still, still if self._velocity else None)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measured]:
+        """Read."""
+        seen, own = step_state.inputs[self._world.name][-1].data, step_state.params
+        angle, speed = seen.qpos[self._world.qpos_at], seen.qvel[self._world.qvel_at]
+        if own.terms is not None:
+            angle, speed = own.terms.read(angle), own.terms.rate(angle, speed)
+        return step_state, Measured(angle + own.zero, speed if self._velocity else None)
+
+
+@struct.dataclass
+class EncoderParams(Base):
+    """Parameters of the encoders.
+
+    Attributes:
+        zero: What they read at the model's zero, ``(joints,)`` [rad].
+        terms: The drives' own, which say how far each is off its axis; None: not at all.
+    """
+
+    zero: Any
+    terms: DriveTerms | None = None
+
+
+class MjcfRobot(LoggedRobot):
+    """A robot that is known from its model and from recordings.
+
+    Args:
+        config: What there is to know about it.
+
+    Raises:
+        UsageError: When the model does not fit.
+    """
+
+    delayed = "command to angle"
+    burst = 2
+
+    def __init__(self, config: RobotConfig) -> None:
+        if not set(config.commands) <= set(COMMANDS) or not set(config.commands) & set(DRIVING):
+            raise UsageError(
+                f"a log that drives a robot has one of {', '.join(DRIVING)}, got {', '.join(config.commands) or 'no'}",
+                hint=f"fields of the actuator may be {', '.join(COMMANDS)}",
+            )
+        self.config, self.tick_s = config, config.step_s
+        own = read_model(config.model)
+        self.lawful = any(term.what in LAWS for term in config.terms)
+        rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
+        self.model = config.driven(rubbing)
+        self.placed = tuple(expand(config.terms, config.joints, self.model, own))
+        self._limits = [limit_of(own, joint) for joint in config.joints]
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What was measured of each joint."""
+        c = self.config
+        velocity, goal = ("velocity" if c.velocity else None), ("goal" if "goal" in c.commands else None)
+        rows = enumerate(c.joints)
+        return tuple(Channel("position", velocity, c.sigma_rad, c.sigma_rad_s, i, joint, goal) for i, joint in rows)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Field -> unit; entry of a field, such as ``position[0]``, where some joints are slides and others hinges."""
+        known = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
+        there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
+        known = {field: unit for field, unit in known.items() if field in there}
+        slides = [joint in slides_of(self.model, self.config.joints) for joint in self.config.joints]
+        if len(set(slides)) == 1:
+            return {field: unit_for(unit, slides[0]) for field, unit in known.items()}
+        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in known.items() for i, s in enumerate(slides)}
+
+    def dynamics(self) -> list[Parameter]:
+        """Return what may be identified."""
+        return [p.parameter for p in self.placed]
+
+    def make_nodes(self) -> tuple[BaseNode, RecordedActuator, DrivenWorld]:
+        """Return sensor, actuator and world."""
+        config = self.config
+        still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
+        units = config.kp_unit, config.kd_unit
+        world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
+        sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
+        return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
+
+    def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
+        """Return the robot with optional terms to choose from; a step of its simulation then takes longer.
+
+        Args:
+            wanted: ``auto``, ``all``, or names with commas between.
+        """
+        return MjcfRobot(replace(self.config, terms=optional(self.config.terms, wanted)))
+
+    def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
+        """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
+        return IdentifiableMjcf(self, max_delay_s)
+
+    def base(self, params: DriveParams) -> DriveParams:
+        """Return the world's parameters before any is identified: the model's, and drives as the terms have them."""
+        n, driving = len(self.config.joints), set(self.config.commands)
+        zero, one = jnp.zeros(n), jnp.ones(n)
+        return params.replace(
+            kp=FALLBACK["kp"] * one if "goal" in driving else zero,
+            kd=zero,
+            gain=one,
+            released=zero,
+            zero=zero,
+        )
+
+    @property
+    def export_lead_s(self) -> float:
+        """What C MuJoCo adds to the delay of commands [s].
+
+        Half a step for the integrator's sake, as ``DrivenWorld`` does in the graph.
+        """
+        return 0.5 * self.config.step_s
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+        """Return the file's model with what was identified: friction, inertia, payload, tilt, and each joint's drive.
+
+        Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
+        """
+        config, spec = self.config, read_spec(self.config.model)
+        spec.option.timestep, spec.option.integrator = config.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.gravity = np.asarray(tilted(self.placed, values, spec.option.gravity))
+        drives = self._drives(values)
+        if not ("kp" in config.commands and config.kp_unit == 1.0):
+            set_drives(spec, dict(zip(config.joints, drives, strict=True)))
+        model = spec.compile()
+        dofs = [model.joint(name).dofadr[0] for name in config.joints]
+        # A speed without load makes a damping of the torque limit, after a damping that was identified.
+        for p in sorted(self.placed, key=lambda p: p.what == "speed"):
+            value = float(values[p.parameter.name])
+            for i in p.at:
+                if p.what == "payload":
+                    # By name: a body that hangs on a held joint may be fused in one of both models.
+                    name = self.model.body(i).name
+                    model.body_mass[model.body(name).id if name else i] += value
+                elif p.what == "speed":
+                    model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
+                elif p.what in ON_DOF:
+                    getattr(model, ON_DOF[p.what])[dofs[i]] = value
+        spec.copy_back(model)
+        return spec.to_xml()
+
+    def _drives(self, values: Mapping[str, Any]) -> list[JointDrive]:
+        """Return the joints' drives with identified values."""
+        told: Any = next(
+            (t for n, t in (("goal", "position"), ("goal_velocity", "velocity")) if n in self.config.commands), "torque"
+        )
+        usual: dict[str, Any] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
+        found = [{**usual, "most": most} for most in self._limits]
+        names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
+        for p in self.placed:
+            for i in p.at if p.what in names else ():
+                found[i][names[p.what]] = float(values[p.parameter.name])
+        return [JointDrive(told, **one) for one in found]
+
+
+class IdentifiableMjcf(IdentifiableRecording):
+    """Simulates what the encoders measured; an ``identify.model.IdentifiableModel``.
+
+    Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
+
+    Args:
+        robot: The robot.
+        max_delay_s: Upper bound of the delay [s].
+    """
+
+    def __init__(self, robot: MjcfRobot, max_delay_s: float) -> None:
+        super().__init__(robot, max_delay_s)
+        self.parameters = ParameterTable(p for p in self.parameters if p.name != "sensor_delay")
+        self.ahead_s = robot.tick_s
+        self._world = world = robot.make_nodes()[2]
+        self._placed: Sequence[Placed] = robot.placed
+        self._joints, self._dofs = world.joints, world.qvel_at
+        self._params = {**self._params, world.name: robot.base(self._params[world.name])}
+
+    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+        """Return node parameters.
+
+        Args:
+            values: Parameters by name.
+            start: Shape ``(2 * joints,)``: positions as measured, then velocities.
+        """
+        tree = self.parameters.placed(self._params, values)
+        world = place(self._placed, values, tree["world"], self._joints, self._dofs)
+        n = len(self._dofs)
+        angle = start[:n] - world.zero
+        speed = start[n:]
+        if world.terms is not None:
+            angle = world.terms.angle(angle)
+            speed = speed / world.terms.rate(angle, 1.0)
+        return {
+            **tree,
+            "world": self._world.started(world, angle, speed),
+            "sensor": EncoderParams(world.zero, world.terms),
+        }
+
+
+def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:
+    """Return what is identified unless somebody says otherwise.
+
+    Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
+    damping and the joint's can be told apart only where torque is switched off or the log has gains of its own: else
+    there is one.
+
+    Args:
+        commands: Fields of the log that drive.
+        physical: Whether the log's own gains are in N m/rad and N m s/rad: then factors of them are identified.
+    """
+    if "goal" in commands:
+        factor: dict[str, Any] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
+        first: tuple[ParameterPattern, ...] = (
+            ParameterPattern("kp", **factor),
+            *([ParameterPattern("kd", **factor)] if physical else []),
+        )
+        first += (ParameterPattern("kd"),) if "enabled" in commands and not physical else ()
+    else:
+        first = (ParameterPattern("kd"),) if "goal_velocity" in commands else (ParameterPattern("gain"),)
+    rest = () if "goal_velocity" in commands and "goal" not in commands else (ParameterPattern("damping"),)
+    return (*first, *rest, ParameterPattern("armature"), ParameterPattern("frictionloss", each=True))
+
+
+def all_joints(model: Path) -> tuple[str, ...]:
+    """Return the joints of a model file."""
+    return joints_of(read_model(model))

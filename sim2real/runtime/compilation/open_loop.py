@@ -1,0 +1,215 @@
+"""A graph in which no computed message returns to an earlier node, run node by node, with its timing as an argument.
+
+Identification replays recorded commands: the world hears them, the sensor hears the world. Such a graph needs no rows
+and no rings of outputs (``sim2real.runtime.compilation.compiled``): each node makes all of its steps, then its readers
+make theirs and look messages up by ``seq``. The program depends on the number of steps alone: it serves every log.
+"""
+
+from __future__ import annotations
+
+import graphlib
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.graph.node import TICKS_PER_S, BaseNode, BaseWorld
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.windows import check_bursts, newest_message
+from sim2real.runtime.compilation.fit import check_fit
+from sim2real.runtime.compilation.wiring import messages_read
+from sim2real.runtime.init import OUTPUTS, init_graph_state
+from sim2real.runtime.match import matched
+
+Tables = dict[str, Any]
+"""Node -> ``seq`` and ``ts`` of its steps, leaves ``(E, K)``, and for each of its ``inputs`` the window that a step
+reads: ``seq``, ``sent``, ``received``, ``lead``, leaves ``(E, K, W)``. Behind an episode's last step ``seq`` is -1."""
+Step = Callable[[StepState], tuple[StepState, Any]]
+
+
+class OpenLoopGraph:
+    """A graph whose computed nodes can run one after the other.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: Name of the node that ``init_graph_state`` initialises first.
+        given: Nodes that are not run because their outputs are known.
+
+    Attributes:
+        order: The computed nodes, senders before readers.
+        world: The fastest of them that is a world; None without a world.
+
+    Raises:
+        UsageError: When computed nodes hear each other in a loop.
+    """
+
+    def __init__(self, nodes: Mapping[str, BaseNode], supervisor: str, given: Collection[str]) -> None:
+        self.nodes, self.supervisor, self.given = dict(nodes), supervisor, frozenset(given)
+        heard = {
+            n: {c.output_node.name for c in node.inputs.values()} - self.given
+            for n, node in self.nodes.items()
+            if n not in self.given
+        }
+        try:
+            self.order = tuple(graphlib.TopologicalSorter(heard).static_order())
+        except graphlib.CycleError as error:
+            raise UsageError(
+                f"nodes hear each other in a loop: {' -> '.join(error.args[1])}",
+                hint="give the recorded outputs of one of them",
+            ) from None
+        worlds = [self.nodes[n] for n in self.order if isinstance(self.nodes[n], BaseWorld)]
+        self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
+
+    def tables(self, timeline: Timeline, given: Mapping[str, Any]) -> Tables:
+        """Return the timing of all computed steps.
+
+        Args:
+            timeline: The timelines of E episodes.
+            given: Node -> recorded outputs, leaves ``(E, N, ...)``.
+
+        Raises:
+            UsageError: When nodes and timeline do not fit, or a window is too short for a burst of messages.
+        """
+        check_fit(self.nodes, timeline, given)
+        check_bursts(self.nodes, timeline)
+        tables: Tables = {}
+        for name in self.order:
+            vertex = timeline.vertices[name]
+            steps = np.broadcast_to(np.arange(vertex.start.shape[1]), vertex.start.shape)
+            seq = np.where(steps < vertex.count[:, None], steps, -1)
+            inputs = {i: _window(self.nodes, timeline, name, i, seq) for n, i in timeline.edges if n == name}
+            ts = (np.where(seq >= 0, vertex.start, 0) / TICKS_PER_S).astype(np.float32)
+            tables[name] = {"seq": seq.astype(np.int32), "ts": ts, "inputs": inputs}
+        return tables
+
+    def begin(self, params: Mapping[str, Any], defaults: Mapping[str, Any], eps: Any) -> GraphState:
+        """Return the state in which an episode starts.
+
+        Args:
+            params: Parameters of some nodes; the others' come from ``init_params``.
+            defaults: Default outputs that replace those of ``init_output``: node -> a message.
+            eps: The episode's number, which steps receive.
+        """
+        gs = init_graph_state(self.nodes, self.supervisor, jax.random.key(0), params)
+        outputs = dict(gs.aux[OUTPUTS])
+        for name, message in defaults.items():
+            outputs[name] = jax.tree_util.tree_map(lambda new, old: jnp.asarray(new, old.dtype), message, outputs[name])
+        return gs.replace(eps=eps, aux={OUTPUTS: outputs})
+
+    def run(
+        self,
+        gs: GraphState,
+        tables: Tables,
+        given: Mapping[str, Any],
+        record: str,
+        known: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """Run an episode and return a node's outputs, leaves ``(K, ...)``.
+
+        Args:
+            gs: What ``begin`` returned.
+            tables: Of this episode: leaves ``(K, ...)``.
+            given: Node -> its recorded messages, leaves ``(N, ...)``.
+            record: The node.
+            known: Outputs of nodes that were computed elsewhere: node -> leaves ``(1 + K, ...)``, the default first.
+        """
+        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()} | dict(known or {})
+        for name in self.order:
+            if name not in sent:
+                made = self._scan(name, gs, tables[name], sent, self._called(name, gs))
+                if name == record:
+                    return made
+                sent[name] = _with_default(gs.aux[OUTPUTS][name], made)
+        raise UsageError(f"no node {record!r} runs that could be recorded. Nodes: {', '.join(self.order)}")
+
+    def drive(self, gs: GraphState, tables: Tables, given: Mapping[str, Any], step: Step) -> Any:
+        """Run the world's ticks with another function in place of its step, for physics outside of the program.
+
+        Args:
+            gs: What ``begin`` returned.
+            tables: As in ``run``.
+            given: As in ``run``; the world may hear no other nodes.
+            step: Maps the world's step state to the next one and to a result.
+
+        Returns:
+            The results, leaves ``(ticks, ...)``.
+
+        Raises:
+            UsageError: When there is no world, or it hears a node that is not given.
+        """
+        if self.world is None:
+            raise UsageError("drive() is for graphs with a world, this one has none")
+        world, heard = self.world, [c.output_node.name for c in self.nodes[self.world].inputs.values()]
+        if live := [n for n in heard if n not in given]:
+            raise UsageError(
+                f"drive() needs all messages that the world {world!r} hears, and {live[0]!r} is not given",
+                hint="give its recorded outputs",
+            )
+        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()}
+        return self._scan(world, gs, tables[world], sent, step, ahead=True)
+
+    def _scan(
+        self, name: str, gs: GraphState, table: Tables, sent: Mapping[str, Any], step: Step, ahead: bool = False
+    ) -> Any:
+        """Make all steps of a node; ``ahead`` looks up the messages of all steps before the first one is made."""
+
+        def one(carry: Any, now: Tables) -> tuple[Any, Any]:
+            rng, state, params = carry
+            inputs = now["inputs"] if ahead else self._inputs(name, gs, now, sent)
+            new, made = step(StepState(rng, state, params, inputs, gs.eps, now["seq"], now["ts"]))
+            after = matched(name, "the state that step returns", new.state, "the one it got", state)
+            return (
+                new.rng,
+                after,
+                matched(name, "the params that step returns", new.params, "the ones it got", params),
+            ), made
+
+        if ahead:
+            table = {**table, "inputs": jax.vmap(lambda now: self._inputs(name, gs, now, sent))(table)}
+        return jax.lax.scan(one, (gs.rng[name], gs.state[name], gs.params[name]), table)[1]
+
+    def _called(self, name: str, gs: GraphState) -> Step:
+        """Return a node's step, with its output in the form of its default output."""
+
+        def step(step_state: StepState) -> tuple[StepState, Any]:
+            try:
+                new, output = self.nodes[name].step(step_state)
+            except Exception as error:
+                error.add_note(f"in the step of node {name!r}")
+                raise
+            return new, matched(name, "the output of step", output, "that of init_output", gs.aux[OUTPUTS][name])
+
+        return step
+
+    def _inputs(self, name: str, gs: GraphState, now: Tables, sent: Mapping[str, Any]) -> dict[str, InputState]:
+        """Return what one step reads."""
+        node, inputs = self.nodes[name], {}
+        for input_name, t in now["inputs"].items():
+            connection = node.inputs[input_name]
+            data = jax.tree_util.tree_map(lambda leaf, t=t: leaf[t["seq"] + 1], sent[connection.output_node.name])
+            state = InputState(t["seq"], t["sent"], t["received"], data)
+            dist = gs.delays.get(name, {}).get(input_name)
+            if dist is not None:
+                period_s = 1.0 / node.rate
+                served = dist.apply(state, t["lead"], connection.window, period_s, now["ts"], connection.skip)
+                state = served.replace(delay_dist=dist)
+            inputs[input_name] = state
+        return inputs
+
+
+def _with_default(default: Any, rows: Any) -> Any:
+    """Return messages ``(N, ...)`` behind the default output: message k is at place k + 1, an empty slot at place 0."""
+    return jax.tree_util.tree_map(lambda first, rest: jnp.concatenate([first[None], jnp.asarray(rest)]), default, rows)
+
+
+def _window(nodes: Mapping[str, BaseNode], timeline: Timeline, name: str, input_name: str, seq: np.ndarray) -> Tables:
+    """Return the messages in the window of every step ``seq (E, K)`` of a node, leaves ``(E, K, W)``."""
+    edge, reader = timeline.edges[name, input_name], timeline.vertices[name]
+    width = nodes[name].inputs[input_name].total_window
+    newest = np.where(seq >= 0, newest_message(edge, reader), -1)
+    read = messages_read(width, newest, reader.start, edge, timeline.vertices[edge.sender])
+    return dict(zip(("seq", "sent", "received", "lead"), read, strict=True))

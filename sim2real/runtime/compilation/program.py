@@ -1,0 +1,334 @@
+"""One row of a compiled graph: the steps in its slots, then the world's ticks."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
+from sim2real.runtime.compilation.wiring import SlotTable, Wiring
+from sim2real.runtime.match import check_match, matched
+
+if TYPE_CHECKING:
+    from sim2real.graph.base import Number
+
+
+T = TypeVar("T")
+Ages = tuple[int, int]
+"""Smallest and largest age of an input's newest message, counted in the sender's outputs."""
+
+
+class Rollout(NamedTuple):
+    """A node's steps in a rollout, in order; C is the number of rows times the node's slots (or ticks) per row.
+
+    Attributes:
+        seq: Shape ``(C,)``, int32: number of the step; -1 where a slot made no step.
+        output: Leaves ``(C, ...)``; meaningless where ``seq`` is -1.
+    """
+
+    seq: Number
+    output: Any
+
+
+class RowProgram:
+    """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
+
+    Args:
+        nodes: The nodes by name.
+        wiring: The tables.
+        given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
+        episodes: Number of episodes E.
+        ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
+            the sender's ring has.
+        reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        wiring: Wiring,
+        given: Mapping[str, Any],
+        episodes: int,
+        ages: Sequence[Mapping[str, Ages]] | None = None,
+        reusable: bool = False,
+    ) -> None:
+        self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
+        self.bounds: DelayBounds = bounds_of(nodes)
+        self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
+        # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
+        by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
+        self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
+        self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
+        self._always = [bool((t.seq >= 0).all()) and not reusable for t in wiring.tables]
+        self._ages = ages or [{} for _ in wiring.tables]
+
+    @property
+    def data(self) -> Any:
+        """The tables, and the bounds of trainable delays; see ``HoldsData``."""
+        return self._tables, self._world, self.bounds
+
+    def with_data(self, nodes: Mapping[str, BaseNode], data: Any) -> RowProgram:
+        """Return the program with other nodes and data, which may be traced."""
+        program = copy.copy(self)
+        program.nodes, (program._tables, program._world, program.bounds) = nodes, data
+        return program
+
+    def check_given(self, outputs: Mapping[str, Any]) -> None:
+        """Check that recorded outputs have the form of their nodes' default outputs."""
+        for name, recorded in self._given.items():
+            one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
+            check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
+
+    def always(self, slot: int) -> bool:
+        """Return whether a slot makes a step in every row of every episode."""
+        return self._always[slot]
+
+    def run_slots(
+        self,
+        gs: GraphState,
+        begin: int,
+        end: int,
+        outputs: dict[str, list[Rollout]],
+        inside: bool = False,
+        full: bool = False,
+    ) -> GraphState:
+        """Run some slots of the row; outside of the timelines nothing changes.
+
+        Args:
+            gs: The graph's state.
+            begin: First slot.
+            end: Slot after the last.
+            outputs: Node -> its steps; those of these slots are appended.
+            inside: Promise that the timelines have this row and episode, which saves masking every update.
+            full: Promise that each of the slots makes a step.
+        """
+        for i in range(begin, end):
+            name = self.wiring.slots[i]
+            step_state = self.step_state(gs, i, inside)
+            new, output = self.call(name, step_state)
+            ran = None if full or (inside and self._always[i]) else step_state.seq >= 0
+            gs = self.commit(gs, name, new, output, ran)
+            outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
+        return gs
+
+    def run_world(self, gs: GraphState, outputs: dict[str, list[Rollout]], inside: bool = False) -> GraphState:
+        """Run the world's ticks and go to the next row; outside of the timelines nothing changes.
+
+        Args:
+            gs: The graph's state.
+            outputs: Node -> its steps; the world's ticks are appended.
+            inside: As in ``run_slots``.
+        """
+        name, before, here = self.wiring.world, gs, None if inside else self.within(gs)
+        if name is not None:
+            # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
+            # worlds compile in half the time.
+            unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
+            gs, made = jax.lax.scan(partial(self.run_tick, name), gs, self.world_row(gs), unroll=unroll)
+            if here is not None:
+                made = made._replace(seq=jnp.where(here, made.seq, -1))
+            outputs.setdefault(name, []).extend(
+                jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], made) for i in range(self.wiring.ticks)
+            )
+        gs = gs.replace(step=gs.step + 1)
+        return gs if here is None else select(here, gs, before)
+
+    def world_row(self, gs: GraphState) -> Any:
+        """Return the entries of the world's table for a row, leaves ``(ticks, ...)``."""
+        return _at(self._world, gs)
+
+    def run_tick(
+        self, name: str, gs: GraphState, now: Mapping[str, Any], ages: Mapping[str, Ages] | None = None
+    ) -> tuple[GraphState, Rollout]:
+        """Run one tick of the world.
+
+        Args:
+            name: The world's name.
+            gs: The graph's state.
+            now: The tick's entries of ``world_row``.
+            ages: As for slots.
+        """
+        step_state = self._step_state(gs, name, now, ages or {})
+        new, output = self.call(name, step_state)
+        return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
+
+    def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
+        """Call a node's step; an exception gets a note with the node's name."""
+        try:
+            return self.nodes[name].step(step_state)
+        except Exception as error:
+            error.add_note(f"in the step of node {name!r}")
+            raise
+
+    def step_state(self, gs: GraphState, slot: int, inside: bool = False) -> StepState:
+        """Return the step state of a slot's step; ``seq`` is -1 if the slot makes no step.
+
+        Args:
+            gs: The graph's state.
+            slot: The slot.
+            inside: Promise that the timelines have this row and episode; ``seq`` is -1 elsewhere too.
+        """
+        table = _at(self._tables[slot], gs)
+        if not inside:
+            table["seq"] = self.seq(gs, slot)
+        return self._step_state(gs, self.wiring.slots[slot], table, self._ages[slot])
+
+    def seq(self, gs: GraphState, slot: int) -> jax.Array:
+        """Return the number of the step that a slot makes; -1 if it makes none, and outside of the timelines."""
+        return jnp.where(self.within(gs), self._tables[slot]["seq"][gs.step, gs.eps], -1)
+
+    def within(self, gs: GraphState) -> Number:
+        """Return whether the timelines have the state's episode and row; XLA clamps an index that they lack."""
+        return (gs.step < self.wiring.rows) & (gs.eps >= 0) & (gs.eps < self.episodes)
+
+    def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Number | None) -> GraphState:
+        """Put the results of a node's step into the graph's state.
+
+        Args:
+            gs: The graph's state.
+            name: The node's name.
+            new: The step state that the step returned.
+            output: The output that it returned.
+            ran: Bool scalar, whether the step counts; None: it does, which saves masking.
+        """
+
+        def merge(field: str, fresh: T, old: T) -> T:
+            if fresh is old:
+                return old
+            fresh = matched(name, f"the {field} that step returns", fresh, "the one it got", old)
+            return fresh if ran is None else select(ran, fresh, old)
+
+        changed: dict[str, Any] = {
+            field: {**getattr(gs, field), name: merge(field, getattr(new, field), getattr(gs, field)[name])}
+            for field in ("state", "rng")
+        }
+        if new.params is not gs.params[name]:
+            changed["params"] = {**gs.params, name: merge("params", new.params, gs.params[name])}
+        if name in gs.buffer:
+            kept = gs.buffer[name]
+            fresh = matched(name, "the output of step", output, "that of init_output", kept[-1])
+            pushed = (*kept[1:], fresh)
+            changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, kept)}
+        return gs.replace(**changed)
+
+    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any], ages: Mapping[str, Ages]) -> StepState:
+        inputs = {}
+        for input_name, t in table["inputs"].items():
+            connection = self.nodes[name].inputs[input_name]
+            width, age = connection.total_window, t["age"]
+            sender = connection.output_node.name
+            if sender in self._given:
+                data = self._look_up(gs, sender, t["seq"])
+            else:
+                kept = gs.buffer[sender]
+                data = _window(kept, age, width, *ages.get(input_name, (0, len(kept) - width)))
+            dist = gs.delays.get(name, {}).get(input_name)
+            state = InputState(t["seq"], t["sent"], t["received"], data)
+            if dist is not None:
+                period = 1.0 / self.nodes[name].rate
+                own = self.bounds[name][input_name].opened(dist)
+                served = own.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
+                state = served.replace(delay_dist=dist)
+            inputs[input_name] = state
+        rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
+        return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
+
+    def _look_up(self, gs: GraphState, sender: str, seq: jax.Array) -> Any:
+        """Return the recorded messages with these ``seq (W,)``; the default output where it is -1."""
+
+        def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
+            filled = seq.reshape(-1, *[1] * default.ndim) >= 0
+            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default)
+
+        return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
+
+
+def _window(kept: tuple[T, ...], age: jax.Array, width: int, least: int, most: int) -> T:
+    """Return a window of ``width`` of a node's last outputs, oldest first; ``age`` newer ones are left out.
+
+    ``age`` is from ``least`` to ``most``. The outputs are kept as separate arrays and chosen by selects, which XLA
+    fuses with other elementwise operations. One stacked array would cost a GPU a concatenation, a copy and a gather per
+    leaf.
+    """
+    begin = len(kept) - width
+    window = list(kept[begin - least : len(kept) - least])
+    for a in range(least + 1, most + 1):
+        window = [select(age == a, kept[begin - a + i], window[i]) for i in range(width)]
+    return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
+
+
+def scan_rows(
+    row: Callable[[GraphState], tuple[GraphState, dict[str, list[Rollout]]]],
+    gs: GraphState,
+    record: Sequence[str],
+    rows: int,
+    unroll: int,
+) -> tuple[GraphState, dict[str, Rollout]]:
+    """Run a number of rows in a loop.
+
+    Args:
+        row: Runs one row: state -> (state, node -> its steps).
+        gs: The graph's state.
+        record: Nodes whose outputs are returned.
+        rows: Number of rows.
+        unroll: Rows in one pass of the loop.
+
+    Returns:
+        The last state, and the records by node.
+    """
+
+    def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
+        state, outputs = row(state)
+        kept = {n: outputs.get(n, []) for n in record}
+        return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
+
+    gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
+    # (rows, per row, ...) -> (C, ...); counted, as -1 cannot be inferred for a leaf of size 0
+    merge = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])  # noqa: E731
+    return gs, {n: jax.tree_util.tree_map(merge, r) for n, r in records.items()}
+
+
+def select(mask: Number, new: T, old: T) -> T:
+    """Return ``new`` if ``mask`` is true, else ``old``, leaf by leaf.
+
+    MJX's data is one leaf: its own ``where`` skips fields that need no merging.
+
+    Args:
+        mask: Bool scalar.
+        new: A tree.
+        old: A tree of the same structure.
+    """
+
+    def one(a: Any, b: Any) -> Any:
+        if a is b:
+            return b
+        return b.where(mask, a) if _is_mjx_data(b) else jnp.where(mask, a, b)
+
+    return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
+
+
+def has_mjx_data(tree: Any) -> bool:
+    """Return whether a state of MJX is among the leaves of a tree."""
+    return any(_is_mjx_data(leaf) for leaf in jax.tree_util.tree_leaves(tree, is_leaf=_is_mjx_data))
+
+
+def _is_mjx_data(leaf: object) -> bool:
+    return type(leaf).__module__.startswith("mujoco.mjx") and hasattr(leaf, "where")
+
+
+def _pytree(table: SlotTable | None) -> dict[str, Any]:
+    if table is None:
+        return {}
+    inputs = {n: {f: getattr(t, f) for f in t.__dataclass_fields__} for n, t in table.inputs.items()}
+    return {"seq": table.seq, "ts": table.ts, "inputs": inputs}
+
+
+def _at(table: T, gs: GraphState) -> T:
+    return jax.tree_util.tree_map(lambda t: t[gs.step, gs.eps], table)

@@ -1,0 +1,291 @@
+"""Turns timelines into index tables: which step each slot of each row computes, and which messages the step reads.
+
+A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks. In a
+pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` decides which step is computed where. Pure
+numpy, before anything is compiled; ``sim2real.runtime.testing`` interprets the tables for tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.graph.timeline import Timeline
+from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
+from sim2real.graph.windows import check_bursts, longest_burst
+from sim2real.runtime.compilation.pattern import find_pattern
+from sim2real.runtime.compilation.placement import Placement, Placer
+
+EMPTY_AGE_S = 1e6
+"""Age of an empty slot in a window [s]: older than any message."""
+
+
+@dataclass(frozen=True)
+class InputTable:
+    """The messages in an input's window, for every episode and row (and tick of the row, for a world).
+
+    Attributes:
+        age: Shape ``(E, R, ...)``, int32: how many outputs the sender has made since the newest message in the window.
+        seq: Shape ``(E, R, ..., W)``, int32: -1 in empty slots.
+        sent: Like ``seq``, float32 [s].
+        received: Like ``seq``, float32 [s].
+        lead: Like ``seq``, float32: reader's start minus sent time [s]; ``EMPTY_AGE_S`` in empty slots.
+    """
+
+    age: np.ndarray
+    seq: np.ndarray
+    sent: np.ndarray
+    received: np.ndarray
+    lead: np.ndarray
+
+
+@dataclass(frozen=True)
+class SlotTable:
+    """The steps that one slot computes, for every episode and row (and tick of the row, for a world).
+
+    Attributes:
+        seq: Shape ``(E, R, ...)``, int32: number of the step; -1: no step.
+        ts: Like ``seq``, float32: the step's start [s].
+        inputs: Input name -> the messages that the step reads.
+    """
+
+    seq: np.ndarray
+    ts: np.ndarray
+    inputs: Mapping[str, InputTable]
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """The tables of a compiled graph.
+
+    Attributes:
+        world: Name of the world that ticks in every row; None without a world.
+        ticks: Number of world ticks in a row.
+        rows: Number of rows.
+        slots: The node of each slot, in the order in which slots run.
+        tables: One for each slot.
+        world_table: The world's; arrays ``(E, R, ticks, ...)``.
+        rings: Node -> how many of its last outputs are kept.
+        discarded: Fraction of the slots, over all rows, that compute no step.
+        bursts: (node, input) -> the most messages that one step consumes, the first step left out.
+        offsets: Number of the row's ticks before each slot.
+        last: Number of ticks in the last row.
+    """
+
+    world: str | None
+    ticks: int
+    rows: int
+    slots: tuple[str, ...]
+    tables: tuple[SlotTable, ...]
+    world_table: SlotTable | None
+    rings: Mapping[str, int]
+    discarded: float
+    bursts: Mapping[tuple[str, str], int]
+    offsets: tuple[int, ...]
+    last: int
+
+    @property
+    def total(self) -> int:
+        """Number of world ticks in an episode."""
+        return (self.rows - 1) * self.ticks + self.last
+
+    @property
+    def full(self) -> tuple[int, int]:
+        """The longest range of whole rows, begin and end, in which each slot makes a step in all episodes."""
+        gaps = np.any([(t.seq < 0).any(axis=0) for t in self.tables], axis=0)
+        gaps[-1] |= self.last < self.ticks
+        ends = np.flatnonzero([*gaps, True])
+        begins = np.concatenate([[0], ends[:-1] + 1])
+        i = int(np.argmax(ends - begins))
+        return int(begins[i]), int(ends[i])
+
+
+def wire(
+    nodes: Mapping[str, BaseNode],
+    supervisor: str,
+    timeline: Timeline,
+    given: frozenset[str] = frozenset(),
+    reusable: bool = False,
+) -> Wiring:
+    """Turn timelines into index tables.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name; a row is at most as long as its period.
+        timeline: The timelines.
+        given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
+        reusable: Whether rings are made longer than these timelines need, so that most timelines of a robot have rings
+            of the same lengths.
+
+    Raises:
+        UsageError: When the supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
+            trainable delay is too short for a burst of messages.
+    """
+    if supervisor not in timeline.vertices:
+        raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
+    check_bursts(nodes, timeline)
+    placer = Placer(nodes, supervisor, timeline, given)
+    return _Tables(placer, placer.place(), reusable).wiring()
+
+
+def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> Wiring | None:
+    """Turn timelines into index tables whose rows are patterns; None if they have no pattern.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name.
+        timeline: The timelines.
+    """
+    placer = Placer(nodes, supervisor, timeline, frozenset())
+    placement = find_pattern(placer)
+    return None if placement is None else _Tables(placer, placement).wiring()
+
+
+def messages_read(
+    width: int, newest: np.ndarray, ts: np.ndarray, edge: Edge, sender: Vertex
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the messages in the windows of steps: ``seq``, ``sent``, ``received`` and ``lead`` of ``InputTable``.
+
+    Args:
+        width: Length W of the window.
+        newest: Shape ``(E, C)``: the newest message that each step has consumed; -1: none, or no step.
+        ts: Shape ``(E, C)``: starts of the steps [ticks].
+        edge: The messages.
+        sender: The steps that sent them.
+    """
+    window = np.maximum(newest[..., None] - np.arange(width - 1, -1, -1), -1)
+    flat = window.reshape(len(window), -1).clip(0)
+    pick = lambda a: np.where(window >= 0, np.take_along_axis(a, flat, 1).reshape(window.shape), 0)  # noqa: E731
+    sent, received = pick(sender.end), pick(edge.received)
+    lead = np.where(window >= 0, (ts[..., None] - sent) / TICKS_PER_S, EMPTY_AGE_S)
+    seconds = lambda a: (a / TICKS_PER_S).astype(np.float32)  # noqa: E731
+    return window.astype(np.int32), seconds(sent), seconds(received), lead.astype(np.float32)
+
+
+class _Tables:
+    """Makes the tables of one placement."""
+
+    def __init__(self, placer: Placer, placement: Placement, reusable: bool = False) -> None:
+        self.placer, self.placement, self.reusable = placer, placement, reusable
+        self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
+        self.rows, self.ticks = placement.rows, placement.ticks
+        self.total = (placement.rows - 1) * placement.ticks + placement.last
+        # When the program computes each step, as a number that increases with row and slot.
+        self.done = {
+            n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
+            for n in placer.others
+        }
+
+    def wiring(self) -> Wiring:
+        """Return all tables."""
+        names = self.placement.slots
+        tables = tuple(self._slot_table(n, i) for i, n in enumerate(names))
+        world_table = self._world_table() if self.world else None
+        ran = [t.seq >= 0 for t in tables]
+        return Wiring(
+            world=self.world,
+            ticks=self.ticks,
+            rows=self.rows,
+            slots=names,
+            tables=tables,
+            world_table=world_table,
+            rings=self._rings(names, tables, world_table),
+            discarded=1.0 - float(np.mean(ran)) if ran else 0.0,
+            bursts={k: longest_burst(e, self.timeline.vertices[k[0]]) for k, e in self.placer.edges.items()},
+            offsets=self.placement.offsets,
+            last=self.placement.last,
+        )
+
+    def _moment(self, row: np.ndarray, slot: np.ndarray | int) -> np.ndarray:
+        return row * (len(self.placement.slots) + 1) + slot
+
+    def _slot_table(self, name: str, slot: int) -> SlotTable:
+        rows, slots = self.placement.row[name], self.placement.slot[name]
+        seq = np.full((self.timeline.episodes, self.rows), -1, np.int64)
+        e, k = np.nonzero((slots == slot) & (rows < self.rows) & self.placer.valid(name))
+        seq[e, rows[e, k]] = k
+        row = np.arange(self.rows, dtype=np.int64)
+        # In the last row, which may have fewer ticks, the slots behind its last tick run too.
+        ticks = np.minimum(row * self.ticks + self.placement.offsets[slot], self.total)
+        return self._table(name, seq, self._moment(row, slot), ticks)
+
+    def _world_table(self) -> SlotTable:
+        world = self.world or ""
+        episodes = self.timeline.episodes
+        # The last row's table is as long as the others', also where the row has fewer ticks.
+        tick = np.minimum(np.arange(self.rows * self.ticks, dtype=np.int64), self.total - 1)
+        before = np.searchsorted(self.placement.offsets, tick % self.ticks, side="right")
+        after = self._moment(tick // self.ticks, before)  # the slots before this tick are done
+        seq = np.broadcast_to(tick, (episodes, tick.size))
+        flat = self._table(world, seq, after, tick)
+        split = lambda a: a.reshape(episodes, self.rows, self.ticks, *a.shape[2:])  # noqa: E731
+        inputs = {
+            n: InputTable(*(split(getattr(t, f)) for f in InputTable.__dataclass_fields__))
+            for n, t in flat.inputs.items()
+        }
+        return SlotTable(split(flat.seq), split(flat.ts), inputs)
+
+    def _table(self, name: str, seq: np.ndarray, moment: np.ndarray, ticks: np.ndarray) -> SlotTable:
+        """Return the table of steps ``seq (E, C)``.
+
+        ``moment (C,)`` is when the program computes each, ``ticks (C,)`` how many ticks the world has then made.
+        """
+        ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
+        inputs = {}
+        for key, edge in self.placer.edges.items():
+            if key[0] != name:
+                continue
+            if edge.sender in self.placer.given:
+                made = None
+            elif edge.sender == self.world:
+                made = np.broadcast_to(ticks, seq.shape)
+            else:
+                made = search_rows(self.done[edge.sender], np.broadcast_to(moment, seq.shape))
+            inputs[key[1]] = self._input_table(key, seq, ts, made)
+        return SlotTable(seq.astype(np.int32), (ts / TICKS_PER_S).astype(np.float32), inputs)
+
+    def _input_table(
+        self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, made: np.ndarray | None
+    ) -> InputTable:
+        """Return the messages that steps read on an input.
+
+        ``seq (E, C)`` and ``ts (E, C)`` [ticks] are the steps and their starts; ``made (E, C)`` is how many steps the
+        sender has then made, None if its outputs are given.
+        """
+        connection, edge = self.nodes[key[0]].inputs[key[1]], self.placer.edges[key]
+        sender: Vertex = self.timeline.vertices[edge.sender]
+        newest = np.take_along_axis(self.placer.newest[key], seq.clip(0), 1)
+        age = np.zeros_like(seq) if made is None else np.where(seq >= 0, made - 1 - newest, 0)
+        if (age < 0).any():
+            raise UsageError(
+                f"input {key[1]!r} of node {key[0]!r} would read a message that has not been computed",
+                hint="the timeline's edges contradict its vertices: re-derive it",
+            )
+        return InputTable(
+            age.astype(np.int32),
+            *messages_read(connection.total_window, np.where(seq >= 0, newest, -1), ts, edge, sender),
+        )
+
+    def _rings(
+        self, names: tuple[str, ...], tables: tuple[SlotTable, ...], world_table: SlotTable | None
+    ) -> dict[str, int]:
+        rings = dict.fromkeys(self.nodes, 0)
+        readers = list(zip(names, tables, strict=True))
+        if self.world and world_table:
+            readers.append((self.world, world_table))
+        for reader, table in readers:
+            for input_name, t in table.inputs.items():
+                connection = self.nodes[reader].inputs[input_name]
+                sender = connection.output_node.name
+                if sender in self.placer.given:
+                    continue
+                room = int(t.age.max(initial=0))
+                # 2, 4, 8 ...; a robot that was late once reads older messages, another recording of it none.
+                if self.reusable and (room or not connection.blocking):
+                    room = max(2, 1 << (room - 1).bit_length())
+                rings[sender] = max(rings[sender], room + connection.total_window)
+        return rings

@@ -1,0 +1,1 @@
+"""A graph on the wall clock: one thread for each node."""

@@ -1,0 +1,234 @@
+"""A graph on the wall clock: one thread per node, and the timing rules with measured times."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import NoReturn
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.episode import Recorder
+from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.runtime.clock import MonotonicClock, realtime
+from sim2real.runtime.data import NodeData, snapshot
+from sim2real.runtime.failure import GraphTimeout
+from sim2real.runtime.statistics import NodeStatistics
+from sim2real.runtime.stepper import Stepper
+from sim2real.runtime.wall_clock.channel import MessageChannel
+from sim2real.runtime.wall_clock.handover import Handover, Reply
+from sim2real.runtime.wall_clock.node_thread import NodeThread, Shared
+from sim2real.runtime.wall_clock.watchdog import LAST_RESORT_S, Watchdog, step_limits
+
+_LEAD_S = 0.005
+_POLL_S = 0.05
+
+
+class WallClockRun:
+    """One episode on the wall clock.
+
+    Args:
+        nodes: The nodes by name.
+        supervisor: The supervisor's name.
+        steppers: Prepared steppers by name.
+        data: The nodes' data by name.
+        graph_state: The state at the episode's start.
+        recorder: Receives all steps and messages, or None.
+        own: Whether the supervisor makes its steps itself.
+        spin_s: How long before each step a thread polls the clock instead of sleeping [s].
+        timeout_s: How long the supervisor waits for its caller [s].
+        step_timeout_s: How long a step may take, see ``step_limits``.
+    """
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        supervisor: str,
+        steppers: Mapping[str, Stepper],
+        data: dict[str, NodeData],
+        graph_state: GraphState,
+        recorder: Recorder | None,
+        own: bool,
+        spin_s: float,
+        timeout_s: float,
+        step_timeout_s: float | None,
+    ) -> None:
+        self._nodes, self._supervisor, self._data = nodes, supervisor, data
+        self._graph_state, self._recorder, self._gym = graph_state, recorder, not own
+        self._clock = MonotonicClock()
+        self._handover = Handover(own)
+        self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
+        self._channels = {(n, c.name): MessageChannel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
+        self._threads: dict[str, NodeThread] = {}
+        for name, node in nodes.items():
+            inputs = {i: self._channels[name, i] for i in node.inputs}
+            outputs = [self._channels[c.input_node.name, c.name] for c in node.outputs if c.input_node.name in nodes]
+            handover = self._handover if name == supervisor else None
+            self._threads[name] = NodeThread(steppers[name], data[name], inputs, outputs, self._shared, handover)
+        self._watchdog = Watchdog(self._threads.values(), step_limits(nodes, step_timeout_s), self._shared)
+        self._process = ExitStack()
+        self._stop_lock = threading.Lock()
+        self._stopped = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the graph has stopped, or is stopping."""
+        return self._shared.stopping.is_set()
+
+    @property
+    def alive(self) -> list[str]:
+        """Nodes whose threads have not ended."""
+        return [n for n, t in self._threads.items() if t.is_alive()]
+
+    def begin(self, timeout_s: float) -> None:
+        """Call the nodes' startups, each in its thread, and then start the clock."""
+        self._shared.timeout_s = timeout_s
+        with self._stop_lock:
+            self._refuse_if_stopped()
+            # Before the startups, which may switch torque on: a garbage collection stops all threads, for 0.5 s in a
+            # large process, and a servo's watchdog would trip.
+            self._process.enter_context(realtime())
+            deadline = time.monotonic() + timeout_s
+            # Under the lock: stop() in another thread then finds either no thread started or all of them.
+            self._watchdog.start()
+            for thread in self._threads.values():
+                thread.start()
+        for name, thread in self._threads.items():
+            while not (thread.ready.wait(_POLL_S) or self.ended):
+                if time.monotonic() > deadline:
+                    self._shared.fail(
+                        GraphTimeout(
+                            f"node {name!r} has not finished its startup after {timeout_s:g} s",
+                            hint="see what it waits for, or start with a longer timeout_s",
+                        )
+                    )
+        self.check()
+        with self._stop_lock:
+            self._refuse_if_stopped()
+        self._clock.begin(_LEAD_S)
+        for node in self._nodes.values():
+            node.set_clock(self._clock.now_s, self._clock.origin_ns)
+        if self._recorder is not None:
+            ahead_ns = self._clock.origin_ns - time.monotonic_ns()
+            self._recorder.start(time.time_ns() + ahead_ns, self._clock.origin_ns)
+        self._shared.go.set()
+
+    def _refuse_if_stopped(self) -> None:
+        if self.ended:
+            raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
+
+    def check(self) -> None:
+        """Stop the graph and raise its failure, if it has one that was not raised yet."""
+        if self._shared.failure is not None:
+            self.stop(self._shared.timeout_s)
+
+    def observe(self, timeout_s: float) -> StepState:
+        """Wait for the supervisor's next step."""
+        if self._handover.own:
+            raise UsageError(
+                f"the supervisor {self._supervisor!r} makes its own steps",
+                hint="call reset() instead of start() to make them yourself",
+            )
+        step_state = self._handover.observe(timeout_s)
+        self.check()
+        if step_state is None:
+            self._missing(f"no step of the supervisor {self._supervisor!r} within {timeout_s:g} s")
+        return step_state
+
+    def reply(self, reply: Reply) -> int:
+        """Reply to the step on offer; return how many steps are finished once that one is."""
+        return self._handover.reply(reply)
+
+    def settle(self, finished: int, timeout_s: float) -> None:
+        """Wait until the supervisor has finished ``finished`` steps."""
+        done = self._handover.settle(finished, timeout_s)
+        self.check()
+        if not done:
+            self._missing(f"the supervisor {self._supervisor!r} has not finished its step after {timeout_s:g} s")
+
+    def run_for(self, duration_s: float) -> None:
+        """Let the graph run for ``duration_s``, the supervisor making its own steps; return early if it is stopped."""
+        self._handover.set_own(True)
+        self._shared.stopping.wait(duration_s)
+        self.check()
+        if self._gym:
+            self._handover.set_own(False)
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Wait until the graph stops; return False if the time was up before."""
+        ended = self._shared.stopping.wait(timeout_s)
+        self.check()
+        return ended
+
+    def stop(self, timeout_s: float) -> None:
+        """Stop all nodes and make them safe; raise the graph's failure, if it has one that was not raised yet."""
+        deadline = time.monotonic() + timeout_s
+        self._shared.stop(timeout_s)
+        if threading.current_thread() in self._threads.values():
+            return  # a node stops its own graph: its thread cannot wait for itself
+        with self._stop_lock:
+            if not self._stopped:
+                self._stopped = True
+                self._end(deadline)
+            failure = self._shared.deliver()
+        if failure is not None:
+            raise failure
+
+    def snapshot(self) -> GraphState:
+        """Return the graph's state as of each node's last finished step."""
+        return snapshot(self._graph_state, self._data, self._supervisor)
+
+    def statistics(self) -> dict[str, NodeStatistics]:
+        """Return timing statistics of each node."""
+        return {name: thread.log.summary() for name, thread in self._threads.items()}
+
+    def _wake(self) -> None:
+        """Wake threads that wait for messages or for the caller: neither will come any more."""
+        self._handover.close()
+        for channel in self._channels.values():
+            channel.stop()
+
+    def _end(self, deadline: float) -> None:
+        begin = time.monotonic()
+        for thread in self._threads.values():
+            if thread.ident is not None:
+                thread.over.wait(max(0.0, deadline - time.monotonic()))
+                if not thread.made_safe:
+                    thread.join(max(0.0, deadline - time.monotonic()))
+        self._watchdog.finish()
+        self._process.close()
+        for name, thread in self._threads.items():
+            if thread.is_alive() and not thread.failed:
+                if not thread.made_safe:
+                    thread.make_safe_from_outside(LAST_RESORT_S)
+                waited_s = time.monotonic() - begin
+                self._shared.fail(
+                    GraphTimeout(
+                        f"node {name!r} is still in its {thread.during} {waited_s:.1f} s after the stop; "
+                        "its stop() was called from outside",
+                        hint="give what it waits for a timeout of its own",
+                    )
+                )
+        for node in self._nodes.values():
+            node.set_clock(None)
+        self._record_leftovers()
+
+    def _record_leftovers(self) -> None:
+        if self._recorder is None:
+            return
+        try:
+            for (name, _), channel in self._channels.items():
+                if not self._threads[name].is_alive():
+                    for record in channel.leftover():
+                        self._recorder.message(record)
+        except Sim2RealError as error:
+            self._shared.fail(error)
+        except Exception as error:  # as a note, if a node has failed: that failure must still reach the caller
+            self._shared.fail(Sim2RealError(f"the recorder failed at the end: {type(error).__name__}: {error}"))
+
+    def _missing(self, what: str) -> NoReturn:
+        if self.ended:
+            raise Sim2RealError("the graph was stopped while a step was awaited", hint="call reset() to start it again")
+        raise GraphTimeout(what, hint="is one of its blocking inputs silent?")

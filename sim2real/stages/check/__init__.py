@@ -1,0 +1,1 @@
+"""The stage check: whether a recording can determine the parameters."""

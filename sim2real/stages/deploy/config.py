@@ -1,0 +1,66 @@
+"""How a policy is deployed; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sim2real.errors import UsageError
+from sim2real.hardware.safety.config import GateLimits
+from sim2real.stages.seed import check_seed
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """Run the policy on the robot and compare with the simulation."""
+
+    port: str = "embedded"
+    """Serial port of the servo bus, or 'embedded' for the emulated robot."""
+    bundle: str | None = None
+    """Folder of the policy bundle; default: the newest training of the pipeline."""
+    episodes: int = 2
+    """How many times to deploy."""
+    duration_s: float = 10.0
+    """Length of a deployment [s]."""
+    settle_s: float = 20.0
+    """Longest wait for the robot to come to rest before a deployment [s]."""
+    seed: int = 0
+    """Seed of the embedded robot."""
+    backend: Literal["numpy", "onnx"] | None = None
+    """What runs the policy: numpy, or onnxruntime; default: numpy, but onnxruntime for a network of your own."""
+    blend_s: float = 0.0
+    """Time in which the policy's action grows from none to all of it, for a first try on a robot [s]."""
+    measure_delay: bool = True
+    """Measure the delay with a few small steps, where the robot says how, before the policy moves it."""
+    delay_tolerance_s: float = 0.008
+    """How far the measured delay may lie outside of those that the policy was trained with [s]."""
+    force: bool = False
+    """Deploy, with a warning, though the delay is not what the policy was trained with."""
+    hold: bool = False
+    """Hold the robot where an episode or Ctrl-C ends it, until Enter is pressed: for one that falls without torque."""
+    dry_run: bool = False
+    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
+    strict_timing: bool = False
+    """End with code 5 when more than 1 % of the steps miss their deadline."""
+    max_tilt_rad: float | None = None
+    """How far the robot may lean before it is stopped, of one that sees its tilt; default: not checked [rad]."""
+    gate: GateLimits = field(default_factory=GateLimits)
+    """Limits on every command."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        check_seed(self.seed)
+        if self.max_tilt_rad is not None and not 0.0 < self.max_tilt_rad <= math.pi:
+            raise UsageError(f"max_tilt_rad must lie in (0, pi] rad, got {self.max_tilt_rad}")
+        if not (0.0 <= self.blend_s <= 60.0 and 0.0 < self.delay_tolerance_s <= 1.0):
+            raise UsageError(
+                "blend_s must lie in [0, 60] s and delay_tolerance_s in (0, 1] s, "
+                f"got {self.blend_s} and {self.delay_tolerance_s}"
+            )
+        if self.episodes < 1:
+            raise UsageError(f"episodes must be at least 1, got {self.episodes}")
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
+        if not 0.0 < self.settle_s <= 600.0:
+            raise UsageError(f"settle_s must lie in (0, 600] s, got {self.settle_s}")

@@ -1,0 +1,334 @@
+"""What identify found, as its artifact holds it and as the console shows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.estimation.links import Link
+from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.files import number
+from sim2real.artifacts.identification import (
+    ROUND_TRIP,
+    Determined,
+    Estimate,
+    HeldOut,
+    Identification,
+    Judgement,
+    Left,
+    Matrix,
+    Refinement,
+    Search,
+)
+from sim2real.identify.fit import Fit
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.uncertainty import identifiability, noise, uncertainty
+from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
+from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
+from sim2real.identify.validation.prediction import position_of
+from sim2real.identify.validation.verdict import Position, Score, judge, scores
+from sim2real.log.schema import unit_of
+from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation.free_run import Lack
+from sim2real.stages.terminal.console import note, table
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A fit, and how uncertain it is.
+
+    Attributes:
+        fit: The fit.
+        at: Its residuals.
+        spread: Its uncertainty.
+        check: What the data determines.
+        trip: The sum of the delays; None where there are none.
+        widening: Factor on its deviations with which draws cover the errors of the model.
+    """
+
+    fit: Fit
+    at: uncertainty.Linearised
+    spread: uncertainty.Uncertainty
+    check: identifiability.Check
+    trip: RoundTrip | None
+    widening: float
+
+    @property
+    def x(self) -> np.ndarray:
+        """The estimate on the parameters' scales, ``(P,)``."""
+        return self.at.x
+
+    @staticmethod
+    def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
+        """Compute how uncertain a fit is.
+
+        Args:
+            fit: The fit.
+            without: What was identified without one part of the recordings or another.
+        """
+        at = uncertainty.linearise(fit.problem, fit.z)
+        spread = held_out_parts.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
+        check = identifiability.from_linearised(fit.problem, at)
+        spread, check = negligible(fit.problem, fit.z, at, spread, check)
+        fit, at = _where_nothing_is_said(fit, at, spread)
+        trip = round_trip(fit.problem.table, at.x, spread)
+        return Findings(fit, at, spread, check, trip, noise.widening(fit.problem.table, at, spread))
+
+
+def _where_nothing_is_said(
+    fit: Fit, at: uncertainty.Linearised, spread: uncertainty.Uncertainty
+) -> tuple[Fit, uncertainty.Linearised]:
+    """Return a fit with limits that no motion reaches where the data sheet has them: the search left them anywhere."""
+    table, x = fit.problem.table, at.x.copy()
+    for i in np.flatnonzero([v == NOT_REACHED for v in spread.verdict]):
+        p = table.columns[i].parameter
+        x[i] = p.to_scale(indifferent(p, float(spread.low[i])))
+    z = np.where(x == at.x, fit.z, table.at_scale(x))
+    return replace(fit, z=z), replace(at, x=x)
+
+
+def document(
+    pipeline: str, found: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
+) -> Identification:
+    """Return the estimates and their uncertainty; predictions and verdict are added later.
+
+    Args:
+        pipeline: Name of the robot's pipeline.
+        found: The estimates.
+        posterior: What robots are drawn from.
+        truth: The embedded robot's own values, those that are known.
+        seconds: What the search took [s].
+    """
+    fit, spread, check = found.fit, found.spread, found.check
+    names = tuple(fit.problem.table.names)
+    minute = dict(zip(names, check.per_minute.tolist(), strict=True))
+    search = Search(
+        strategy=fit.problem.config.strategy if fit.search else None,
+        history=np.asarray(fit.search.history) if fit.search else np.zeros(0),
+        evaluations=fit.search.evaluations if fit.search else 0,
+        refined=tuple(Refinement(r.before, r.loss, r.steps) for r in fit.refined),
+        seconds=seconds,
+        engine=str(fit.problem.engine),
+    )
+    if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
+        rows = tuple(_without_interval(row) for row in _rows(found, truth))
+        return Identification(
+            pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
+        )
+    return Identification(
+        pipeline=pipeline,
+        logs=(),
+        verdict=Judgement("", ()),
+        parameters=tuple(_rows(found, truth)),
+        search=search,
+        covariance=Matrix(names, spread.covariance),
+        correlation=Matrix(names, spread.correlation),
+        residual_inflation=spread.inflation,
+        misfit=spread.misfit,
+        check=Determined(check.condition, check.undetermined, check.messages, minute),
+        posterior=posterior,
+        widening=found.widening,
+    )
+
+
+def judged(
+    document: Identification,
+    found: Findings,
+    units: Mapping[str, str],
+    max_delay_s: float,
+    outside: Sequence[str],
+    lack: Lack,
+) -> Identification:
+    """Return the document with its verdict, whose ``next`` are the flags with which to identify again.
+
+    Args:
+        document: With predictions.
+        found: The estimates.
+        units: Field -> unit.
+        max_delay_s: For which delays the model is made [s].
+        outside: Where held-out data goes beyond what was fitted: sentences.
+        lack: What free runs show.
+    """
+    judged_on = positions(found.fit.problem, units)
+    rows = scores(document.prediction, judged_on)
+    table = found.fit.problem.table
+    fit = found.fit
+    verdict = judge(
+        rows,
+        table,
+        found.x,
+        found.spread,
+        found.check,
+        trip=found.trip,
+        max_delay_s=max_delay_s,
+        beyond=outside,
+        left=None if fit.converged else fit.left,
+    )
+    horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
+    worth = held_out_parts.sentences(document.left_out, judged_on, horizon_s)
+    status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
+    flags = " ".join(f for f in (verdict.flags, lack.flags) if f)
+    told = Judgement(status, (*worth, *verdict.reasons, *lack.reasons), flags)
+    return replace(document, verdict=told, held_out=tuple(scored(rows)))
+
+
+def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
+    """Return the measured positions, which the verdict judges one by one."""
+    return [
+        Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma)
+        for c in problem.model.channels
+    ]
+
+
+def scored(scores: Sequence[Score]) -> list[HeldOut]:
+    """Return how far each position is off on held-out data, the worst first."""
+    return [
+        HeldOut(
+            name=s.position.name,
+            column=s.position.column,
+            unit=s.position.unit,
+            horizon_s=s.horizon_s,
+            rmse={m: e if math.isfinite(e) else None for m, e in {"identified": s.own, **s.others}.items()},
+            beaten_by=tuple(s.beaten_by),
+        )
+        for s in scores
+    ]
+
+
+def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
+    """Return the quantities in which recordings are compared: name, unit, and the parameters that it is the sum of."""
+    free = [p for p in parameters if p.free and not p.per_recording]
+    delays = [p.name for p in free if p.kind == "delay"]
+    rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]
+    return rows + ([(ROUND_TRIP, "s", delays)] if len(delays) > 1 else [])
+
+
+def show(found: Identification) -> None:
+    """Print the parameters, and what stands in the way of trusting them."""
+    rows = []
+    for p in found.parameters:
+        interval = "" if p.low95 is None else f"[{p.low95:.4g}, {number(p.high95):.4g}]"
+        rows.append([p.name, p.estimate, interval, p.unit, p.nominal, p.truth, _off(p), p.verdict])
+    print(table(rows, ["parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict"]))
+    if found.aggregate:
+        each = [
+            [a.name, a.mean, f"[{a.low95:.4g}, {a.high95:.4g}]", a.unit, a.between, a.agree] for a in found.aggregate
+        ]
+        print(table(each, ["over recordings", "mean", "95 % of the next", "unit", "spread", "agree"]))
+    if found.posterior is not None and found.posterior.others:
+        others = [[o.about, f"{100 * o.weight:.0f} %"] for o in found.posterior.others]
+        print(table(others, ["explains the recordings as well", "share of the draws"]))
+    if found.held_out:
+        models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
+        errors = [[row.name, *(row.rmse.get(m) for m in models), row.unit] for row in found.held_out]
+        print(table(errors, [f"off {found.held_out[0].horizon_s:g} s ahead, held out", *models, "unit"]))
+    if found.links:
+        print(link_table(found.links))
+    note(f"verdict: {found.verdict.status}")
+    for reason in found.verdict.reasons:
+        note(f"  {reason}")
+    if found.verdict.next:
+        note(f"next: {found.verdict.next}")
+
+
+def _off(p: Estimate) -> str:
+    """Return how far an estimate is from the truth; of a truth of 0 in its unit."""
+    if p.truth is None:
+        return ""
+    return f"{100 * (p.estimate / p.truth - 1):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
+
+
+def link_table(links: Sequence[Link]) -> str:
+    """Return what was found of links, as a table with a 95 % interval a number."""
+    rows = [
+        [name, factor * number(r.value), f"[{factor * number(r.low95):.4g}, {factor * number(r.high95):.4g}]", unit]
+        for link in links
+        for name, r, factor, unit in link.rows()
+    ]
+    return table(rows, ["link", "estimate", "95 % interval", "unit"])
+
+
+def summary(found: Identification) -> dict[str, Any]:
+    """Return the few lines that the console shows at the end; of several positions the worst."""
+    total = next((p for p in found.parameters if p.name == ROUND_TRIP), None)
+    first = found.logs[0].path
+    lines: dict[str, Any] = {"log": first if len(found.logs) == 1 else f"{len(found.logs)} logs, the first {first}"}
+    if total:
+        lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
+    if found.held_out:
+        worst = found.held_out[0]
+        count, unit = len(found.held_out), f" {worst.unit}".rstrip()
+        which = worst.name + (f", the worst of {count}" if count > 1 else "")
+        lines["position"] = f"{which}, on held-out data"
+        for model, error in worst.rmse.items():
+            if error is not None:
+                lines[f"{model}, {worst.horizon_s:g} s ahead"] = f"{error:.4f}{unit}"
+        for model in ("identified", "hold"):
+            free = [number(r.rmse) for r in found.free_run if r.field == worst.column and r.model == model]
+            if free:
+                lines[f"{model}, free run"] = f"{np.mean(free):.4f}{unit}"
+    seconds = number(found.search.seconds)
+    lines["verdict"] = found.verdict.status
+    lines["search"] = f"{found.search.evaluations} candidates in {seconds:.0f} s"
+    return lines
+
+
+def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:
+    parameters, spread = found.fit.problem.table, found.spread
+    rows = []
+    for i, column in enumerate(parameters.columns):
+        p = column.parameter
+        value = np.ravel(found.fit.values[p.name])[column.recording or 0]
+        rows.append(
+            Estimate(
+                name=column.label,
+                unit=p.unit,
+                kind=p.kind,
+                about=p.about,
+                nominal=p.nominal,
+                estimate=float(value),
+                standard_error=float(spread.standard_error[i]),
+                low95=float(spread.low[i]),
+                high95=float(spread.high[i]),
+                lower=p.low,
+                upper=p.high,
+                verdict=spread.verdict[i],
+                truth=truth.get(p.name),
+            )
+        )
+    for p in (p for p in parameters if not p.free):
+        ends = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
+        named = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
+        rows.append(Estimate(*named, verdict="fixed", truth=truth.get(p.name), **ends))
+    return rows + ([_round_trip(found.trip, truth)] if found.trip else [])
+
+
+def _without_interval(row: Estimate) -> Estimate:
+    """Return the row of a parameter whose fit did not converge."""
+    if row.verdict == "fixed":
+        return row
+    return replace(row, standard_error=None, low95=None, high95=None, verdict="not converged")
+
+
+def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> Estimate:
+    """Return the row of the sum of all delays, which a log determines even where it cannot tell them apart."""
+    return Estimate(
+        name=ROUND_TRIP,
+        unit="s",
+        kind="derived",
+        about=" + ".join([*trip.parts, *trip.held]),
+        nominal=0.0,
+        estimate=trip.estimate,
+        standard_error=trip.standard_error,
+        low95=trip.low,
+        high95=trip.high,
+        lower=trip.lower,
+        upper=trip.upper,
+        verdict=trip.verdict,
+        truth=truth.get(ROUND_TRIP),
+    )

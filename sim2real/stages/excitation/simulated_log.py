@@ -1,0 +1,84 @@
+"""The log that commands would give if the robot were its model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.episode import Episode, Steps, named_leaves
+from sim2real.graph.node import to_ticks
+from sim2real.graph.schedule import draw
+from sim2real.graph.times import Vertex
+from sim2real.identify.config import FitConfig
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.problem.engine import CRollouts, choose
+from sim2real.robots.contract import Robot
+from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+
+
+def simulate(
+    model: IdentifiableModel,
+    robot: Robot,
+    signal: np.ndarray,
+    values: Mapping[str, Any],
+    config: FitConfig,
+    seed: int = 0,
+) -> Episode:
+    """Return the log that commands would give if the robot were the model.
+
+    It starts at rest; joints that are told where to go start where they are told to be.
+
+    Args:
+        model: The model.
+        robot: Says which command is excited, and at which rate.
+        signal: Shape ``(N, actions)``: one command a step, as ``Robot.around`` returns them.
+        values: Parameters by name.
+        config: For which delays the model is made, and what simulates it.
+        seed: Of the timing.
+    """
+    nodes = model.nodes(config.max_delay_s)
+    engine = choose(config.engine, nodes, model.given, config.jacobian)
+    timeline = draw(nodes, len(signal) / robot.rate_hz, rng=seed)
+    given, outputs = {}, {}
+    for name in model.given:
+        message = nodes[name].init_output(jax.random.key(0), None)
+        count = timeline.vertices[name].start.shape[1]
+        rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
+        if name == robot.roles.actuator:
+            played = signal[np.minimum(np.arange(count), len(signal) - 1)]
+            rows[robot.command] = played.reshape(rows[robot.command].shape)
+        leaves, kind = jax.tree_util.tree_flatten(message)
+        given[name] = kind.unflatten(
+            [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
+        )
+        outputs[name] = rows
+    graph = OpenLoopGraph(nodes, model.sensor, model.given)
+    tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, given))
+    messages = jax.tree_util.tree_map(lambda rows: rows[0], given)
+    rest = named_leaves(nodes[model.sensor].init_output(jax.random.key(0), None))
+    told = [i for i, c in enumerate(model.channels) if c.goal is not None]
+    start = np.array([float(c.of(np.asarray(rest[c.position]))) for c in model.channels])
+    start[told] = [signal[0, model.channels[i].index or 0] for i in told]
+    params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
+    # The first command is taken to have held before, as where a log is cut into segments.
+    gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
+    if engine.name == "c":
+        outside = CRollouts(graph, engine.model)
+        found = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
+    else:
+        found = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
+    count = int(timeline.vertices[model.sensor].count[0])
+    outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(found).items()}
+    early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
+    steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
+    return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
+
+
+def _steps(vertex: Vertex, count: int, early: int) -> Steps:
+    """Return the steps of one drawn node as a log has them, ``early`` ticks before."""
+    start, end = (np.maximum(times[0, :count] - early, 0) for times in (vertex.start, vertex.end))
+    return Steps(start, start, start, np.full(count, -1), end, np.zeros(count, np.int64))

@@ -1,0 +1,1 @@
+"""The stage identify: parameters, delays and initial states from recordings."""

@@ -1,0 +1,77 @@
+"""What really happened on the embedded robot: asked for after the work is done, to compare with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sim2real.artifacts.recording import Recording
+from sim2real.graph.episode import Steps
+from sim2real.hardware.emulation.truth import Kind, Truth
+from sim2real.robots.roles import Roles
+from sim2real.stages.terminal.console import note
+
+_NEAR_NS = 3_000_000
+
+
+def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
+    """Return the true parameters, and the true mean delays in the log's own terms.
+
+    ``sensor_delay`` is from the motion to the measurement's time stamp, ``actuator_delay`` from the end of the
+    actuator's step to the motor [s]. Nothing is returned for a robot that is not embedded.
+    """
+    try:
+        truth = recording.truth
+        if truth is None:
+            return {}
+        values = {name: float(v) for name, v in truth.parameters.items()}
+    except (ValueError, KeyError) as error:  # nothing depends on it but a column of a table
+        note(f"warning: {recording.truth_path} is damaged, so nothing is compared with the truth: {error}")
+        return {}
+    episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
+    if origin_ns is None:  # a session that crashed never wrote when it started
+        return values
+    sensing = sensing_delay_s(truth, episode.steps[roles.sensor], origin_ns)
+    actuation = actuation_delay_s(truth, episode.steps[roles.actuator], origin_ns)
+    delays = {"sensor_delay": sensing, "actuator_delay": actuation, "round_trip_delay": sensing + actuation}
+    return {**values, **{name: delay for name, delay in delays.items() if math.isfinite(delay)}}
+
+
+def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
+    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any.
+
+    Args:
+        truth: The embedded robot's account.
+        steps: The sensor's.
+        origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
+    """
+    stamp = steps.begun * 1000 + origin_ns
+    samples = truth.of(Kind.SAMPLE)
+    if not len(samples):
+        return float("nan")
+    nearest = np.clip(np.searchsorted(samples["t_host_ns"], stamp), 0, len(samples) - 1)
+    matched = np.abs(samples["t_host_ns"][nearest] - stamp) < _NEAR_NS
+    return _mean_s((stamp - samples["t_ns"][nearest])[matched])
+
+
+def actuation_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
+    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any.
+
+    Args:
+        truth: The embedded robot's account.
+        steps: The actuator's.
+        origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
+    """
+    start, end = steps.start * 1000 + origin_ns, steps.end * 1000 + origin_ns
+    effects = truth.of(Kind.EFFECT)
+    effects = effects[effects["t_host_ns"] > 0]
+    if not len(effects):
+        return float("nan")
+    nearest = np.clip(np.searchsorted(effects["t_host_ns"], start), 0, len(effects) - 1)
+    matched = (effects["t_host_ns"][nearest] >= start) & (effects["t_host_ns"][nearest] <= end)
+    return _mean_s((effects["t_ns"][nearest] - end)[matched])
+
+
+def _mean_s(durations_ns: np.ndarray) -> float:
+    return float(durations_ns.mean() * 1e-9) if durations_ns.size else float("nan")

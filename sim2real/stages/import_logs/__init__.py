@@ -1,0 +1,1 @@
+"""The stage import: files of other recorders into logs."""

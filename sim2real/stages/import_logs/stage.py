@@ -1,0 +1,216 @@
+"""Turn files of other recorders into logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.run import run_folder
+from sim2real.artifacts.timing import Timing
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.log.importing import evidence, importer
+from sim2real.log.importing.files.foreign import ForeignFile, joined, open_foreign
+from sim2real.log.importing.mapping import FieldMapping, ImportMapping, load_mapping, to_toml
+from sim2real.log.importing.proposal import pipeline_name, propose
+from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.signal_names import meaning
+from sim2real.robots.from_model.mjcf import joints_of, read_model, slides_of, unit_for
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.roles import ROLES
+from sim2real.stages.import_logs.config import ImportConfig
+from sim2real.stages.pipeline import pipeline
+from sim2real.stages.terminal import console
+
+
+def run(config: ImportConfig) -> None:
+    """Write a log for each file, into a run folder of its own or where the configuration says.
+
+    Raises:
+        UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
+            proposed and something is ambiguous.
+    """
+    files = [open_foreign(path, config.format, config.episode) for path in config.sources]
+    files = [joined(files)] if config.together and len(files) > 1 else files
+    mapping = told_mapping(config)
+    text = "" if mapping else None
+    for file in files:
+        if mapping is None:
+            mapping, text = proposed(file, asked(config))
+        else:
+            for line in file.notes:
+                console.note(line)
+        episode = importer.import_opened(file, mapping, config.selection)
+        refuse_contradictions(file.path, episode, config.as_told)
+        facts, log, written = importer.facts(episode), config.out, None
+        if log is None:
+            inputs = mapping.inputs(file.path) | {f"source_{i}": p for i, p in enumerate(file.beside, 1)}
+            with run_folder.open_stage(config.runs, mapping.pipeline, "record", config, inputs) as stage:
+                importer.write_log(log := stage.output("log", "session.mcap"), episode, mapping)
+                if text:
+                    (written := stage.output("mapping", "import.toml")).write_text(text, encoding="utf-8")
+                for name, path in Timing.of(episode).save(stage.folder).items():
+                    stage.output(name, path)
+                stage.summary(facts)
+        else:
+            importer.write_log(log, episode, mapping)
+            if text:
+                (written := log.with_suffix(".import.toml")).write_text(text, encoding="utf-8")
+        print(console.pairs(facts))
+        console.wrote(log)
+        if written is not None:
+            console.wrote(written)
+            console.note(f"the next file of this recorder: sim2real import FILE --mapping {console.shown(written)}")
+            text = ""
+
+
+def told_mapping(config: ImportConfig) -> ImportMapping | None:
+    """Return the mapping that is named, or that the pipeline has; None: one is to be proposed."""
+    if config.mapping is None and config.pipeline is None:
+        return None
+    home = pipeline.load_pipeline(config.pipeline) if config.pipeline and not config.mapping else None
+    if home is not None and not (home.folder / "import.toml").is_file() and described(home):
+        return None
+    return load_mapping(config.mapping, config.pipeline, home.package if home else None)
+
+
+def described(home: pipeline.Pipeline) -> bool:
+    """Return whether a pipeline's robot takes what a proposed mapping calls its fields."""
+    return isinstance(home.load(), MjcfRobot)
+
+
+def asked(config: ImportConfig) -> Asked:
+    """Return what the user says of files without a mapping."""
+    if config.mjcf is not None:
+        name = config.pipeline or pipeline_name(config.mjcf)
+        return replace(asked_of_model(config.mjcf, name, config.joints, config.rate_hz), as_told=config.as_told)
+    home = pipeline.load_pipeline(config.pipeline) if config.pipeline else None
+    if home is not None:
+        own: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - `described` said so
+        return replace(asked_of_model(own.model, home.name, own.joints, config.rate_hz), as_told=config.as_told)
+    return Asked("robot", config.rate_hz, config.joints, as_told=config.as_told)
+
+
+def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> Asked:
+    """Return what a model says of files without a mapping.
+
+    Args:
+        mjcf: The model.
+        name: Name of the pipeline.
+        joints: The joints that were recorded; empty: all of the model's.
+        rate_hz: Samples per second, where a file has no stamps [Hz].
+
+    Raises:
+        UsageError: When the model has no such joint.
+    """
+    model = read_model(mjcf)
+    own = joints_of(model)
+    if unknown := [j for j in joints if j not in own]:
+        raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    ranges = np.array([model.joint(j).range for j in joints or own])
+    return Asked(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
+
+
+def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
+    """Return the mapping that a file's names and data speak for, and its text; the evidence is printed.
+
+    Raises:
+        UsageError: When something is ambiguous.
+    """
+    try:
+        found = propose(file, told)
+    except UsageError:
+        # What was left out may be the reason.
+        for line in file.notes:
+            console.note(line)
+        raise
+    console.note(f"proposed from {file.path.name}, as nobody said what is what:")
+    lines, mapping = list(found.evidence), found.mapping
+    if told.slides:
+        mapping, line = in_lengths(mapping, told, file.path)
+        lines.append(line)
+    for line in lines:
+        console.note(f"  {line}")
+    names = f"Joints: {', '.join(found.joints)}"
+    return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
+
+
+def in_lengths(mapping: ImportMapping, told: Asked, path: Path) -> tuple[ImportMapping, str]:
+    """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
+
+    Args:
+        mapping: As it was proposed.
+        told: What the model says.
+        path: The file.
+
+    Raises:
+        UsageError: The positions were taken for degrees.
+    """
+    mixed, names = len(told.slides) < len(told.joints), ", ".join(told.slides)
+
+    def field(how: FieldMapping) -> FieldMapping:
+        if unit_for(how.unit, True) == how.unit:
+            return how
+        if how.unit.startswith("rad") and not np.allclose(np.abs(how.scale), 1.0):
+            raise UsageError(
+                f"{path}: {', '.join(how.source)} was taken for degrees, but {names} slides: its positions are lengths",
+                hint="write a mapping with the scales to m and to rad: 0.001 for mm, 0.0174533 for degrees",
+            )
+        return replace(how, unit="" if mixed else unit_for(how.unit, True))
+
+    nodes = {
+        n: replace(node, fields={f: field(h) for f, h in node.fields.items()}) for n, node in mapping.nodes.items()
+    }
+    return replace(mapping, nodes=nodes), f"{names} slides, by the model: in m, m/s and N"
+
+
+def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:
+    """Refuse a mapping that the data contradicts.
+
+    Args:
+        path: The file.
+        episode: What was imported from it.
+        as_told: Only warn.
+
+    Raises:
+        UsageError: When joints follow other commands than their own, or move against them.
+    """
+    said = contradictions(episode)
+    if said and not as_told:
+        raise UsageError(
+            f"the mapping and the data of {path} contradict each other: {'; '.join(said)}",
+            hint="correct order, signs or units in the mapping; --as-told imports it all the same",
+        )
+    for line in said:
+        console.note(f"warning: {line}")
+
+
+def contradictions(episode: Episode) -> list[str]:
+    """Return what a log's data says against the goals and positions in it: sentences."""
+    sensor, actuator = ROLES.sensor, ROLES.actuator
+    if not {sensor, actuator} <= set(episode.outputs):
+        return []
+    commands, units = episode.outputs[actuator], {**episode.units.get(actuator, {}), **episode.units.get(sensor, {})}
+    said: list[str] = []
+    for field, values in episode.outputs[sensor].items():
+        if meaning(field).quantity != "position" or not units.get(field):
+            continue
+        for goal, told in commands.items():
+            if (
+                units.get(goal) == units[field]
+                and told.shape[1:] == values.shape[1:]
+                and meaning(goal).side == "command"
+            ):
+                t = episode.steps[actuator].begun_s, episode.steps[sensor].begun_s
+                flat = told.reshape(len(told), -1), values.reshape(len(values), -1)
+                said += evidence.contradictions(t, *flat, acting=_acting(list(commands.items())))
+    return said
+
+
+def _acting(commands: Sequence[tuple[str, np.ndarray]]) -> np.ndarray | None:
+    """Return whether torque was on at each command; None where it is not known."""
+    found = [values for name, values in commands if meaning(name).quantity == "enabled"]
+    return (found[0].reshape(len(found[0]), -1) > 0).min(axis=1) if len(found) == 1 else None

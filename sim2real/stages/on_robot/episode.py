@@ -1,0 +1,259 @@
+"""One episode on the robot: the graph on the wall clock, its log, and how well it kept its times."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2real.artifacts.run.manifest import git_state, plain, versions
+from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealError
+from sim2real.graph.base import GraphState
+from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
+from sim2real.graph.node import BaseNode
+from sim2real.log.writer import McapRecorder
+from sim2real.robots.contract import Robot, Session
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.failure import noted
+from sim2real.stages.on_robot.come_to_rest import come_to_rest
+from sim2real.stages.on_robot.open_robot import answer_rows, bus_use, rig_summary, sent_rows
+from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.terminal.console import note, progress
+from sim2real.stages.terminal.interruption import interruptible
+
+LATE_SHARE = 0.01
+"""Share of late steps above which ``--strict-timing`` ends with code 5."""
+_POLL_S = 0.25
+_INTERRUPTED = 130
+
+
+class Watch:
+    """A recorder that passes everything on, keeps when the episode started, and stops the graph on a NaN.
+
+    Args:
+        recorder: Where everything goes.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.monotonic_ns = 0
+
+    def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """Keep when the episode starts."""
+        self.monotonic_ns = monotonic_ns
+        self._recorder.start(epoch_ns, monotonic_ns)
+
+    def step(self, record: StepRecord, output: Any) -> None:
+        """Pass a step on.
+
+        Raises:
+            SafetyStop: Its output holds a NaN; the log holds the step all the same.
+        """
+        self._recorder.step(record, output)
+        for name, leaf in named_leaves(output).items():
+            values = np.asarray(leaf)
+            if values.dtype.kind == "f" and np.isnan(values).any():
+                raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
+
+    def message(self, record: MessageRecord) -> None:
+        """Pass the fate of a message on."""
+        self._recorder.message(record)
+
+
+def run_episode(
+    pipeline: Pipeline,
+    robot: Robot,
+    session: Session,
+    nodes: Mapping[str, BaseNode],
+    params: Mapping[str, Any],
+    log: Path,
+    duration_s: float,
+    config: Any,
+    label: str,
+    hold: bool = False,
+) -> dict[str, Any]:
+    """Run the graph for a while and log it; whatever happens, the motors end without torque and the log readable.
+
+    Args:
+        pipeline: The robot's pipeline.
+        robot: Its parts.
+        session: The open robot.
+        nodes: The graph.
+        params: Parameters of its nodes.
+        log: The log to write.
+        duration_s: How long to run [s].
+        config: The stage's configuration, for the log's metadata.
+        label: What the progress bar says.
+        hold: Whether the motors hold the robot where it ends, until somebody says that it can do without them.
+
+    Returns:
+        The summary that also stands in the log's ``session_end``: timing by node, losses, the gate's counts.
+
+    Raises:
+        Sim2RealError: What stopped the robot.
+    """
+    graph = AsyncGraph(nodes, nodes[robot.roles.supervisor])
+    state = graph.init(jax.random.key(0), params)
+    graph.warmup(state)  # every program is compiled before torque goes on
+    recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig.torque_withheld)
+    watch = Watch(recorder)
+    graph.recorder = watch
+    try:
+        try:
+            _drive(graph, state, duration_s, label, recorder)
+        except (KeyboardInterrupt, SystemExit):
+            with interruptible():  # a second signal stops at once
+                come_to_rest(graph, session.rig, hold)
+            raise
+        if hold:
+            come_to_rest(graph, session.rig, hold)
+        graph.stop()
+    except BaseException as error:
+        session.rig.stop_quietly()
+        _end(error, graph, recorder, lambda: _summary(robot, graph, session, watch))
+        raise
+    summary = _summary(robot, graph, session, watch)
+    recorder.close("finished", OK, summary, note)
+    return summary
+
+
+def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summary: Callable[[], Any]) -> None:
+    """Stop the graph and complete the log; what else goes wrong on the way must not take the place of the reason."""
+    status = f"{type(error).__name__}: {error}"
+    with noted(error):
+        graph.stop()
+    with noted(error):
+        recorder.write_event("stop", status)
+    with noted(error):
+        recorder.close(status, _exit_code(error), summary(), note)
+
+
+def check_deadlines(summary: Mapping[str, Any]) -> None:
+    """Judge an episode for ``--strict-timing``, once everything about it is written.
+
+    Raises:
+        DeadlineExceeded: When more than ``LATE_SHARE`` of a node's steps were late.
+    """
+    late = [
+        f"{name} {node['overruns']} of {node['steps']}"
+        for name, node in summary["timing"].items()
+        if node["overruns"] > LATE_SHARE * node["steps"]
+    ]
+    if late:
+        raise DeadlineExceeded(
+            f"more than {LATE_SHARE:.0%} of the steps missed their deadline: {', '.join(late)}",
+            hint="close what else runs on this machine, or lower the rate; the log is complete",
+        )
+
+
+def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]:
+    """Return the timing table of a summary: rows and headers, times in ms; ages are those of its oldest input."""
+    quantiles = ["p50", "p99", "max [ms]"]
+    headers = ["node", "steps", "period p50", *quantiles[1:], "late p50", *quantiles[1:], "age p50", *quantiles[1:]]
+    rows = []
+    for name, node in summary["timing"].items():
+        ages = [max(q) for q in zip(*node["age_s"].values(), strict=True)] or [None] * 3
+        kinds = (node["period_s"], node["lateness_s"], ages)
+        times = [q if q is None else round(1e3 * q, 2) for kind in kinds for q in kind]
+        rows.append([name, node["steps"], *times, node["overruns"]])
+    return [*rows, *answer_rows(summary)], [*headers, "overruns"]
+
+
+def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder) -> None:
+    """Run the graph; print a warning where the log's writer falls behind, and again when it is twice as far behind."""
+    graph.start(state)
+    with progress(round(duration_s, 1), label) as bar:
+        begin, warn_s = time.monotonic(), 0.0
+        while (left := duration_s - (time.monotonic() - begin)) > 0:
+            graph.run_for(min(_POLL_S, left))
+            bar.n = round(min(duration_s, time.monotonic() - begin), 1)
+            bar.refresh()
+            if (left := recorder.backlog()).late and left.behind_s > warn_s:
+                note(f"warning: {left}")
+                warn_s = 2.0 * left.behind_s
+
+
+def _recorder(
+    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, dry: bool
+) -> McapRecorder:
+    """Return the log's writer, whose metadata says what the session is, and, first of all, whether it is a dry run."""
+    topology = {
+        name: {
+            "rate_hz": node.rate,
+            "delay_s": node.delay,
+            "scheduling": node.scheduling.value,
+            **{k: v for k, v in (("color", node.color), ("order", node.order)) if v is not None},
+            "inputs": {
+                i: {"from": c.output_node.name, "blocking": c.blocking, "window": c.window, "skip": c.skip}
+                for i, c in node.inputs.items()
+            },
+        }
+        for name, node in graph.nodes.items()
+    }
+    metadata = {
+        "pipeline": pipeline.name,
+        "dry_run": dry,
+        "config": plain(asdict(config)),
+        "graph": topology,
+        "roles": asdict(robot.roles),
+        "versions": plain(versions()),
+        "git": plain(git_state()),
+        "seed": config.seed,
+        "port": config.port,
+    }
+    inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
+    joints, units = {robot.roles.sensor: robot.joints}, dict.fromkeys(graph.nodes, robot.units)
+    recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
+    if dry:
+        recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
+    return recorder
+
+
+def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
+    rig, command, counters = session.rig, robot.command, session.rig.device.counters
+    timing = {
+        n: {
+            "steps": s.steps,
+            "period_s": _numbers(s.period_s),
+            "lateness_s": _numbers(s.lateness_s),
+            "overruns": s.overruns,
+            "age_s": {name: _numbers(ages) for name, ages in s.age_s.items()},
+        }
+        for n, s in sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
+    }
+    return {
+        "monotonic_ns": watch.monotonic_ns,
+        "timing": timing,
+        "bus": bus_use(robot, rig),
+        "transactions": counters.transactions,
+        "lost_replies": counters.lost_replies,
+        "retries": counters.retries,
+        "command_timeouts": rig.timeouts,
+        **rig_summary(rig),
+        "gate": asdict(rig.gate.counts),
+        "sent": sent_rows(rig.gate, command, robot.units.get(command, "")),
+    }
+
+
+def _place(node: BaseNode) -> float:
+    """Return where a node stands in tables: those with an ``order`` first, the others as they are."""
+    return math.inf if node.order is None else node.order
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    """Return the values for JSON, which knows no NaN: a node that never stepped has no times."""
+    return [v if math.isfinite(v) else None for v in values]
+
+
+def _exit_code(error: BaseException) -> int:
+    if isinstance(error, Sim2RealError):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return _INTERRUPTED
+    return error.code if isinstance(error, SystemExit) and isinstance(error.code, int) else ERROR

@@ -1,0 +1,142 @@
+"""Opening the robot for a stage that moves it, and what that stage says about its rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.hardware.safety.gate import SafetyGate
+from sim2real.hardware.safety.rig import Rig
+from sim2real.robots.contract import Robot, Session
+from sim2real.runtime.clock import realtime
+from sim2real.stages.deploy.config import DeployConfig
+from sim2real.stages.record.config import RecordConfig
+from sim2real.stages.terminal.console import note, table
+
+LATE_SHARE = 0.01
+"""Share of late answers above which the stage warns."""
+
+
+@contextmanager
+def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) -> Iterator[Session]:
+    """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
+
+    Args:
+        robot: The robot.
+        config: Port, limits, seed, and whether it is a dry run.
+        truth_path: File for the emulated robot's account of itself.
+
+    Raises:
+        UsageError: The session has no rig, or its device moves in a dry run.
+    """
+    if config.dry_run:
+        note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
+    with robot.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+        _require_rig(session.rig)
+        if config.dry_run:
+            session.rig.withhold_torque()
+        announce(session)
+        yield session
+
+
+def _require_rig(rig: object) -> None:
+    """Refuse what has no safety gate, no guardian and no dry run: sessions come from plug-ins too."""
+    if not isinstance(rig, Rig):
+        raise UsageError(
+            f"this robot's session has a {type(rig).__name__} for a rig",
+            hint="make its `rig` a sim2real.hardware.safety.rig.Rig of a sim2real.hardware.device.Device",
+        )
+
+
+def announce(session: Session) -> None:
+    """Say what the motors do by themselves when this computer's side dies, and what stops them then."""
+    for line in session.rig.device.without_host():
+        note(f"if this process dies: {line}; the guardian takes the torque off")
+
+
+def rig_summary(rig: Rig) -> dict[str, Any]:
+    """Return what the rig adds to an episode's summary.
+
+    Returns:
+        ``late_replies``: answers whose sample's time is not sure, or that came after they had been asked for again;
+        ``late_s``: by how much answers took longer than their bytes, median, 99 % and largest [s];
+        ``suspects``: what was odd about the measurements.
+    """
+    counters = rig.device.counters
+    quantiles = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
+    return {"late_replies": counters.late_replies, "late_s": quantiles, "suspects": list(rig.suspects)}
+
+
+def bus_use(robot: Robot, rig: Rig) -> dict[str, dict[str, list[int]]]:
+    """Return for each node that talks to the device how long its transactions took; see ``BusUse`` [us]."""
+    users = {robot.roles.sensor: rig.measuring, robot.roles.actuator: rig.commanding}
+    return {name: {kind: values.tolist() for kind, values in asdict(use).items()} for name, use in users.items()}
+
+
+def answer_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
+    """Return the row of the timing table that the bus has: answers, how late they were [ms], how many too late."""
+    if "late_s" not in summary:
+        return []
+    late = [q if q is None else round(1e3 * q, 2) for q in summary["late_s"]]
+    nothing = [None] * 3
+    return [["answers", summary["transactions"], *nothing, *late, *nothing, summary["late_replies"]]]
+
+
+def warn(summary: Mapping[str, Any]) -> None:
+    """Say what was odd, but no reason to stop."""
+    share = summary["late_replies"] / max(1, summary["transactions"])
+    if share > LATE_SHARE:
+        note(
+            f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
+            "hint: set the adapter's latency timer to 1 ms, and close what else runs on this machine"
+        )
+    for suspect in summary["suspects"]:
+        note(f"warning: {suspect}\nhint: does it lie on something, or does its encoder stand still?")
+
+
+def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
+    """Return for each actuator what the gate let through since the robot started, as JSON takes it.
+
+    Args:
+        gate: The gate.
+        field: Field of the command, the name of what has none.
+        unit: The command's.
+
+    Returns:
+        ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of what was sent, or would have been; and
+        ``cut``: commands that a limit of the gate had changed.
+    """
+    counts, names = gate.counts, gate.config.joints
+    several = len(counts.total) > 1
+    return [
+        {
+            "name": names[i] if i < len(names) else f"{field}[{i}]" if several else field,
+            "unit": unit,
+            "commands": counts.passed,
+            "low": counts.low[i],
+            "mean": total / counts.passed,
+            "high": counts.high[i],
+            "cut": counts.cut[i],
+        }
+        for i, total in enumerate(counts.total)
+    ]
+
+
+def show_withheld(summaries: Sequence[Mapping[str, Any]]) -> None:
+    """Print what the episodes of a dry run would have sent."""
+    several = len(summaries) > 1
+    rows = []
+    for number, summary in enumerate(summaries):
+        for s in summary["sent"]:
+            share = f"{s['cut'] / max(1, s['commands']):.1%}"
+            own = [s["unit"], s["commands"], s["low"], s["mean"], s["high"], s["cut"], share]
+            rows.append([*([number] if several else []), s["name"], *own])
+    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max", "cut by the gate", "share"]
+    print(table(rows, [*(["episode"] if several else []), *heads]))
+    note("dry run: nothing was moved; no later stage takes this for a recording")

@@ -1,0 +1,62 @@
+"""What a user means by a run: its path, its name, a stage folder in it, or a pipeline's newest."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from sim2real.artifacts.run.manifest import read_manifest
+from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished, run_folders
+from sim2real.artifacts.run.stage_status import standing, why_stale
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline.pipeline import available
+from sim2real.stages.terminal.console import note
+
+
+def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Path:
+    """Return a run folder by its path, by its name, by a stage folder in it, or the newest one of a pipeline.
+
+    Of a pipeline's runs the newest with a finished stage is taken: one that failed at its start does not hide it.
+
+    Args:
+        root: Folder of all runs.
+        target: What the user typed.
+        pipeline: The pipeline that the run has to belong to; None allows any.
+
+    Raises:
+        UsageError: When there is no such run, or it belongs to another pipeline.
+    """
+    path = Path(target)
+    # Only a stage folder stands for its parent: that of a pipeline's name would be the working directory.
+    options = [path.parent if read_manifest(path) is not None else path]
+    options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
+    for folder in options:
+        owners = {str(a.manifest.get("pipeline")) for stage in STAGES for a in attempts(folder, stage)}
+        if owners and pipeline and pipeline not in owners:
+            raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
+        if owners:
+            return folder
+    if pipeline is None and (known := run_folders(root, str(target))):
+        return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
+    raise _nothing_there(root, str(target))
+
+
+def warn_of_stale(found: StageFolder) -> StageFolder:
+    """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
+    if why := why_stale(found, standing(found.run_dir)):
+        note(f"warning: {why}; `sim2real run {found.manifest['pipeline']} --resume {found.run_dir}` makes it again")
+    return found
+
+
+def _nothing_there(root: Path, target: str) -> UsageError:
+    """Return the error for a name that is none: it says what there is."""
+    pipelines = sorted(available())
+    names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
+    said = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
+    if target in pipelines:
+        hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
+    elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
+        hint = f"did you mean {close[0]}?"
+    else:
+        hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
+    return UsageError(f"there is no file, pipeline or run {target!r}. {said}", hint=hint)

@@ -1,0 +1,220 @@
+"""A robot that is described on the command line, by its model and a recording, as a pipeline for the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.identification import Identification
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.log.importing import importer
+from sim2real.log.importing.files import bags
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.mapping import ImportMapping, load_mapping
+from sim2real.log.importing.proposal import pipeline_name
+from sim2real.log.reader import read_log
+from sim2real.robots.from_model import model_file
+from sim2real.robots.from_model.mjcf import joints_of, read_model, read_spec
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
+from sim2real.stages.import_logs import stage as import_logs_stage
+from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
+from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY, RobotFlags
+from sim2real.stages.terminal import console
+from sim2real.stages.terminal.console import note
+
+_STEPS_S = (0.0005, 0.005)
+"""Between these, the model's own time step is taken."""
+_FASTEST = 0.02
+"""Of the periods between samples, this share is shorter than that of the rate which nodes get."""
+_FACTORS = ("kp", "kd", "goal_velocity", "torque", "duty")
+"""Commands that a parameter is multiplied with."""
+MODEL_FILE = "robot.xml"
+
+
+@dataclass(frozen=True)
+class DescribedPipeline(Pipeline):
+    """A pipeline without a folder.
+
+    Attributes:
+        description: What there is to know about the robot.
+        mapping: Of files of other recorders; None: not known.
+        told: The flags that described it.
+    """
+
+    description: RobotConfig = field(default_factory=lambda: RobotConfig(Path(), (), ()))
+    mapping: ImportMapping | None = None
+    told: tuple[str, ...] = ()
+
+    def load(self, module: str | None = None) -> Any:
+        """Return the robot; it has no other modules."""
+        if module:
+            raise UsageError(f"{self.name!r} is a model without a pipeline: it has no {module!r}")
+        return MjcfRobot(self.description)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """How a command names it."""
+        return self.told or (self.name,)
+
+    def mapping_of(self, path: Path) -> ImportMapping | None:
+        """Return the mapping of a file of another recorder; None of a log of ours."""
+        return None if path.suffix == ".mcap" and bags.is_ours(path) else self.mapping
+
+    def reading(self, logs: Sequence[str], mapping: ImportMapping | None = None) -> DescribedPipeline:
+        """Return the pipeline with what it needs to read logs: a mapping where they are of another recorder.
+
+        Args:
+            logs: The logs.
+            mapping: Their mapping; None: one is proposed.
+        """
+        first = Path(logs[0])
+        if mapping is None and not (first.suffix == ".mcap" and bags.is_ours(first)):
+            asked = import_logs_stage.asked_of_model(self.description.model, self.name, self.description.joints)
+            mapping, _ = import_logs_stage.proposed(open_foreign(first), asked)
+        return replace(self, mapping=mapping)
+
+    def texts(self) -> Mapping[str, str]:
+        """Return the files that describe the robot: name -> text."""
+        return files_of(self.description)
+
+
+def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
+    """Return the pipeline of a model and of what a log says of it.
+
+    Args:
+        told: What the user says.
+        logs: The logs; the first one says which commands there are and how fast they came.
+
+    Raises:
+        UsageError: When there is no model or log, or they do not fit each other.
+    """
+    if told.mjcf is None or not logs:
+        raise UsageError(
+            "a robot without a pipeline is described by its model and by a log",
+            hint="sim2real identify --mjcf robot.xml --log run.csv",
+        )
+    model, first = read_model(told.mjcf), Path(logs[0])
+    name = pipeline_name(told.mjcf)
+    if first.suffix == ".mcap" and bags.is_ours(first):
+        mapping, episode = None, read_log(first)
+        name = str(episode.metadata.get("pipeline") or name)
+    else:
+        mapping = load_mapping(told.mapping, name) if told.mapping else None
+        if mapping is None:
+            asked = import_logs_stage.asked_of_model(told.mjcf, name, told.joints, told.rate_hz)
+            mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(asked, as_told=told.as_told))
+        episode = importer.import_file(first, mapping)
+        import_logs_stage.refuse_contradictions(first, episode, told.as_told)
+    description = _description(told, model, episode)
+    note_held(description)
+    summary = f"{len(description.joints)} joints of {told.mjcf.name}"
+    return DescribedPipeline(
+        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, told=_words(told)
+    )
+
+
+def note_held(description: RobotConfig) -> None:
+    """Print which files were left out, where joints that were not recorded are held, and what moves the others."""
+    holding, model = description.held(), read_model(description.model)
+    if left_out := model_file.read(description.model, description.contacts)[1]:
+        console.note(f"left out, as nothing but contacts and pictures needs them: {', '.join(left_out)}")
+    for held in holding.held:
+        console.note(f"not recorded, held: {held}")
+    for number, name in holding.moved.items():
+        console.note(f"not recorded, free: {model.joint(number).name or 'a joint without a name'}, which {name} moves")
+
+
+def _words(told: RobotFlags) -> tuple[str, ...]:
+    """Return the flags that describe the robot, as a command line has them."""
+    found: list[str] = []
+    for f in fields(told):
+        flag, value = f"--{f.name.replace('_', '-')}", getattr(told, f.name)
+        if f.name in ("parameter", "hold"):
+            found += [word for one in value for word in (flag, one)]
+        elif value != f.default:
+            found += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
+    return tuple(map(str, found))
+
+
+def from_file(path: Path, name: str) -> DescribedPipeline:
+    """Return the pipeline of a ``robot.toml``, as an identification leaves it beside its parameters."""
+    return DescribedPipeline(
+        name, f"described by {path}", "", identify=MODEL_IDENTIFY, description=RobotConfig.load(path)
+    )
+
+
+def pipeline_beside(parameters: Path, found: Identification) -> Pipeline:
+    """Return the robot that parameters are of: described beside them, or a pipeline.
+
+    Args:
+        parameters: Their file, or its folder.
+        found: What they say.
+    """
+    beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
+    return from_file(beside, found.pipeline) if beside.is_file() else load_pipeline(found.pipeline)
+
+
+def files_of(description: RobotConfig) -> dict[str, str]:
+    """Return ``robot.toml``, and the model where it needs no other files: name -> text.
+
+    A model that needs others, such as meshes, stays where it is, and is named by its absolute path.
+    """
+    spec, text = read_spec(description.model), description.model.read_text(encoding="utf-8")
+    if "<include" in text or any(part.file for part in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)):
+        return {ROBOT_FILE: description.to_toml(str(description.model.resolve()))}
+    return {ROBOT_FILE: description.to_toml(MODEL_FILE), MODEL_FILE: text}
+
+
+def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
+    """Return what there is to know about a robot, from its model and a log."""
+    joints = told.joints or joints_of(model)
+    commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
+    driving = tuple(n for n in COMMANDS if n in commands)
+    # A factor of 0 leaves its parameter open: a recorder that does not know a gain writes 0.
+    if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
+        note(f"{', '.join(idle)} is 0 in all of the log: left out")
+        driving = tuple(n for n in driving if n not in idle)
+        commands = {n: values for n, values in commands.items() if n not in idle}
+    if "position" not in sensed or not driving:
+        raise UsageError(
+            "the log has no sensor.position, or no command that drives a joint: "
+            f"sensor {', '.join(sensed) or 'nothing'}, actuator {', '.join(commands) or 'nothing'}",
+            hint=f"in the mapping, name the actuator's fields as they act: {', '.join(COMMANDS)}",
+        )
+    n, one = (len(joints),), {name: (1,) for name in driving}
+    shapes = {name: values.shape[1:] for name, values in [("position", sensed["position"]), *commands.items()]}
+    if odd := [f"{name} {shapes[name]}" for name in ("position", *driving) if shapes[name] not in (n, one.get(name))]:
+        raise UsageError(
+            f"a sample of each field has the shape {n}, for {', '.join(joints)}, but in the log: {', '.join(odd)}",
+            hint="name the joints that were recorded with --joints, in the order of the columns; in a mapping, "
+            "shape = [1] makes a vector of a number",
+        )
+    fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))
+    own_s = float(model.opt.timestep)
+    found = RobotConfig(
+        model=Path(str(told.mjcf)),
+        joints=tuple(joints),
+        commands=driving,
+        shared=tuple(name for name in driving if shapes[name] != n),
+        velocity=told.velocity and "velocity" in sensed,
+        rate_hz=round(1.0 / fastest, 3),
+        step_s=told.step_s or min(max(own_s, _STEPS_S[0]), _STEPS_S[1]),
+        fix_base=told.fix_base,
+        contacts=told.contacts,
+        hold=told.hold,
+    )
+    if told.velocity and not found.velocity:
+        raise UsageError("the log has no velocity", hint="leave --velocity out: it is not needed")
+    units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
+    if set(units) == {"kp"}:  # a firmware's own unit; both gains together are those of a motor's own torque loop
+        found = replace(found, kp_unit=units["kp"])
+    terms = tuple(ParameterPattern.parse(p) for p in told.parameter) or usual_terms(
+        driving, physical=set(units) == {"kp", "kd"}
+    )
+    return replace(found, terms=terms)

@@ -1,0 +1,29 @@
+"""The robot of a pipeline, for the stages that need hardware or training."""
+
+from __future__ import annotations
+
+from sim2real.errors import UsageError
+from sim2real.robots.contract import Robot
+from sim2real.robots.worlds import in_world
+from sim2real.stages.pipeline.pipeline import Pipeline
+
+
+def moving_robot(pipeline: Pipeline, world: str | None = None) -> Robot:
+    """Return a pipeline's robot for the stages that need hardware or training.
+
+    Args:
+        pipeline: The pipeline.
+        world: World that it is simulated in; None: its own.
+
+    Raises:
+        UsageError: When the pipeline is for recordings only, and has just what identification needs; or there is no
+            such world.
+    """
+    robot = in_world(pipeline.load(), world)
+    if not isinstance(robot, Robot):
+        name = pipeline.name
+        raise UsageError(
+            f"pipeline {name!r} is of recordings that somebody else made: there is no robot to record, train or deploy",
+            hint=f"import a recording with `sim2real import FILE --pipeline {name}`, then `sim2real identify {name}`",
+        )
+    return robot

@@ -1,0 +1,69 @@
+"""Logs that belong to a pipeline, opened for the stages that read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sim2real.artifacts.recording import Recording
+from sim2real.errors import Sim2RealError
+from sim2real.identify.problem.segments import require_moved
+from sim2real.log.importing.importer import import_file
+from sim2real.log.schema import unit_of
+from sim2real.robots.contract import RecordedRobot
+from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.terminal.console import note
+
+
+def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None = None) -> Recording:
+    """Read a log of a pipeline; a log that was cut is used as far as it goes.
+
+    A file of another recorder is imported in memory, where the pipeline has a mapping for it.
+
+    Args:
+        path: The file.
+        pipeline: The pipeline that it must be of.
+        robot: Its robot, in whose units the log must be; None: any units.
+
+    Raises:
+        Sim2RealError: When it is no log, of another pipeline, or of a dry run, in other units, or has holes.
+    """
+    if (mapping := pipeline.mapping_of(path)) is not None:
+        recording = Recording(path, import_file(path, mapping))
+        if robot is not None:
+            require_units(recording, robot)
+        return recording
+    recording = Recording.load(path)
+    for warning in recording.warnings:
+        note(f"warning: {warning}; what is there is used")
+    owner = recording.pipeline
+    if owner is None:
+        raise Sim2RealError(
+            f"{path} does not say which pipeline it is of: its metadata is damaged", hint="record again"
+        )
+    if owner != pipeline.name:
+        raise Sim2RealError(
+            f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
+        )
+    require_moved(recording.episode, str(path))
+    if robot is not None:
+        require_units(recording, robot)
+    holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
+    if holes:
+        raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
+    return recording
+
+
+def require_units(recording: Recording, robot: RecordedRobot) -> None:
+    """Check that what the robot's sensor and actuator sent is in the units that the robot computes in.
+
+    Raises:
+        Sim2RealError: When a log is in other ones.
+    """
+    said = recording.episode.units or dict.fromkeys((robot.roles.sensor, robot.roles.actuator), recording.units)
+    for node in (robot.roles.sensor, robot.roles.actuator):
+        for field, unit in said.get(node, {}).items():
+            if unit != (own := unit_of(field, robot.units) or unit):
+                raise Sim2RealError(
+                    f"{field!r} of {node!r} is in {unit} in the log {recording.path}, the robot computes in {own}",
+                    hint="convert it: `scale` in the mapping of an import, or the robot's `units`",
+                )

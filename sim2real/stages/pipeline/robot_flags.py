@@ -1,0 +1,52 @@
+"""A robot that flags describe instead of a pipeline; every field is a flag. Imports no JAX: ``--help`` is instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import UseAppendAction, arg
+
+from sim2real.stages.identify.config import IdentifyConfig
+
+
+@dataclass(frozen=True)
+class RobotFlags:
+    """A robot that no pipeline describes: its model, and what else there is to say of it."""
+
+    mjcf: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Model of the robot: MJCF or URDF."""
+    joints: tuple[str, ...] = ()
+    """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
+    parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """What is identified: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
+    kp@.*_calf_joint; with =VALUE it is held. An unknown WHAT is refused, with a list."""
+    mapping: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Mapping of the log, if it is of another recorder; default: one is proposed."""
+    rate_hz: float | None = None
+    """Samples per second, where the log has no time stamps [Hz]."""
+    velocity: bool = False
+    """Compare measured velocities, too."""
+    step_s: float = 0.0
+    """Time step of the simulation [s]; 0: the model's own, between 0.5 and 5 ms."""
+    fix_base: bool = False
+    """Hold a floating base where the model has it, as on a stand."""
+    contacts: bool = False
+    """Simulate contacts."""
+    hold: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """Where joints that were not recorded are held: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
+    as_told: bool = False
+    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
+
+
+MODEL_IDENTIFY = IdentifyConfig(
+    initial_state="measured",
+    settle_s=0.0,
+    horizon_s=1.0,
+    generations=0,
+    refine=1,
+    jacobian="finite",
+    max_delay_s=0.05,
+)
+"""How a robot of a model is identified: rough values are known, so there is no search; starts are read off the log."""

@@ -1,0 +1,1 @@
+"""The stage record: the robot under an excitation."""

@@ -1,0 +1,49 @@
+"""How the robot is recorded; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sim2real.errors import UsageError
+from sim2real.hardware.safety.config import GateLimits
+from sim2real.stages.seed import check_seed
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Record the robot under an excitation."""
+
+    port: str = "embedded"
+    """Serial port of the servo bus, or 'embedded' for the emulated robot."""
+    duration_s: float = 40.0
+    """Length of the recording [s]."""
+    excitation: Literal["multisine", "chirp", "steps"] = "multisine"
+    """Command signal."""
+    amplitude: float = 1.8
+    """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
+    low_hz: float = 0.2
+    """Lowest frequency of the excitation [Hz]."""
+    high_hz: float = 3.0
+    """Highest frequency of the excitation [Hz]."""
+    seed: int = 0
+    """Seed of the excitation, and of the embedded robot."""
+    dry_run: bool = False
+    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
+    strict_timing: bool = False
+    """End with code 5 when more than 1 % of the steps miss their deadline."""
+    gate: GateLimits = field(default_factory=GateLimits)
+    """Limits on every command."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before anything moves."""
+        check_seed(self.seed)
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
+        if not 0.0 < self.low_hz < self.high_hz:
+            raise UsageError(f"the excitation needs 0 < low_hz < high_hz, got {self.low_hz} and {self.high_hz} Hz")
+        if not 0.0 < self.amplitude <= self.gate.limit:
+            raise UsageError(
+                f"the amplitude must lie in (0, {self.gate.limit}], got {self.amplitude}",
+                hint="raise --gate.limit only if the robot bears it",
+            )

@@ -1,0 +1,85 @@
+"""Record the robot under an excitation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sim2real.artifacts.recording import LOG, TRUTH, Recording
+from sim2real.artifacts.run.run_folder import StageFolder, open_stage
+from sim2real.robots.contract import Robot
+from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.on_robot.episode import check_deadlines, run_episode, timing_rows
+from sim2real.stages.on_robot.open_robot import opened, show_withheld, warn
+from sim2real.stages.pipeline.load_robot import moving_robot
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
+from sim2real.stages.record.config import RecordConfig
+from sim2real.stages.terminal.console import note, table
+
+
+def record(
+    robot: Robot | Pipeline | str, folder: AnyPath, config: RecordConfig | Mapping[str, Any] | None = None
+) -> Recording:
+    """Play the excitation on the robot and record it.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        folder: Takes the log; a log is never overwritten.
+        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it.
+
+    Returns:
+        The recording; its ``summary`` is that of the session.
+
+    Raises:
+        Sim2RealError: What stopped the robot; the log holds everything up to then.
+    """
+    pipeline, folder = pipeline_of(robot), folder_of(folder)
+    config = config_of(config, pipeline.record)
+    robot = moving_robot(pipeline)
+    signal = excitation(config, robot.rate_hz, len(robot.action))
+    note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
+    log, truth = folder / LOG, folder / TRUTH
+    with opened(robot, config, truth) as session:
+        nodes = robot.recording_nodes(session, signal)
+        run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
+    return Recording.load(log, truth)
+
+
+def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
+    """Record in a stage folder.
+
+    Args:
+        pipeline: The robot.
+        config: The stage's configuration.
+        root: Folder of all runs.
+        run_dir: Run folder to add to; None makes a new one.
+    """
+    robot = moving_robot(pipeline)
+    excitation(config, robot.rate_hz, len(robot.action))  # what cannot be played is refused before a folder is made
+    with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run) as stage:
+        stage.output("log", LOG)
+        if config.port == "embedded":
+            stage.output("truth", TRUTH)
+        recording = record(pipeline, stage.folder, config)
+        summary = recording.summary
+        for name, path in recording.timing.save(stage.folder).items():
+            stage.output(name, path)
+        print(table(*timing_rows(summary)))
+        warn(summary)
+        if config.dry_run:
+            show_withheld([summary])
+        stage.summary(
+            {
+                "seconds": config.duration_s,
+                "lost replies": summary["lost_replies"],
+                "late replies": summary["late_replies"],
+                "odd measurements": len(summary["suspects"]),
+                "transactions": summary["transactions"],
+                "commands clamped": summary["gate"]["clamped"],
+            }
+        )
+        if config.strict_timing:
+            check_deadlines(summary)
+    return stage.result

@@ -1,0 +1,15 @@
+"""The range of seeds, for every stage. Imports no JAX."""
+
+from __future__ import annotations
+
+from sim2real.errors import UsageError
+
+
+def check_seed(seed: int) -> None:
+    """Refuse what is no seed.
+
+    Raises:
+        UsageError: When it is negative, or above 31 bits.
+    """
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"seed must lie in [0, 2**31), got {seed}")

@@ -1,0 +1,1 @@
+"""The stage train: a policy on the identified model, with the robot's timing."""

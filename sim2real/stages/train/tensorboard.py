@@ -1,0 +1,48 @@
+"""Curves of a training for TensorBoard, while it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from sim2real.errors import Sim2RealError
+from sim2real.train.ppo.result import Progress
+
+
+@contextmanager
+def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progress], None]]:
+    """Yield what writes the figures of an evaluation into event files, one for each policy.
+
+    Args:
+        folder: Takes a folder for each policy.
+        names: The policies, such as ``seed 0``, in the order of the figures.
+
+    Raises:
+        Sim2RealError: tensorboardX is not installed.
+    """
+    make = _writer()
+    with ExitStack() as stack:
+        writers = [stack.enter_context(make(str(folder / name.replace(", ", "_").replace(" ", "_")))) for name in names]
+
+        def write(progress: Progress) -> None:
+            for name, values in progress.values.items():
+                for writer, value in zip(writers, values, strict=True):
+                    writer.add_scalar(name, float(value), progress.env_steps)
+            for writer in writers:
+                writer.flush()
+
+        yield write
+
+
+def _writer() -> Any:
+    """Import the writer, which is an extra."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError as error:
+        raise Sim2RealError(
+            "files for TensorBoard need tensorboardX, which is not installed",
+            hint="pip install 'sim2real[tensorboard]'",
+        ) from error
+    return SummaryWriter

@@ -1,0 +1,1 @@
+"""The stage validate: an identification scored on later logs."""

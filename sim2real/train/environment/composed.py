@@ -1,0 +1,89 @@
+"""A composed task as an environment for PPO, without a graph: one control step is one row."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.composer.physics.mjx.environment import MjxEnvironment
+from sim2real.composer.task import UNLIMITED
+from sim2real.errors import UsageError
+from sim2real.train.environment.protocol import Step
+from sim2real.train.environment.tasks import REWARD
+
+if TYPE_CHECKING:
+    from sim2real.composer.physics.mjx.environment import State
+
+
+class TaskState(NamedTuple):
+    """The state of a ``TaskEnvironment``.
+
+    Attributes:
+        own: The composed environment's.
+        terms: Sum of each term of the reward that has a name, so far.
+    """
+
+    own: State
+    terms: dict[str, jax.Array]
+
+
+class TaskEnvironment:
+    """A composed task on MJX as an environment; the observation is the vector of all its observables, in their order.
+
+    Args:
+        environment: The task; it needs a time limit unless its episodes end by themselves.
+
+    Raises:
+        UsageError: When the action is not a vector with bounds.
+    """
+
+    def __init__(self, environment: MjxEnvironment) -> None:
+        self.environment = environment
+        self.observation_size = sum(leaf.size for leaf in environment.observation_spec().values())
+        spec = environment.action_spec()
+        bounds = [np.broadcast_to(getattr(spec, name, np.inf), spec.shape) for name in ("minimum", "maximum")]
+        if len(spec.shape) != 1 or not (np.abs(bounds) < UNLIMITED).all():
+            raise UsageError(
+                f"PPO's actions are vectors with bounds, and the task's action_spec is {spec!r}",
+                hint="give every actuator a ctrlrange, or override action_spec in the task",
+            )
+        self.action_low, self.action_high = bounds
+
+    def reset(self, key: jax.Array) -> tuple[TaskState, jax.Array]:
+        """Return the state at the start of an episode and the first observation."""
+        state = self.environment.reset(key)
+        return TaskState(state, state.terms), _vector(state)
+
+    def step(self, state: TaskState, action: jax.Array, key: jax.Array) -> Step:
+        """Make one control step.
+
+        Args:
+            state: What ``reset`` or ``step`` returned.
+            action: Shape ``(A,)`` [the actuators' units].
+            key: Not used: the state has a key of its own.
+        """
+        del key
+        new = self.environment.step(state.own, action)
+        ends = new.done & ~new.truncated
+        terms = {name: state.terms[name] + term for name, term in new.terms.items()}
+        metrics = {f"{REWARD}{name}": term for name, term in terms.items()}
+        return Step(TaskState(new, terms), _vector(new), new.reward, ends, new.truncated, jnp.bool_(True), metrics)
+
+    def privileged(self, state: TaskState) -> jax.Array:
+        """Return what is true in a state, shape ``(P,)``, in MuJoCo's units.
+
+        Positions and velocities of all joints, then the fields of the model that hooks set, such as drawn masses, and
+        what the task keeps in ``physics.variables``, by name.
+        """
+        own = state.own
+        known = jax.tree.leaves((own.data.qpos, own.data.qvel, own.leaves, own.variables))
+        return jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in known])
+
+
+def _vector(state: State) -> jax.Array:
+    """Return all observables as one vector, shape ``(O,)``."""
+    values = [jnp.ravel(value) for value in state.observation.values()]
+    return jnp.concatenate(values) if values else jnp.zeros(0)

@@ -1,0 +1,100 @@
+"""An environment in which every step is one of the policy: rows without one are played along with the step before."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.train.environment.protocol import Step
+
+if TYPE_CHECKING:
+    from sim2real.train.environment.graph_environment import EnvState, GraphEnvironment
+
+T = TypeVar("T")
+
+
+class PolicySteps:
+    """A ``GraphEnvironment`` for learners that know nothing of rows.
+
+    In some rows of a graph the policy makes no step: where it paused, or where its rate does not divide the world's.
+    Our own PPO is told which rows these are. Here such a row belongs to the policy's step before it: its reward is
+    added to that step's, and the observation is the one that the policy sees next. An episode ends at the policy's
+    last step in the timeline, whose observation is the final one.
+
+    Where the policy makes a step in every row, nothing is changed, and nothing is computed twice.
+
+    Args:
+        env: The graph as an environment.
+
+    Raises:
+        UsageError: When the policy makes fewer than two steps in a timeline.
+    """
+
+    def __init__(self, env: GraphEnvironment) -> None:
+        turns = env.graph.turns
+        if (turns.sum(axis=1) < 2).any():
+            raise UsageError(
+                f"the policy {env.task.supervisor!r} makes fewer than two steps in a timeline",
+                hint="draw longer timelines",
+            )
+        self.env = env
+        self.observation_size = env.observation_size
+        self.action_low, self.action_high = env.action_low, env.action_high
+        self._last = turns.shape[1] - 1 - np.argmax(turns[:, ::-1], axis=1)
+        self._wait = int(np.argmax(turns, axis=1).max())  # rows before the first step
+        self._gap = max(int(np.diff(np.flatnonzero(t)).max()) for t in turns) - 1
+        self._always = bool(turns.all())
+
+    @property
+    def length(self) -> int:
+        """Largest number of steps of an episode."""
+        return int(self.env.graph.turns.sum(axis=1).max()) - 1
+
+    def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
+        """Start an episode, and run to the policy's first step."""
+        state, observation = self.env.reset(key)
+        if not self._wait:
+            return state, observation
+        idle = jnp.asarray(self.action_low, jnp.float32)
+
+        def play(now: tuple[EnvState, jax.Array], _: None) -> tuple[tuple[EnvState, jax.Array], None]:
+            made = self.env.step(now[0], idle, key)
+            # Nobody has acted: what was earned so far is no part of the episode's return.
+            state = made.state._replace(total=now[0].total, good=now[0].good)
+            return _select(now[0].step_state.seq >= 0, now, (state, made.observation)), None
+
+        return jax.lax.scan(play, (state, observation), length=self._wait)[0]
+
+    def step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
+        """Make a step of the policy, and run to its next one.
+
+        Args:
+            state: What ``reset`` or ``step`` returned.
+            action: Shape ``(A,)`` [the action's units].
+            key: JAX key.
+        """
+        made = self._ended(self.env.step(state, action, key))
+
+        def play(now: Step, _: None) -> tuple[Step, None]:
+            following = self._ended(self.env.step(now.state, action, key))
+            following = following._replace(reward=now.reward + following.reward, valid=now.valid)
+            over = now.terminated | now.truncated | (now.state.step_state.seq >= 0)
+            return _select(over, now, following), None
+
+        return jax.lax.scan(play, made, length=self._gap)[0] if self._gap else made
+
+    def _ended(self, made: Step) -> Step:
+        """Return a row, truncated where it leads to the policy's last step."""
+        if self._always:
+            return made
+        graph = made.state.graph
+        return made._replace(truncated=made.truncated | (graph.step >= jnp.asarray(self._last)[graph.eps]))
+
+
+def _select(condition: Any, yes: T, no: T) -> T:
+    """Return one of two trees; a function of one copy."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,0 +1,93 @@
+"""Pushes: sudden changes of the joints' velocities at random times, as if something had hit the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState
+from sim2real.graph.node import BaseNode
+from sim2real.train.environment.variation import VariationConfig
+
+
+@runtime_checkable
+class PushableWorld(Protocol):
+    """A world whose joints can be pushed."""
+
+    def velocity(self, state: Any) -> jax.Array:
+        """Return the joints' velocities, shape ``()`` or ``(joints,)`` [rad/s, or m/s]."""
+        ...
+
+    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+        """Return the state with other velocities of the joints."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pushes:
+    """Pushes of each joint by itself, at the moments of policy steps.
+
+    Attributes:
+        node: Name of the world's node.
+        world: The world.
+        size: Largest change of a velocity [rad/s, or m/s]; all up to it are as likely, in both directions.
+        chance: Probability that a joint is pushed in a row.
+    """
+
+    node: str
+    world: PushableWorld
+    size: float
+    chance: float
+
+    @staticmethod
+    def of(vary: VariationConfig, world: BaseNode, rate_hz: float) -> Pushes | None:
+        """Return the pushes that a configuration asks for; None: none.
+
+        Args:
+            vary: Their size and rate.
+            world: The world's node.
+            rate_hz: The policy's rate [Hz].
+
+        Raises:
+            UsageError: The world has no place for them, or they come faster than policy steps.
+        """
+        if not vary.push:
+            return None
+        if not isinstance(world, PushableWorld):
+            raise UsageError(
+                f"a {type(world).__name__} cannot be pushed: nothing says where in its state velocities are",
+                hint="give the world velocity(state) and with_velocity(state, velocity), or leave out --vary.push",
+            )
+        if vary.push_hz > rate_hz:
+            raise UsageError(f"vary.push_hz must not exceed the policy's rate, {rate_hz:g} Hz, got {vary.push_hz:g}")
+        return Pushes(world.name, world, vary.push, vary.push_hz / rate_hz)
+
+    def kicks(self, key: jax.Array, shape: tuple[int, ...], width: jax.Array | None = None) -> jax.Array:
+        """Draw by how much velocities change in a row; 0 where a joint is not pushed.
+
+        Args:
+            key: JAX key.
+            shape: That of the velocities.
+            width: Share of the size; None: all of it.
+        """
+        k_whether, k_how = jax.random.split(key)
+        size = self.size if width is None else self.size * width
+        hit = jax.random.bernoulli(k_whether, self.chance, shape)
+        return jnp.where(hit, size * jax.random.uniform(k_how, shape, minval=-1.0, maxval=1.0), 0.0)
+
+    def apply(self, graph_state: GraphState, key: jax.Array, width: jax.Array | None = None) -> GraphState:
+        """Return the graph's state after the pushes of a row.
+
+        Args:
+            graph_state: The state after the row.
+            key: JAX key.
+            width: Share of the size; None: all of it.
+        """
+        state = graph_state.state[self.node]
+        before = jnp.asarray(self.world.velocity(state))
+        after = before + self.kicks(key, before.shape, width).astype(before.dtype)
+        return graph_state.replace(state={**graph_state.state, self.node: self.world.with_velocity(state, after)})

@@ -1,0 +1,203 @@
+"""The policy: a network, the normaliser of its observations, and the distribution of its actions.
+
+A policy is a pytree of arrays, so it can be a node's parameters and pass through jit, vmap and files. All functions
+take one observation; use ``jax.vmap`` for more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.base import Base
+from sim2real.policy.network import OWN, NetworkSpec
+from sim2real.policy.runner import BESIDES, GRU_ARRAYS, OBSERVATION_CLIP, PARTS, gru_of, layers_of, require
+from sim2real.train.networks.architectures import GRU, MLP, Factory, Network, is_recurrent, make_network, name_of
+
+
+def log_prob(u: jax.Array, mean: jax.Array, log_std: jax.Array, squash: bool = False) -> jax.Array:
+    """Return the log density of ``u`` under a normal distribution with a diagonal covariance, or that of ``tanh(u)``.
+
+    Written out: importing distrax takes 1.7 s, a fifth of a training of the pendulum, which compiles and runs as fast
+    with it.
+
+    Args:
+        u: Shape ``(A,)``.
+        mean: Shape ``(A,)``.
+        log_std: Shape ``(A,)``: logarithms of the standard deviations.
+        squash: Return the density of ``tanh(u)``, that of ``u`` divided by the slope of tanh.
+
+    Returns:
+        Shape ``()``.
+    """
+    z = (u - mean) * jnp.exp(-log_std)
+    density = -jnp.sum(0.5 * z**2 + log_std + 0.5 * math.log(2.0 * math.pi))
+    return density - log_slope(u) if squash else density
+
+
+def log_slope(u: jax.Array) -> jax.Array:
+    """Return the logarithm of the volume by which tanh stretches at ``u``, shape ``(A,)``; exact for large ``u``."""
+    return jnp.sum(2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)))
+
+
+def entropy(log_std: jax.Array) -> jax.Array:
+    """Return the entropy [nat], shape ``()``, of a normal distribution with ``log_std (A,)``."""
+    return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
+
+
+@struct.dataclass
+class Policy(Base):
+    """A Gaussian policy: the observation is normalised, the network gives the mean, which is bounded and scaled.
+
+    By default the mean is clipped to [-1, 1], not squashed by tanh: tasks such as a swing-up need full actions, which
+    tanh reaches only for very large means, and train more slowly with it.
+
+    Attributes:
+        params: The network's parameters; of a perceptron one pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer.
+        log_std: Shape ``(A,)``: logarithm of the exploration noise, in units of half the action range.
+        mean: Shape ``(O,)``: the observation's mean.
+        std: Shape ``(O,)``: the observation's standard deviation.
+        low: Shape ``(A,)``: lower bound of the action.
+        high: Shape ``(A,)``: upper bound of the action.
+        network: The network, as functions of its parameters.
+        spec: What it is, in words that a file can hold.
+    """
+
+    params: Any
+    log_std: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    low: jax.Array
+    high: jax.Array
+    network: Network = struct.field(pytree_node=False)
+    spec: NetworkSpec = struct.field(pytree_node=False, default=NetworkSpec())
+
+    def initial_carry(self) -> Any:
+        """Return what is carried into an episode's first step; ``()`` if nothing is."""
+        return self.network.initial_carry()
+
+    def normalise(self, observation: jax.Array) -> jax.Array:
+        """Return the network's input for ``observation``, both of shape ``(O,)``."""
+        return jnp.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+    def get_mean(self, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+        """Return what is carried on, and the mean of the Gaussian, shape ``(A,)``, before it is bounded and scaled."""
+        return self.network.apply(self.params, carry, self.normalise(observation))
+
+    def bound(self, u: jax.Array) -> jax.Array:
+        """Return ``u``, shape ``(A,)``, within [-1, 1]: clipped, or squashed by tanh."""
+        return jnp.tanh(u) if self.spec.squash else jnp.clip(u, -1.0, 1.0)
+
+    def to_action(self, u: jax.Array) -> jax.Array:
+        """Bound ``u``, shape ``(A,)``, and scale it to [low, high]."""
+        return self.low + 0.5 * (self.high - self.low) * (self.bound(u) + 1.0)
+
+    def step(self, carry: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
+        """Return what is carried on, and the action without exploration noise, shape ``(A,)``.
+
+        Args:
+            carry: What ``initial_carry`` returned at the episode's start, or the step before.
+            observation: Shape ``(O,)``, in the units that the policy was trained with.
+        """
+        carry, u = self.get_mean(carry, observation)
+        return carry, self.to_action(u)
+
+    def get_action(self, observation: jax.Array, rng: jax.Array | None = None) -> jax.Array:
+        """Return the action, shape ``(A,)``, for an observation, shape ``(O,)``.
+
+        Args:
+            observation: In the units that the policy was trained with.
+            rng: JAX key of the exploration noise; None: no noise.
+
+        Raises:
+            UsageError: The policy remembers, so that an observation alone does not tell its action.
+        """
+        if is_recurrent(self.network):
+            raise UsageError(
+                f"a policy of network {self.spec.name!r} remembers: its action does not follow from an observation",
+                hint="call step(carry, observation), beginning each episode with initial_carry()",
+            )
+        _, u = self.get_mean(self.initial_carry(), observation)
+        if rng is not None:
+            u = u + jnp.exp(self.log_std) * jax.random.normal(rng, u.shape, u.dtype)
+        return self.to_action(u)
+
+    def to_weights(self) -> dict[str, np.ndarray]:
+        """Return the arrays of a policy bundle: ``layers.<i>.kernel``, ``layers.<i>.bias``, ``log_std``, ...
+
+        Raises:
+            Sim2RealError: This is a batch of policies: its leaves have a leading seed axis.
+        """
+        if np.ndim(self.log_std) != 1:
+            raise Sim2RealError(
+                f"one policy was expected, this one has leading axes {np.shape(self.log_std)[:-1]}",
+                hint="pick a seed first: policies[0], or TrainResult.best",
+            )
+        weights = {name: getattr(self, name) for name in BESIDES} | _to_arrays(self.spec.name, self.params)
+        return {name: np.asarray(value, np.float32) for name, value in weights.items()}
+
+    @classmethod
+    def from_weights(
+        cls, weights: Mapping[str, np.ndarray], spec: NetworkSpec | None = None, factory: Factory | None = None
+    ) -> Policy:
+        """Return the policy from the arrays that ``to_weights`` returns.
+
+        Args:
+            weights: The arrays.
+            spec: What the network is; default: a perceptron whose mean is clipped.
+            factory: Makes the network of a user; default: what has the name that ``spec`` has.
+
+        Raises:
+            Sim2RealError: An array is missing or of another shape.
+            UsageError: The network cannot be imported.
+        """
+        spec = spec or NetworkSpec()
+        arrays = {name: jnp.asarray(value, jnp.float32) for name, value in weights.items()}
+        network, params = _from_arrays(spec.name if factory is None else factory, arrays)
+        return cls(params=params, **{name: arrays[name] for name in BESIDES}, network=network, spec=spec)
+
+
+def _to_arrays(name: str, params: Any) -> dict[str, Any]:
+    """Return the parameters of a network by name."""
+    if name not in OWN:
+        return dict(_named(params))
+    layers = params if name == "mlp" else params["layers"]
+    arrays = {} if name == "mlp" else {f"gru.{part}": params[part] for part in GRU_ARRAYS}
+    return arrays | {f"layers.{i}.{p}": a for i, ab in enumerate(layers) for p, a in zip(PARTS, ab, strict=True)}
+
+
+def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[Network, Any]:
+    """Return a network, and its parameters from what ``_to_arrays`` returned."""
+    if kind in OWN:
+        layers = tuple(layers_of(arrays))
+        widths = tuple(bias.shape[0] for _, bias in layers)
+        if kind == "mlp":
+            return MLP(widths), layers
+        gru = gru_of(arrays)
+        return GRU((gru["recurrent"].shape[0], *widths)), {**gru, "layers": layers}
+    require(arrays, BESIDES)
+    inputs, outputs = arrays["mean"].size, arrays["log_std"].size
+    network = make_network(kind, (), inputs, outputs)
+    example = network.init(np.random.default_rng(0), inputs, 1.0)
+    like = _named(example)
+    require(arrays, [name for name, _ in like])
+    for name, leaf in like:
+        if leaf.shape != arrays[name].shape:
+            raise Sim2RealError(
+                f"the policy's {name} has shape {arrays[name].shape}, that of {name_of(kind)} has {leaf.shape}",
+                hint="the network is another one than was trained: go back to the code that the bundle was made with",
+            )
+    return network, jax.tree.unflatten(jax.tree.structure(example), [arrays[name] for name, _ in like])
+
+
+def _named(params: Any) -> list[tuple[str, Any]]:
+    """Return the arrays of a user's network with their paths as names."""
+    found = jax.tree_util.tree_leaves_with_path(params)
+    return [(f"network.{jax.tree_util.keystr(path, simple=True, separator='.')}", leaf) for path, leaf in found]

@@ -1,0 +1,136 @@
+"""The state before the first update."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.train.config import PPOConfig
+from sim2real.train.environment.protocol import TrainingEnvironment
+from sim2real.train.networks.architectures import Factory, make_network, name_of
+from sim2real.train.networks.normaliser import Normaliser
+from sim2real.train.networks.policy import Policy
+from sim2real.train.networks.sequences import ActorCritic
+from sim2real.train.ppo.optimiser import make_optimiser, set_rate
+from sim2real.train.ppo.rollout import Copies
+from sim2real.train.ppo.teacher import check_teacher, size_of
+from sim2real.train.ppo.update import TrainState
+from sim2real.train.sweep import Sweep
+
+if TYPE_CHECKING:
+    import optax
+
+T = TypeVar("T")
+
+
+def make_start(
+    env: TrainingEnvironment, configs: Sequence[PPOConfig], key: jax.Array, networks: ActorCritic
+) -> TrainState:
+    """Return the states before the first update, with a leading axis; compiles nothing.
+
+    The environments' states are zeros; the first rollout resets them.
+
+    Args:
+        env: The environment.
+        configs: Settings; they may differ in numbers alone. The leading axis has all seeds of the first, then those of
+            the next.
+        key: Source of all randomness; seed i depends on it and on i alone.
+        networks: Actor and value function.
+    """
+    first = configs[0]
+    shapes = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
+    more = privileged_size(env, first)
+    keys = jnp.stack([jax.random.fold_in(key, seed) for seed in range(first.num_seeds)])
+    data = np.asarray(jax.random.key_data(keys))
+    sizes = env.observation_size, np.shape(env.action_low)[0], more
+    starts = [_networks(config, networks, np.random.default_rng(own), sizes) for config in configs for own in data]
+    params, optimiser, normaliser, privileged = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *starts)
+    members = len(starts)
+    count = members, first.num_envs
+    carries = (net.initial_carry() for net in (networks.actor, networks.critic))
+    copies = Copies(*_blank(shapes, count), *(_repeated(carry, count) for carry in carries))
+    keys = keys if len(configs) == 1 else jnp.tile(keys, len(configs))
+    return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys)
+
+
+def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, np.ndarray]:
+    """Return setting -> its value for each place on the leading axis, float32."""
+    return {n: np.repeat(np.array([point[n] for point in sweep.grid], np.float32), num_seeds) for n in sweep.values}
+
+
+def make_networks(
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    actor: Factory | None = None,
+    critic: Factory | None = None,
+    teacher: Policy | None = None,
+) -> ActorCritic:
+    """Return the networks of a training.
+
+    Args:
+        env: The environment.
+        config: Names them.
+        actor: Makes the actor; default: as ``config`` says.
+        critic: Makes the value function; default: as ``config`` says, and that the actor.
+        teacher: Whom the actor shall imitate; None: it learns from rewards.
+
+    Raises:
+        UsageError: There is no such network, or it does not fit.
+    """
+    if teacher is not None:
+        check_teacher(env, config, teacher)
+    kind = actor or config.network
+    judge = critic or config.critic or kind
+    size, actions = env.observation_size, np.shape(env.action_low)[0]
+    return ActorCritic(
+        actor=make_network(kind, config.hidden, size, actions),
+        critic=make_network(judge, config.hidden, size + (privileged_size(env, config) or 0), 1, exported=False),
+        name=name_of(kind),
+        teacher=teacher,
+    )
+
+
+def privileged_size(env: TrainingEnvironment, config: PPOConfig) -> int | None:
+    """Return how much the value function sees besides the observation; None: it is not asked for."""
+    return size_of(env) if config.privileged else None
+
+
+def _repeated(carry: T, count: tuple[int, ...]) -> T:
+    """Return a copy of a carry for each copy of the environment."""
+    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*count, *np.shape(leaf))), carry)
+
+
+def _networks(
+    config: PPOConfig, networks: ActorCritic, rng: np.random.Generator, sizes: tuple[int, int, int | None]
+) -> tuple[dict[str, Any], optax.OptState, Normaliser, Normaliser | None]:
+    """Return networks, optimiser and normalisers; ``sizes``: of observation, action and privileged observation."""
+    size, actions, more = sizes
+    params = {
+        "actor": networks.actor.init(rng, size, 0.01),
+        "log_std": np.full(actions, config.log_std_init, np.float32),
+        "value": networks.critic.init(rng, size + (more or 0), 1.0),
+    }
+    optimiser = _blank(jax.eval_shape(make_optimiser(config).init, params), ())
+    if config.schedule == "adaptive":
+        optimiser = set_rate(optimiser, np.float32(config.learning_rate))
+    return params, optimiser, _normaliser(size), None if more is None else _normaliser(more)
+
+
+def _normaliser(size: int) -> Any:
+    """Return statistics of nothing, in numpy."""
+    blank: Any = (np.asarray(np.float32(0)), np.zeros(size, np.float32), np.ones(size, np.float32))
+    return Normaliser(*blank)
+
+
+def _blank(shapes: T, leading: tuple[int, ...]) -> T:
+    """Return zeros of given shapes and dtypes, with leading axes; in numpy, as jnp.zeros compiles for each shape."""
+
+    def leaf(struct: jax.ShapeDtypeStruct) -> jax.Array | np.ndarray:
+        is_key = jnp.issubdtype(struct.dtype, jax.dtypes.prng_key)
+        return (jnp if is_key else np).zeros((*leading, *struct.shape), struct.dtype)
+
+    return jax.tree.map(leaf, shapes)

@@ -1,0 +1,91 @@
+"""Training over several devices, of one host or of several: seeds and copies are divided, in one program."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from sim2real.train.config import PPOConfig
+from sim2real.train.scale.mesh import COPIES, SEEDS, mesh_of
+
+if TYPE_CHECKING:
+    from sim2real.train.ppo.update import TrainState
+
+
+T = TypeVar("T")
+
+
+class Shardings(NamedTuple):
+    """Where the arrays of a training lie.
+
+    Attributes:
+        state: A sharding for each array of its state.
+        whole: The sharding of what all devices have.
+    """
+
+    state: Any
+    whole: NamedSharding
+
+
+def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
+    """Return where each array of a training's state goes; None for one device.
+
+    Seeds are divided first, as they have nothing to tell each other; the devices of a seed divide its copies. The
+    compiler sees to it that they exchange what an update needs. Random numbers do not depend on it.
+
+    Args:
+        state: The state, with a leading seed axis; the environments' part has the copies as its second axis.
+        config: Numbers of devices in each process, seeds and copies.
+
+    Raises:
+        UsageError: When there are not as many devices, or they cannot divide seeds and copies.
+    """
+    if (mesh := mesh_of(config)) is None:
+        return None
+    by_seed = NamedSharding(mesh, PartitionSpec(SEEDS))
+    split = NamedSharding(mesh, PartitionSpec(SEEDS, COPIES))
+    shardings = jax.tree.map(lambda _: by_seed, state)._replace(copies=jax.tree.map(lambda _: split, state.copies))
+    return Shardings(shardings, NamedSharding(mesh, PartitionSpec()))
+
+
+def place(state: T, layout: Shardings | None) -> T:
+    """Return a state on its devices; each process, which has all of it, puts its own part.
+
+    Args:
+        state: The state, in this process's memory.
+        layout: Where its arrays go; None: where they are.
+    """
+    return state if layout is None else jax.tree.map(_put, state, layout.state)
+
+
+def whole(tree: T, layout: Shardings | None) -> T:
+    """Return arrays of which all devices have a copy.
+
+    Args:
+        tree: The arrays, in this process's memory.
+        layout: Where they go; None: to the one device.
+    """
+    return jax.tree.map(jnp.asarray if layout is None else lambda leaf: _put(leaf, layout.whole), tree)
+
+
+def _put(leaf: Any, where: NamedSharding) -> jax.Array:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), where), impl=jax.random.key_impl(leaf))
+    array = np.asarray(leaf)
+    return jax.make_array_from_callback(array.shape, where, lambda index: array[index])
+
+
+def gather(state: T, layout: Shardings | None) -> T:
+    """Return a state that this process can read, also where other processes have a part; all of them call this.
+
+    Args:
+        state: The state.
+        layout: Where its arrays are; None: here.
+    """
+    if layout is None or jax.process_count() == 1:
+        return state
+    return jax.jit(lambda state: state, out_shardings=layout.whole)(state)

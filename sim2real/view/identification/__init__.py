@@ -1,0 +1,1 @@
+"""The section of an identification on a page, and its figures."""

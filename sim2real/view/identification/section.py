@@ -1,0 +1,366 @@
+"""The section of an identification: its verdict first, then parameters, predictions, and what is left unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sim2real.artifacts.estimation.posterior import from_scale
+from sim2real.artifacts.estimation.quantity import Quantity
+from sim2real.artifacts.identification import Estimate, Identification
+from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.log.schema import unit_of
+from sim2real.view.blocks import (
+    MISSING,
+    Banner,
+    Block,
+    FigureBlock,
+    ListBlock,
+    PageSection,
+    TableBlock,
+    Tile,
+    Tone,
+    decimals_for,
+    fixed,
+    interval,
+    number,
+    pretty_unit,
+)
+from sim2real.view.identification import figures, intervals, residuals
+from sim2real.view.identification.links import link_blocks
+from sim2real.view.provenance import about
+from sim2real.view.readable_units import in_readable_unit
+
+_TITLES: dict[str, tuple[Tone, str]] = {
+    "accepted": ("good", "Accepted"),
+    "hit a bound": ("doubt", "Hit a bound: an estimate lies where the search was not allowed to go further"),
+    "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
+    "lacks a term": ("doubt", "Lacks a term: free runs are far off, and one more term mends them"),
+    "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
+}
+_STRONG = 0.9
+
+
+def identify_section(artifact: StageFolder) -> PageSection:
+    """Return the verdict, the parameters and how sure they are, and how well the model predicts."""
+    found = Identification.load(artifact.folder)
+    blocks = [
+        *_parameters(found),
+        *_aggregate(found),
+        *_parts(found),
+        *_alternatives(found),
+        *link_blocks(found.links),
+        *_predictions(found),
+        *_residuals(found),
+        *_correlation(found),
+    ]
+    if np.isfinite(found.search.history).any():
+        refined = found.search.refined
+        gain = f" Dashed: refined in {sum(r.steps for r in refined)} steps." if refined else ""
+        blocks.append(
+            FigureBlock(figures.search(found, "identify-search"), f"The best loss of the search.{gain}", narrow=True)
+        )
+    lead = "Dynamics and delays from the log, with how far each can be trusted."
+    tiles = list(_tiles(found))
+    return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
+
+
+def _banner(found: Identification) -> Banner | None:
+    status = found.verdict.status
+    if not status:
+        return None
+    tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
+    return Banner(tone, title, [_sentence(r) for r in found.verdict.reasons])
+
+
+def _sentence(text: str) -> str:
+    """Write a message as a sentence; a name at its beginning stays as it is."""
+    first = text.split(" ", 1)[0]
+    return (text if "_" in first else text[:1].upper() + text[1:]).rstrip(".") + "."
+
+
+def _parameters(found: Identification) -> list[Block]:
+    """Return table and figure of the parameters, what lies at a bound, and what the data determines."""
+    bounded = [e for e in found.parameters if e.verdict == "at a bound"]
+    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate lies at a bound."
+    blocks: list[Block] = [
+        _parameter_table(found.parameters),
+        FigureBlock(
+            intervals.intervals(found.parameters, "identify-intervals"),
+            f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; what "
+            "lies inside the shaded 95 % band agrees with the estimate. Arrows point to marks beyond the edge.",
+        ),
+    ]
+    if found.check:
+        known = found.check
+        items = [_sentence(m) for m in known.messages] or ["Every parameter is determined by itself."]
+        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(known.condition, 2)}.")
+        blocks.append(ListBlock("What the data determines", items))
+        errors = known.standard_error_per_minute
+        rows = [_minute(e, value) for e in found.parameters if (value := errors.get(e.name)) is not None]
+        if rows:
+            caption = "Standard error from one minute of such data"
+            heads = ("parameter", "standard error", "unit", "share of the estimate")
+            blocks.append(TableBlock(caption, heads, rows, (2,), folded=True))
+    return blocks
+
+
+def _minute(e: Estimate, error: float) -> list[str]:
+    scale, unit = (1e3, "ms") if e.unit == "s" else (1.0, pretty_unit(e.unit))
+    share = f"{100 * error / abs(e.estimate):.2g} %" if e.estimate else MISSING
+    return [e.name, number(scale * error, 2), unit, share]
+
+
+def _at_bound(e: Estimate) -> str:
+    if e.lower is None or e.upper is None:
+        return e.name
+    upper = abs(e.upper - e.estimate) < abs(e.estimate - e.lower)
+    readable = in_readable_unit(e)
+    bound = readable.upper if upper else readable.lower
+    return f"{e.name} (the {'upper' if upper else 'lower'}, {number(bound)} {pretty_unit(readable.unit)})"
+
+
+def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
+    with_truth = any(e.truth is not None for e in estimates)
+    columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
+    columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
+    rows = []
+    for e in map(in_readable_unit, estimates):
+        places = decimals_for(e.standard_error, e.estimate)
+        ends = MISSING if e.low95 is None else f"{fixed(e.low95, places)} to {fixed(e.high95, places)}"
+        row = [e.name, fixed(e.estimate, places), fixed(e.standard_error, places), ends, pretty_unit(e.unit)]
+        if e.verdict == "fixed":
+            row[2:4] = [MISSING, MISSING]
+        row += [number(e.nominal), interval(e.lower, e.upper)]
+        if with_truth:
+            row += [fixed(e.truth, places), _error(e)]
+        rows.append([*row, e.verdict or MISSING])
+    remarks = [pretty_unit(e.about) if e.about else "" for e in estimates]
+    return TableBlock("Parameters", columns, rows, text_columns=(4, len(columns) - 1), remarks=remarks)
+
+
+def _error(e: Estimate) -> str:
+    if e.truth is None:
+        return MISSING
+    if not e.truth:
+        return number(e.estimate - e.truth, 2)
+    return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
+
+
+def _aggregate(found: Identification) -> list[Block]:
+    quantities: Sequence[Quantity] = found.aggregate
+    if not quantities:
+        return []
+    count = len(quantities[0].estimates)
+    names = figures.log_names(found)[:count]
+    logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
+    rows = []
+    for q in quantities:
+        scale, unit = (1e3, "ms") if q.unit == "s" else (1.0, pretty_unit(q.unit))
+        places = decimals_for(scale * q.standard_error, scale * q.mean)
+        numbers = [fixed(scale * v, places) for v in (q.mean, q.standard_error, q.between)]
+        ends = f"{fixed(scale * q.low95, places)} to {fixed(scale * q.high95, places)}"
+        rows.append([q.name, *numbers, ends, unit, "yes" if q.agree else "no"])
+    heads = ("quantity", "mean", "s.e. of the mean", "spread", "95 % for a further recording", "unit", "agree")
+    loose = ", ".join(q.name for q in quantities if not q.agree)
+    said = f" Beyond what their errors explain they differ in {loose}." if loose else " They agree in everything."
+    return [
+        FigureBlock(
+            intervals.aggregate(quantities, "identify-aggregate"),
+            f"Each recording identified by itself.{said} The shaded interval is what to expect of a further one; "
+            f"with few recordings it is wide.{logs}",
+        ),
+        TableBlock(f"Over {count} recordings", heads, rows, text_columns=(5, 6)),
+    ]
+
+
+def _parts(found: Identification) -> list[Block]:
+    """Return the errors on parts of the recordings that were left out of the fit, with their mean and the worst."""
+    rows = found.left_out
+    if not rows:
+        return []
+    kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
+    units = {column: unit_of(column, found.units) for _, column in kinds}
+    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in one go'} [{units[column]}]" for kind, column in kinds]
+    errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
+    with_terms = bool(found.terms) or any(r.terms for r in rows)
+    table = []
+    moved = [own[np.isfinite(own)] for own in errors.T]  # of a part in which a joint rests there is no error
+    summed = [
+        (name, [of(own) if own.size else np.nan for own in moved])
+        for name, of in (("mean", np.mean), ("worst", np.max))
+    ]
+    for name, own, terms in [
+        *((r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)),
+        *((name, e, "") for name, e in summed),
+    ]:
+        table.append([name, *([terms] if with_terms else []), *(number(e, 3) for e in own)])
+    caption = "Identified without this part, and off on it by (root mean square)"
+    columns = ["left out", *(["terms"] if with_terms else []), *heads]
+    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
+
+
+def _alternatives(found: Identification) -> list[Block]:
+    """Return the models that explain the recordings as well as the estimate, with their parameters and shares."""
+    if found.posterior is None or not found.posterior.others:
+        return []
+    named = [("estimate", found.posterior), *((o.about, o.posterior) for o in found.posterior.others)]
+    left = 1.0 - sum(o.weight for o in found.posterior.others)
+    shares = [left, *(o.weight for o in found.posterior.others)]
+    values = [
+        {n: float(from_scale(t, x)) for n, t, x in zip(p.names, p.transform, p.mean, strict=True)} for _, p in named
+    ]
+    rows = [
+        [name, *(number(own.get(name), 3) for own in values)] for name in dict.fromkeys(n for v in values for n in v)
+    ]
+    rows.insert(0, ["share of the draws", *(f"{100 * s:.0f} %" for s in shares)])
+    caption = "Models that explain the recordings as well: training draws robots of all"
+    return [TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
+
+
+def _predictions(found: Identification) -> list[Block]:
+    """Return curves of errors, free runs, and the segments."""
+    blocks: list[Block] = []
+    if len(found.held_out) > 1:
+        blocks.append(_positions_table(found))
+    if found.prediction:
+        blocks.append(
+            FigureBlock(
+                figures.prediction_errors(found, "identify-errors"),
+                "How the error grows with the horizon, from initial states fitted to the samples before it. On "
+                "held-out data the identified model must stay below all others.",
+            )
+        )
+        blocks.append(_prediction_table(found))
+    if found.free:
+        recordings = np.unique(found.free["recording"]).tolist()
+        blocks.append(
+            FigureBlock(
+                figures.free_runs(found, "identify-free"),
+                "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
+                f"{_left_out(found, recordings)}",
+            )
+        )
+        if found.free_run:
+            blocks.append(_free_run_table(found))
+    if not found.samples:
+        return blocks
+    blocks.append(
+        FigureBlock(
+            figures.predictions(found, "identify-predictions"),
+            "Every segment is simulated from its own initial state. Shaded data took no part in the fit."
+            f"{_left_out(found, found.recordings)}",
+        )
+    )
+    return blocks
+
+
+def _left_out(found: Identification, recordings: Sequence[int]) -> str:
+    left = len(found.fields) * len(recordings) - len(figures.shown(found, recordings))
+    return f" {left} further panels are left out." if left else ""
+
+
+def _residuals(found: Identification) -> list[Block]:
+    s = found.samples
+    if not s:
+        return []
+    there = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
+    if not there.any() or not any("identified" in found.models(f) for f in found.fields):
+        return []
+    assumed = " Orange: the noise that was assumed of the measurement." if found.sigma else ""
+    return [
+        FigureBlock(
+            residuals.figure(found, "identify-residuals"),
+            f"What the identified model leaves unexplained on held-out data.{assumed} A slow wave, or an "
+            "autocorrelation that lasts, is something the model lacks; what stays inside the shaded band is noise.",
+        )
+    ]
+
+
+def _correlation(found: Identification) -> list[Block]:
+    if not found.correlation:
+        return []
+    names, matrix = found.correlation.names, found.correlation.matrix
+    pairs = [
+        (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
+    ]
+    pairs.sort(key=lambda pair: -abs(pair[2]))
+    said = "; ".join(f"{b} and {a} {v:+.2f}".replace("-", "\u2212") for a, b, v in pairs[:6])
+    strong = f" Beyond ±{_STRONG:g}: {said}." if said else f" None is beyond ±{_STRONG:g}."
+    return [
+        FigureBlock(
+            figures.correlation(names, matrix, "identify-correlation"),
+            f"Correlations of the estimates. Of a pair near ±1 only a combination is determined.{strong}",
+            narrow=True,
+        )
+    ]
+
+
+def _positions_table(found: Identification) -> TableBlock:
+    models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
+    rows = [
+        [
+            row.name,
+            *(number(row.rmse.get(m)) for m in models),
+            pretty_unit(row.unit),
+            ", ".join(row.beaten_by) or "none",
+        ]
+        for row in found.held_out
+    ]
+    caption = f"Held-out RMSE of every position after {found.held_out[0].horizon_s:g} s, the worst first"
+    heads = ("position", *models, "unit", "no better than")
+    return TableBlock(caption, heads, rows, (len(models) + 1, len(models) + 2))
+
+
+def _prediction_table(found: Identification) -> TableBlock:
+    fields = list(dict.fromkeys(f for row in found.prediction for f in row.rmse))
+    heads = [f"RMSE of {f}" + (f" [{unit}]" if (unit := unit_of(f, found.units)) else "") for f in fields]
+    rows = [
+        [
+            r.model,
+            number(r.horizon_s, 3),
+            "held out" if r.held_out else "fitted",
+            *[number(r.rmse.get(f)) for f in fields],
+        ]
+        for r in found.prediction
+    ]
+    return TableBlock("Prediction errors", ("model", "horizon [s]", "data", *heads), rows, (2,), folded=True)
+
+
+def _free_run_table(found: Identification) -> TableBlock:
+    several = len(found.recordings) > 1
+    rows = [
+        [
+            r.model,
+            *([figures.title_of(found, r.recording)] if several else []),
+            r.field,
+            number(r.seconds, 3),
+            number(r.rmse),
+            number(r.mae),
+            unit_of(r.field, found.units) or MISSING,
+        ]
+        for r in found.free_run
+    ]
+    heads = ["model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit"]
+    text = (1, 2, 6) if several else (1, 5)
+    return TableBlock("Free runs", heads, rows, text, folded=True)
+
+
+def _tiles(found: Identification) -> Iterator[Tile]:
+    for row in found.held_out[:1]:
+        which = f"{row.name}, the worst of {len(found.held_out)}," if len(found.held_out) > 1 else row.name
+        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
+        error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
+        yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
+    for e in found.parameters:
+        if e.kind == "derived" and e.unit == "s":
+            error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
+            truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
+            yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
+    if found.misfit is not None:
+        yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the deviation assumed of a measurement")
+    seconds, evaluations = found.search.seconds, found.search.evaluations
+    if seconds is not None:
+        simulated = [found.search.engine, f"{number(evaluations)} evaluations" if evaluations else ""]
+        yield Tile("search", f"{float(seconds):.0f} s", "; ".join(filter(None, reversed(simulated))))

@@ -1,0 +1,107 @@
+"""Pages for a browser: one self-contained HTML file, without scripts and without a network."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
+from sim2real.artifacts.run.stage_status import standing
+from sim2real.view.blocks import NoteBlock, PageSection
+from sim2real.view.page.iterations import iterations_sections
+from sim2real.view.page.sections import SECTIONS, headline
+
+PAGE = "report.html"
+
+
+def report(run_dir: Path) -> Path:
+    """Write the report of a run: a section for each stage that is finished.
+
+    Args:
+        run_dir: The run's folder.
+
+    Returns:
+        Path of the page, ``report.html`` in the run's folder.
+
+    Raises:
+        Sim2RealError: When no stage is finished, or what a stage wrote is missing or malformed.
+    """
+    run_dir = Path(run_dir)
+    artifacts = finished_stages(run_dir)
+    sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()] + iterations_sections(run_dir)
+    notes = _about_others(run_dir, artifacts)
+    return _write(run_dir / PAGE, list(artifacts.values()), sections, run_dir.resolve().name, notes)
+
+
+def identify_page(identify_folder: Path) -> Path:
+    """Write the page of an identification into its folder.
+
+    Raises:
+        Sim2RealError: When what identify wrote is missing or malformed.
+    """
+    return _stage_page(identify_folder, "identify")
+
+
+def deploy_page(deploy_folder: Path) -> Path:
+    """Write the page of a deployment into its folder.
+
+    Raises:
+        Sim2RealError: When what deploy wrote is missing or malformed.
+    """
+    return _stage_page(deploy_folder, "deploy")
+
+
+def _stage_page(folder: Path, stage: str) -> Path:
+    artifact = open_folder(folder, stage)
+    section = SECTIONS[stage](artifact)
+    return _write(artifact.folder / PAGE, [artifact], [section], artifact.folder.resolve().parent.name, [])
+
+
+def _write(
+    path: Path, artifacts: Sequence[StageFolder], sections: Sequence[PageSection], run: str, notes: list[NoteBlock]
+) -> Path:
+    """Render a page and write it; a browser that has the old one open never sees half of the new one."""
+    environment = Environment(
+        loader=PackageLoader("sim2real.view"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pipeline = next((str(a.manifest["pipeline"]) for a in artifacts if "pipeline" in a.manifest), "")
+    started = min((str(a.manifest["started"]) for a in artifacts if "started" in a.manifest), default="")
+    text = environment.get_template("page.html").render(
+        pipeline=pipeline or "run",
+        run=run,
+        started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
+        version=next((a.manifest["versions"].get("sim2real") for a in artifacts if "versions" in a.manifest), ""),
+        sections=sections,
+        tiles=headline(sections) if len(sections) > 1 else [],
+        stages=[(stage, stage in {s.id for s in sections}) for stage in STAGES],
+        notes=notes,
+    )
+    draft = path.with_name(f".{path.name}.tmp")
+    draft.write_text(text, encoding="utf-8")
+    os.replace(draft, path)
+    return path
+
+
+def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
+    """Return notes about newer attempts that did not finish, whose place an older one takes, and about stale stages."""
+    notes = []
+    for stage in STAGES:
+        tried = attempts(run_dir, stage)
+        if tried and (stage not in artifacts or tried[0].folder != artifacts[stage].folder):
+            status = tried[0].manifest.get("status", "without a manifest")
+            status = "a dry run" if status == "dry run" else status
+            error = tried[0].manifest.get("error")
+            shown = f"this page shows {artifacts[stage].folder.name}" if stage in artifacts else "it is left out"
+            notes.append(
+                NoteBlock(f"The newest attempt at {stage} is {status}{f' ({error})' if error else ''}: {shown}.")
+            )
+    stale = {stage: s.stale for stage, s in standing(run_dir).items() if s.stale}
+    notes += [NoteBlock(f"Out of date: {why}. `sim2real run --resume` makes it again.") for why in stale.values()]
+    return notes

@@ -1,0 +1,260 @@
+"""The four stages' sections of a page, each from the stage's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Deployment, Scores
+from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.timing import Timing
+from sim2real.graph.episode import Episode
+from sim2real.log.ages import oldest_input
+from sim2real.log.schema import unit_of
+from sim2real.view import timing
+from sim2real.view.blocks import (
+    MISSING,
+    Block,
+    FigureBlock,
+    NoteBlock,
+    PageSection,
+    TableBlock,
+    Tile,
+    fixed,
+    number,
+    spoken,
+)
+from sim2real.view.identification.section import identify_section
+from sim2real.view.page import deployment_verdict, figures
+from sim2real.view.page.episodes import episodes_svg
+from sim2real.view.page.sensitivity import sensitivity_blocks
+from sim2real.view.page.servos import DRY, servo_blocks
+from sim2real.view.provenance import about
+from sim2real.view.signals import Signals, signals_of, simulated_beside
+
+
+def record_section(artifact: StageFolder) -> PageSection:
+    """Return what was recorded, and how well the nodes kept their times."""
+    log = signals_of(Recording.load(artifact.folder))
+    blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
+    commanded = "what would have been commanded" if log.dry else "what was commanded"
+    truth = " The true state is what the embedded robot knew of itself." if log.truth else ""
+    blocks.append(
+        FigureBlock(
+            figures.recording(log, "record-signals"),
+            f"What was measured, at the time of each sample, and {commanded}.{truth} Right: a closer look.",
+        )
+    )
+    blocks += [*_timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
+    steps = max((len(s) for s in log.episode.steps.values()), default=0)
+    tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *_timing_tiles([log.episode])]
+    lead = "The robot under an excitation" + (
+        ", with torque withheld." if log.dry else "; the log is what everything after it rests on."
+    )
+    return PageSection("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
+
+
+def train_section(artifact: StageFolder) -> PageSection:
+    """Return the learning curves."""
+    curves = History.load(artifact.folder)
+    last, seeds = curves.success[-1], curves.returns.shape[1]
+    whose = (
+        f"seed {curves.best_seed}, the best of {seeds}" if curves.best_seed is not None else f"median of {seeds} seeds"
+    )
+    shown = last[curves.best_seed] if curves.best_seed is not None else np.nanmedian(last)
+    tiles = [
+        Tile("success in simulation", f"{shown:.0%}", whose if seeds > 1 else "one seed"),
+        Tile("steps in simulation", number(int(curves.steps[-1]))),
+        Tile("time", f"{curves.seconds[-1]:.0f} s"),
+    ]
+    figure = FigureBlock(figures.training(curves, "train-curves"), "Evaluations during training, in simulation.")
+    lead = "A policy for the identified model, with the timing of the robot."
+    blocks = [figure, _seeds(curves), *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
+    return PageSection("train", "Train", lead, tiles, blocks)
+
+
+def _seeds(curves: History) -> TableBlock:
+    """Return how each seed does at the end, with the settings that it tried, and what each term of the reward added."""
+    tried = ("settings",) if curves.settings else ()
+    rows = [
+        [str(seed), *curves.settings[seed : seed + 1], *map(number, values), f"{curves.success[-1, seed]:.1%}"]
+        for seed, values in enumerate(
+            zip(*(c[-1].tolist() for c in (curves.returns, *curves.terms.values())), strict=True)
+        )
+    ]
+    header = ("seed", *tried, "return", *(f"of it {name}" for name in curves.terms), "success")
+    return TableBlock("Each seed at the end", header, rows, text_columns=(1,) if tried else ())
+
+
+def _drawn_blocks(artifact: StageFolder) -> list[Block]:
+    """Return what episodes were drawn from; nothing where an older version trained."""
+    if "episodes" not in artifact.outputs:
+        return []
+    drawn = Episodes.load(artifact.folder)
+    if not drawn.parameters and not drawn.drawn_s:
+        return [NoteBlock("All episodes had the same parameters, without delays.")]
+    caption = (
+        "What episodes were drawn from: parameters beside the 95 % interval that was identified, times beside those of "
+        "the recording, noise beside how far it lay off the model. For what the model leaves unexplained, the "
+        f"posterior's deviations are {drawn.widening:.1f} times as wide."
+    )
+    if drawn.cut or drawn.again:
+        caption += (
+            f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that training cannot "
+            f"hold; {drawn.again} were drawn again, as it came in their first half."
+        )
+    if drawn.push_hz:
+        caption += f" Each joint is pushed {drawn.push_hz:g} times a second, at random times."
+    if drawn.curriculum != (1.0, 1.0):
+        first, last = drawn.curriculum
+        caption += (
+            f" The share of all differences grows from {first:g} to {last:g} over the training; drawn: the latter."
+        )
+    return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
+
+
+def deploy_section(artifact: StageFolder) -> PageSection:
+    """Return the gap between robot and simulation, and each episode."""
+    deployed = Deployment.load(artifact.folder)
+    logs = [signals_of(recording) for recording in deployed.recordings]
+    if deployed.dry_run:
+        return _dry_section(artifact, logs)
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    blocks += deployment_verdict.verdict_blocks(deployed)
+    rows = [
+        [
+            spoken(row.quantity)[0],
+            row.unit or unit_of(row.quantity, deployed.units) or spoken(row.quantity)[1],
+            *[number(value) for value in (row.real, row.simulation, row.gap)],
+        ]
+        for row in deployed.gap
+    ]
+    blocks.append(
+        TableBlock("Robot and simulation", ("quantity", "unit", "robot", "simulation", "gap"), rows, text_columns=(1,))
+    )
+    blocks += deployment_verdict.tables(deployed)
+    for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
+        caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
+        beside = simulated_beside(columns, log, deployed.units)
+        figure = figures.deployment(log, beside, deployed.units, index, f"deploy-{index}")
+        blocks.append(FigureBlock(figure, caption))
+    for index, log in enumerate(logs):
+        blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    blocks += servo_blocks([log.episode for log in logs])
+    real, simulated = (
+        [float(value) for s in scores if (value := (s or {}).get("success")) is not None]
+        for scores in ([e.real for e in deployed.episodes], [e.simulation for e in deployed.episodes])
+    )
+    tiles = []
+    if real:
+        note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
+        tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
+    tiles += deployment_verdict.verdict_tile(deployed)
+    tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in logs])]
+    lead = "The policy on the robot, beside the same policy in simulation."
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
+
+
+def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
+    """Return what a policy would have done; there is no gap, as nothing was moved."""
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    blocks.append(NoteBlock("There is no gap report: a simulation has nothing to be compared with."))
+    for index, log in enumerate(logs):
+        caption = f"Episode {index}: what was measured, and what the policy would have sent."
+        blocks.append(FigureBlock(figures.recording(log, f"deploy-{index}"), caption))
+    episodes = [log.episode for log in logs]
+    for index, episode in enumerate(episodes):
+        blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
+    lead = "The policy on the robot, with torque withheld."
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
+
+
+SECTIONS = {
+    "record": record_section,
+    "identify": identify_section,
+    "train": train_section,
+    "deploy": deploy_section,
+}
+
+
+def headline(sections: Sequence[PageSection]) -> list[Tile]:
+    """Return the first number of each stage: what a reader wants to know before anything else."""
+    return [Tile(f"{s.title}: {s.tiles[0].label}", s.tiles[0].value, s.tiles[0].note) for s in sections if s.tiles]
+
+
+def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
+    late = {n: np.concatenate([timing.times(e.steps[n]).lateness for e in episodes]) for n in episodes[0].steps}
+    p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
+    worst = max(p99, key=lambda n: p99[n])
+    yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
+    old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
+    oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
+    if oldest:
+        reader = max(oldest, key=lambda n: oldest[n])
+        yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
+    ends: list[Mapping[str, Any]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
+    overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
+    if overruns:
+        lost = ends[-1].get("lost_replies")  # counted over all episodes of a session
+        yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
+
+
+def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
+    """Return figures and table about an episode's timing."""
+    end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
+    rows, measured = [], Timing.of(episode)
+    for node in timing.in_order(episode):
+        steps = episode.steps[node]
+        if len(steps) < 2:
+            continue
+        row = [node, str(len(steps))]
+        taken = timing.times(steps)
+        for values in (taken.period, taken.lateness, taken.computation):
+            p50, p99 = np.quantile(values, [0.5, 0.99])
+            row += [fixed(float(v), 2) for v in (p50, p99, values.max())]
+        row += [MISSING if t is None else fixed(1e3 * t, 2) for t in astuple(measured.nodes[node].bus)]
+        ages = 1e3 * oldest_input(episode, node)
+        row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
+        rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
+    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "bus", "age") for k in ("p50", "p99", "max")]
+    table = TableBlock(
+        f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}",
+        ("node", "steps", *heads, "overruns"),
+        rows,
+        folded=folded,
+    )
+    if folded or not rows:
+        return [table]
+    return [
+        FigureBlock(
+            timing.schedule(episode, f"{name}-schedule"),
+            f"Who computed when.{which} Arrows are messages, from the end of a step to the start of its reader's.",
+        ),
+        FigureBlock(
+            timing.histograms(episode, f"{name}-timing"),
+            f"How well the nodes kept their times, in ms.{which} Age: how long before a step's start the newest "
+            "message that it used was sent, of its oldest input. Dashed: the 99 % quantile. Counts are logarithmic.",
+        ),
+        table,
+    ]
+
+
+def _scores(score: Scores) -> str:
+    simulation = score.simulation or {}
+    names = dict.fromkeys([*score.real, *simulation])
+    both = [
+        f"{label}: robot {number(score.real.get(n), 3)}"
+        + (f", simulation {number(simulation.get(n), 3)}" if n in simulation else "")
+        + ("" if unit == "1" else f" {unit}")
+        for n in names
+        for label, unit in [spoken(n)]
+    ]
+    text = "; ".join(both)
+    return text[:1].upper() + text[1:] + "." if both else ""

@@ -1,0 +1,23 @@
+"""What a stage ran with: the end of its section."""
+
+from __future__ import annotations
+
+from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.view.blocks import Block, FoldBlock, pairs_table
+
+
+def about(artifact: StageFolder) -> list[Block]:
+    """Return what a stage ran with: folded away at the end of its section."""
+    m = artifact.manifest
+    when = {k: m[k] for k in ("started", "duration_s", "command", "git") if m.get(k) is not None}
+    files = {n: e.get("sha256", "") for n, e in m.get("outputs", {}).items()}
+    tables = {
+        "Summary": m.get("summary"),
+        "Configuration": m.get("config"),
+        "Run": when,
+        "Inputs": m.get("inputs"),
+        "Outputs, by SHA-256": files,
+        "Versions": m.get("versions"),
+    }
+    found = [pairs_table(caption, tree) for caption, tree in tables.items() if tree]
+    return [FoldBlock("Configuration, files and versions", found)] if found else []

@@ -1,0 +1,178 @@
+"""What a Rerun recording shows, independent of Rerun: one tab for each episode, with curves and a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
+from sim2real.log.schema import unit_of
+from sim2real.view.signals import Series, Signals, signals_of, simulated_beside
+
+IDLE = "idle"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a plot.
+
+    Attributes:
+        entity: Where it stands in the recording.
+        label: What the legend calls it.
+        look: How it looks, in every plot the same: measured, identified, nominal, truth, command.
+        t_s: Times ``(N,)`` [s]; a NaN among the values interrupts the line.
+        values: Values ``(N,)``.
+    """
+
+    entity: str
+    label: str
+    look: str
+    t_s: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class SceneMotion:
+    """A motion of the robot in the 3-D view: a column ``(N,)`` for each field; a ghost is a model's prediction."""
+
+    entity: str
+    t_s: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    ghost: bool
+
+
+@dataclass(frozen=True)
+class Tab:
+    """One episode.
+
+    Attributes:
+        title: The tab's name.
+        entity: What all its entities begin with.
+        plots: Title -> curves, from top to bottom.
+        motions: What the 3-D view shows.
+        episode: Where the schedule comes from, if there is one.
+    """
+
+    title: str
+    entity: str
+    plots: Mapping[str, list[Curve]]
+    motions: list[SceneMotion]
+    episode: Episode | None = None
+
+
+def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
+    """Return the tabs of a run's finished stages.
+
+    Raises:
+        Sim2RealError: When what a stage wrote is missing or malformed.
+    """
+    tabs = []
+    if "record" in artifacts:
+        log = signals_of(Recording.load(artifacts["record"].folder))
+        tabs.append(_episode_tab(_dry("Record", log), "record", log, []))
+    if "identify" in artifacts:
+        found = Identification.load(artifacts["identify"].folder)
+        several = len(found.recordings) > 1
+        tabs += [_identify_tab(found, r, f" {r}" if several else "") for r in found.recordings]
+    if "deploy" in artifacts:
+        deployed = Deployment.load(artifacts["deploy"].folder)
+        for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
+            log = signals_of(recording)
+            beside = simulated_beside(simulated, log, deployed.units)
+            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, beside))
+    return [tab for tab in tabs if tab.plots]
+
+
+def _dry(title: str, log: Signals) -> str:
+    return f"{title} (dry run)" if log.dry else title
+
+
+def _episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
+    """Return the tab of a log: measured, true and simulated states, what nodes command, and the schedule."""
+    plots: dict[str, list[Curve]] = {}
+    models = {s.name: s for s in simulated}
+    for series in log.measured:
+        curves = [_curve(f"{entity}/{series.source}", series, "measured", f"measured by {series.source}")]
+        if series.name in log.truth:
+            curves.append(_curve(f"{entity}/truth", log.truth[series.name], "truth", "true state"))
+        if series.name in models:
+            curves.append(_curve(f"{entity}/simulation", models[series.name], "identified", "simulation"))
+        plots[_titled(series.name, log.units)] = curves
+    last = log.last_command()
+    commands = [n for n in models if n.partition("[")[0] == "command"]
+    for index, series in enumerate(last):
+        curves = [_curve(f"{entity}/{series.source}", series, "command", f"sent by {series.source}")]
+        if index < len(commands):
+            curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
+        plots.setdefault(_titled(series.name, log.units), []).extend(curves)
+    # The motors' commands come last: where another node sent a field of that name too, theirs is drawn.
+    motions = [_motion(f"{entity}/scene/robot", log.measured, [*log.commanded, *last], ghost=False)]
+    if simulated:
+        states = [s for s in simulated if s.name not in commands]
+        motions.append(_motion(f"{entity}/scene/simulation", states, [], ghost=True))
+    return Tab(title, entity, plots, motions, log.episode)
+
+
+def _identify_tab(found: Identification, recording: int, which: str) -> Tab:
+    chosen = found.disjoint() & (found.samples["recording"] == recording)
+    entity = f"identify/{recording}" if which else "identify"
+    samples = {name: values[chosen] for name, values in found.samples.items()}
+    t_s, segment = samples["t"], samples["segment"]
+    plots, columns = {}, {}
+    for quantity in found.fields:
+        curves = []
+        for model in ("measured", *(m for m in found.models(quantity) if m != "no delay")):
+            values = samples[f"{quantity}_{model}"].astype(np.float64)
+            columns.setdefault(model, {})[quantity] = values
+            series = Series(quantity, model, *_interrupted(t_s, values, segment))
+            curves.append(_curve(f"{entity}/{model}", series, model, model))
+        plots[_titled(quantity, found.units)] = curves
+    motions = [SceneMotion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
+    if "identified" in columns:
+        motions.append(SceneMotion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))
+    return Tab(f"Identify{which}", entity, plots, motions)
+
+
+def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
+    """Return when a node's state changes [s], and what it changes to: waiting, late, computing, idle.
+
+    A state that lasts for no time at all is left out.
+    """
+    due = steps.scheduled + steps.drift
+    times = np.stack([np.minimum(due, steps.start), steps.start, steps.woken, steps.end], axis=1).ravel()
+    names = ["waiting", "late", "computing", IDLE] * len(steps)
+    # After an overrun a step is due before the one in front of it has ended; it waits only from that end on.
+    times = np.maximum.accumulate(times)
+    lasting = np.append(np.diff(times) > 0, True)
+    return times[lasting] / TICKS_PER_S, [name for name, lasts in zip(names, lasting, strict=True) if lasts]
+
+
+def _curve(folder: str, series: Series, look: str, label: str) -> Curve:
+    return Curve(f"{folder}/{series.name}", label, look, series.t_s, series.values)
+
+
+def _motion(entity: str, states: list[Series], commands: list[Series], ghost: bool) -> SceneMotion:
+    """Return one motion on the times of the first state; everything else holds its last value until the next."""
+    t_s = states[0].t_s if states else np.empty(0)
+    columns = {}
+    for series in [*commands, *states]:
+        last = np.searchsorted(series.t_s, t_s, side="right") - 1
+        columns[series.name] = series.values[np.maximum(last, 0)]
+    return SceneMotion(entity, t_s, columns, ghost)
+
+
+def _titled(name: str, units: Mapping[str, str]) -> str:
+    unit = unit_of(name, units)
+    return f"{name} [{unit}]" if unit else name
+
+
+def _interrupted(t_s: np.ndarray, values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put a NaN right after the end of each segment: the next one starts from a state of its own."""
+    cuts = np.flatnonzero(np.diff(segment)) + 1
+    return np.insert(t_s, cuts, t_s[cuts - 1] + 1e-6), np.insert(values, cuts, np.nan)
