@@ -14,7 +14,6 @@ class Sim2RealError(ValueError):
     """An error with a message for the user: what happened, to which name, and what was available.
 
     Args:
-        message: What happened.
         hint: What to do next; printed as a separate paragraph.
 
     Attributes:

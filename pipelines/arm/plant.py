@@ -106,7 +106,6 @@ class ArmPlant:
         armature: Factor on the rotors' reflected inertia.
         coulomb: Factors on dry friction: pan, shoulder, elbow.
         bump: Stribeck: by what share friction at standstill exceeds that at speed.
-        carried_kg: What it holds at its tip.
         step_s: MuJoCo's time step [s].
     """
 

@@ -141,7 +141,6 @@ class PendulumWorld(JointWorld):
     Its state is the message of the sensor, ``th`` and ``thdot``.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
         substep_s: Largest step of the integrator [s].
         options: Options of ``JointWorld``.

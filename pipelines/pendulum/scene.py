@@ -20,7 +20,6 @@ def log_scene(rec: Any, t_s: np.ndarray, columns: Mapping[str, np.ndarray], enti
         rec: The ``rerun.RecordingStream``.
         t_s: Times ``(N,)`` [s].
         columns: Fields ``(N,)``; ``th`` [rad] is needed.
-        entity: Everything is drawn below this entity.
         ghost: Whether a model says so: a wire frame a little in front of the robot, so that both can be compared.
     """
     import rerun as rr  # the viewer is an extra

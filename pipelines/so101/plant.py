@@ -101,7 +101,6 @@ class SO101Plant:
         step_s: MuJoCo's time step [s].
         gain: Factor on the servos' gain.
         friction: Factor on dry friction.
-        carried_kg: What it holds between its jaws.
     """
 
     servo_ids = (1, 2, 3, 4, 5, 6)
@@ -155,7 +154,6 @@ class SO101Plant:
         """Set a servo's P gain.
 
         Args:
-            servo_id: The servo.
             p_gain: P gain [counts].
             d_gain: Not emulated; what the register's default does is part of the damping.
             profile_velocity_rad_s: Not emulated here; the emulator moves the goals.

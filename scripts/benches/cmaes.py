@@ -16,9 +16,6 @@ class CmaEs:
 
     Args:
         mean: Where it begins ``(P,)``, within [0, 1].
-        sigma: First step.
-        population: Candidates a generation.
-        rng: Random numbers.
     """
 
     def __init__(self, mean: np.ndarray, sigma: float, population: int, rng: np.random.Generator) -> None:
@@ -81,8 +78,6 @@ def minimise(
         losses: Candidates ``(N, P)`` in the unit box -> ``(N,)``.
         start: Where the first run begins ``(P,)``.
         deadline: On the clock of the process's processor time [s]; one generation is always made.
-        seed: Seed.
-        sigma: First step.
         population: Candidates a generation of the first run; 0: as the tutorial says.
 
     Returns:

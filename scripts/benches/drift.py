@@ -97,12 +97,7 @@ def _share(name: str, count: int, of: int, goal: str) -> list[dict[str, Any]]:
 
 
 def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what the test said about one robot, as it was and changed.
-
-    Args:
-        number: Its number.
-        options: Flags of the bench.
-    """
+    """Return what the test said about one robot, as it was and changed."""
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
     begin = time.process_time()
@@ -125,16 +120,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
 def one_change(
     robot: Any, change: str, pipeline: Any, identified: Any, folder: Path, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Return what the test said about a robot after one change.
-
-    Args:
-        robot: As it was.
-        change: What changes.
-        pipeline: The robot's.
-        identified: The robot as it was.
-        folder: Takes the logs.
-        options: Flags of the bench.
-    """
+    """Return what the test said about a robot after one change."""
     from sim2real.artifacts.recording import Recording
     from sim2real.stages.deploy.verdict import verdict_of
     from sim2real.stages.estimation.replay import tested
@@ -177,14 +163,8 @@ def restored(
     """Do what a verdict asks for, once, as a run does it; return the new policy's success, or that of the old one.
 
     Args:
-        now: The robot.
         change: What has changed, for the file's name.
-        pipeline: The robot's.
-        identified: The robot as it was.
-        drifted: What the test said.
         said: That for the report, with the old policy's success.
-        logs: Of the deployment.
-        options: Flags of the bench.
     """
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
@@ -224,15 +204,7 @@ def _upper(found: Any, name: str) -> float | None:
 
 
 def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Namespace, terms: str = "own") -> Any:
-    """Return what logs say about a robot; with wider bounds where an estimate lies at one, as a run does it.
-
-    Args:
-        pipeline: The robot's.
-        logs: The logs.
-        number: The robot's.
-        options: Flags of the bench.
-        terms: Optional terms of the model.
-    """
+    """Return what logs say about a robot; with wider bounds where an estimate lies at one, as a run does it."""
     import sim2real
     from sim2real.artifacts.recording import Recording
     from sim2real.commands.retry import MOST, repeated, with_wider_bounds

@@ -99,8 +99,6 @@ class ReachingArm:
         """Write the log of the pipeline's excitation, with goals that come to it slowly from where the arm rests.
 
         Args:
-            path: The log.
-            seconds: Its length.
             session: Its number: jitter differs from one to the next, and the excitation.
         """
         robot, config = self._robot, load_pipeline(self.pipeline).record
@@ -123,8 +121,6 @@ class ReachingArm:
         """Write the log of an episode of the policy written by hand; nobody judges it: it does not succeed or fail.
 
         Args:
-            path: The log.
-            seconds: Its length.
             session: Its number: it says which targets.
         """
         robot, rng = self._robot, np.random.default_rng([self.number, session])
@@ -140,12 +136,7 @@ class ReachingArm:
         return float("nan")
 
     def success(self, bundle: Any, options: Any) -> list[float]:
-        """Return of each deployment of a trained policy whether the robot was at its target in the end: 1 or 0.
-
-        Args:
-            bundle: The policy.
-            options: How many deployments.
-        """
+        """Return of each deployment of a trained policy whether the robot was at its target in the end: 1 or 0."""
         robot, seconds = self._robot, load_pipeline(self.pipeline).deploy.duration_s
         found = []
         for trial in range(100, 100 + options.trials):
@@ -208,13 +199,7 @@ class ReachingArm:
 
 
 def trained(robot: Any, bundle: Any, aim: np.ndarray) -> Policy:
-    """Return a policy that was trained, as the robot runs it.
-
-    Args:
-        robot: Its pipeline's.
-        bundle: The policy.
-        aim: What the episode is about.
-    """
+    """Return a policy that was trained, as the robot runs it."""
     agent, runner, rest = robot.make_agent(), bundle.runner(), np.asarray(robot.servos.at_rest, np.float32)
     past = np.zeros((robot.history, 3 * len(rest)), np.float32)
     step = StepState(params=AgentParams(aim=np.float32(aim), start=rest), state=AgentState(rest, past))

@@ -68,8 +68,6 @@ class Pendulum:
         """Write the log of an excitation.
 
         Args:
-            path: The log.
-            seconds: Its length.
             session: Its number: jitter and losses differ from one to the next.
         """
         hidden.write(path, hidden.play(self.robot, hidden.excited(seconds, self.number), seconds, session))
@@ -79,13 +77,7 @@ class Pendulum:
         hidden.write(path, hidden.play(self.robot, hidden.probed(), PROBE_S, session))
 
     def deploy(self, path: Path, seconds: float, session: int) -> float:
-        """Write the log of an episode of the policy written by hand; return the share of success.
-
-        Args:
-            path: The log.
-            seconds: Its length.
-            session: Its number.
-        """
+        """Write the log of an episode of the policy written by hand; return the share of success."""
         played = hidden.play(self.robot, swing_up(self.before), seconds, session)
         hidden.write(path, played)
         return float((np.cos(played.angle) > 0.95)[len(played.t) // 2 :].mean())
@@ -97,11 +89,7 @@ class Pendulum:
 
 
 def swing_up(robot: hidden.Hidden) -> hidden.Controller:
-    """Return a policy that pumps energy until the pendulum comes up, and holds it there; it predicts over the delay.
-
-    Args:
-        robot: What it is made for.
-    """
+    """Return a policy that pumps energy until the pendulum comes up, and holds it there; it predicts over the delay."""
     gravity, late, parts = robot.gravity, robot.sensing + robot.acting, 8
     last = 0.0
 

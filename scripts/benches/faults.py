@@ -160,12 +160,7 @@ def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float,
     """Start a deployment in a process of its own; SIGUSR1 makes its sensor's readings NaN from then on.
 
     Args:
-        port: The emulator's.
-        bundle: The policy.
-        runs: Folder of its run.
-        said: File for what it says.
         watchdog_s: The gate's longest silence [s].
-        *more: Further flags.
     """
     flags = ["--port", port, "--bundle", str(bundle), "--runs", str(runs), "--duration-s", "8", "--episodes", "1"]
     flags += ["--no-measure-delay", f"--gate.servo-watchdog-s={watchdog_s}", *more]
@@ -235,10 +230,7 @@ def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) 
     """Return what comes of a run whose robot moved before the fault: a busy machine may have to begin again.
 
     Args:
-        fault: What goes wrong.
         seed: Says when.
-        bundle: The policy.
-        root: Folder of the runs.
         watchdog_s: The gate's longest silence [s].
 
     Raises:
@@ -256,11 +248,7 @@ def outcomes(names: Sequence[str], seeds: Sequence[int], watchdog_s: float, jobs
     """Let each fault happen in some runs, several at a time, each on an emulated robot of its own.
 
     Args:
-        names: The faults.
-        seeds: One for each run of each fault.
         watchdog_s: The gate's longest silence [s].
-        jobs: Runs at a time.
-        root: Folder of the runs.
 
     Yields:
         What came of each, in order; of a run that failed, that nothing was safe, with what it said.
@@ -302,9 +290,6 @@ def wait_until_moving(truth: Path, said: Path, child: BaseProcess, speed_rad_s: 
     """Wait until the emulator's motor has been driven, and was measured to be as fast as this.
 
     Args:
-        truth: The emulator's account.
-        said: What the deployment says.
-        child: The deployment.
         speed_rad_s: The motor's speed [rad/s].
 
     Raises:

@@ -156,14 +156,7 @@ def graph_program(graph: CompiledGraph) -> Callable[[Any], Any]:
 
 
 def hand_program(rows: int, ticks: tuple[int, ...], world: Any, unroll: int = 1) -> Callable[[Any], Any]:
-    """Return the same robot without a graph: shift registers, one step of delay each way.
-
-    Args:
-        rows: How often the pattern of ticks is repeated.
-        ticks: World ticks after each policy step of the pattern.
-        world: For its physics.
-        unroll: Patterns in one pass of the loop.
-    """
+    """Return the same robot without a graph: shift registers, one step of delay each way."""
     p = params()
     shift = lambda ring, new: jnp.concatenate([new[None], ring[:-1]])  # noqa: E731
 

@@ -20,7 +20,6 @@ class HiddenPlant:
         play: Half of the encoder's backlash [rad].
         noise: Deviation of a measured angle [rad].
         speed_noise: Deviation of a measured speed [rad/s].
-        seed: Of the noise.
         step_s: Of the integration [s].
     """
 

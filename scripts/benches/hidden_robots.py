@@ -132,9 +132,6 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
     """Run a session from rest, hanging.
 
     Args:
-        robot: The robot.
-        controller: What decides.
-        seconds: How long.
         session: Its number: jitter and losses differ from one to the next.
     """
     rng = np.random.default_rng([robot.seed, session])
@@ -179,7 +176,6 @@ def one_after_another(count: int, took: dict[str, np.ndarray], rate_hz: float = 
     A node waits for its input, and for its own last step to end.
 
     Args:
-        count: Steps of each.
         took: Node -> how long its steps take ``(N,)`` [s].
         rate_hz: Steps per second [Hz].
     """
@@ -206,8 +202,6 @@ def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
     """Return a multisine.
 
     Args:
-        seconds: How long.
-        seed: Of its phases.
         volts: Its largest value [V].
     """
     rng = np.random.default_rng(seed)
@@ -223,7 +217,6 @@ def probed(volts: float = 1.5, steps: int = 8) -> Controller:
 
     Args:
         volts: Size of a step [V].
-        steps: How many.
     """
     made, left, still = 0, 0, 0
 
@@ -257,8 +250,6 @@ def write_log(
     """Write the log of a loop of sensor, agent and actuator.
 
     Args:
-        path: The log.
-        pipeline: Whose it is.
         times: Node -> starts, and ends, of its steps ``(N,)`` [s].
         readings: What the sensor sent in each step: a message, or a mapping of fields.
         commands: What the agent sent, and the actuator let through, likewise.

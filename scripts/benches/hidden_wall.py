@@ -18,10 +18,6 @@ def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:
     """Make a hidden robot the pipeline's emulated one, for this process; latencies are uniform, as wide as its own.
 
     The computer's own pauses are those of this machine: ``hiccups`` are not played.
-
-    Args:
-        robot: The robot.
-        pipeline: The pendulum's.
     """
     made = pipeline.load()
     jitter = math.sqrt(3.0) * robot.jitter
@@ -45,11 +41,7 @@ def record(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int)
     """Return a recording of the robot on the bus.
 
     Args:
-        pipeline: The pendulum's.
-        folder: Takes its log.
-        seconds: How long.
         volts: Its largest voltage [V].
-        seed: Of excitation and jitter.
     """
     import sim2real
 
@@ -59,15 +51,7 @@ def record(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int)
 
 
 def deploy(pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int) -> list[tuple[np.ndarray, ...]]:
-    """Return times [s], true angles [rad] and speeds [rad/s] of each deployment to the robot on the bus.
-
-    Args:
-        pipeline: The pendulum's.
-        bundle: The policy.
-        folder: Takes the logs.
-        seconds: Length of a deployment.
-        trials: How many.
-    """
+    """Return times [s], true angles [rad] and speeds [rad/s] of each deployment to the robot on the bus."""
     import sim2real
 
     folder.mkdir()

@@ -321,9 +321,7 @@ def speed(case: Case, fitted: Mapping[str, Episode], count: int | None, seconds:
     """Return how many candidates a second are simulated over 6,000 samples, 30,000 steps of the physics, each.
 
     Args:
-        case: The disk.
         fitted: Its recording; of a shorter one all is simulated.
-        count: Candidates at once.
         seconds: How long mujoco.sysid is measured [s].
     """
     from benches import sysid

@@ -39,8 +39,6 @@ def each(
     """Do ``work(*task, options)`` for each task, and yield its number and its result as they come.
 
     Args:
-        work: A function of a module.
-        tasks: Arguments.
         options: The bench's flags; ``jobs`` of them run at once, in this process where that is 1.
         lost: Takes a task whose process was killed, and returns what to yield for it; without it that is an error.
     """
@@ -81,7 +79,6 @@ def robots(
 
     Args:
         one: Takes a robot's number and the flags, and returns what became of it.
-        numbers: Of the robots.
         options: The bench's flags: ``jobs`` as for :func:`each`; ``within_s``, if there is one, seconds after which
             robots that are not done count as failed: what the others found is reported.
 

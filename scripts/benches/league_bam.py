@@ -50,7 +50,6 @@ def bounds(kind: str, constants: dict[str, Any]) -> dict[str, tuple[float, float
 
     Args:
         kind: ``M1`` or ``M6``.
-        constants: What is known of the recordings.
     """
     own = {**_COMMON, **(_M6 if kind == "M6" else {})}
     if constants.get("profiled"):
@@ -62,7 +61,6 @@ def friction(p: dict[str, Any], motor: Any, load: Any, speed: Any) -> Any:
     """Return the largest friction [N m]: M6 where its parameters are there, else M1.
 
     Args:
-        p: Parameters.
         motor: The motor's torque [N m].
         load: The torque from outside [N m].
         speed: [rad/s].
@@ -85,10 +83,7 @@ def simulate(
     """Return positions at every step, ``(T,)`` [rad].
 
     Args:
-        p: Parameters.
         constants: ``mass``, ``length``, and ``vin`` or ``voltage``.
-        duty_per_rad: The firmware's gain.
-        start: Position and speed.
         commands: Goals [rad] or voltages, late already, ``(T,)``.
         on: Whether torque is on ``(T,)``.
     """
@@ -121,7 +116,6 @@ class Bench:
 
     Args:
         kind: ``M1`` or ``M6``.
-        own: The recordings.
     """
 
     def __init__(self, kind: str, own: Sequence[Recording]) -> None:
@@ -168,9 +162,6 @@ def fit(
 
     Args:
         kind: ``M1`` or ``M6``.
-        fitted: Recordings of one joint.
-        budget_s: Seconds of processor time.
-        seed: Seed.
 
     Returns:
         What predicts recordings, and what was done in words.

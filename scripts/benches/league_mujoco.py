@@ -87,13 +87,6 @@ def fit_sysid(
 ) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
     """Fit with the toolbox's optimiser within a budget, from several places.
 
-    Args:
-        rig: The rig.
-        fitted: The recordings.
-        ours: With a delay and our terms.
-        budget_s: Seconds of processor time.
-        seed: Of the further places.
-
     Returns:
         What predicts recordings, and what was done in words.
     """
@@ -118,12 +111,6 @@ def fit_pace(
     rig: Rig, fitted: Sequence[Recording], budget_s: float, seed: int
 ) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
     """Fit PACE's parameters with CMA-ES within a budget.
-
-    Args:
-        rig: The rig.
-        fitted: The recordings.
-        budget_s: Seconds of processor time.
-        seed: Seed.
 
     Returns:
         What predicts recordings, and what was done in words.

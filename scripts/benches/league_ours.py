@@ -49,10 +49,7 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
     """Identify with our own configuration, which takes the time that it takes.
 
     Args:
-        name: The set.
         fold: What is held out; where there is a pipeline, what is fitted is read anew, as logs.
-        data: Folder of all recordings.
-        seed: Seed of the search.
 
     Returns:
         What predicts the fold's test recordings, and what was done in words.
@@ -139,8 +136,6 @@ def _written(own: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
     """Return recordings as files of another recorder, with names that say what is what.
 
     Args:
-        own: The recordings.
-        folder: Where to write.
         gains: Whether the firmware's gain differs between recordings, and is in them.
     """
     paths = []
@@ -176,10 +171,6 @@ def _at(
     """Return predicted positions at a recording's stamps, ``(N, joints)``.
 
     Args:
-        case: What was identified.
-        columns: What was simulated.
-        recording: Which recording.
-        own: The same.
         started: Whether the simulation begins in its first state, which then stands before what was predicted.
     """
     pick = (columns["recording"] == recording) & (columns["ahead"] > 0)

@@ -82,8 +82,6 @@ def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, e
         t: Stamps ``(N,)`` [s].
         command: Shape ``(N, k)``.
         position: Shape ``(N, joints)`` [rad].
-        begin: First sample.
-        end: Behind the last one.
         ahead: Whether samples behind ``begin`` may be used: those before it alone for what is predicted.
     """
     near = slice(max(begin - PAST, 0), begin + (PAST if ahead else 1))
@@ -104,7 +102,6 @@ def blocks(
         t: Stamps ``(N,)`` [s].
         command: Shape ``(N, k)``.
         position: Shape ``(N, joints)`` [rad].
-        edges: Where blocks begin and the last one ends.
         named: Number of a block -> the fold in the words of our stage.
     """
     pairs = list(pairwise(edges))

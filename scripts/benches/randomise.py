@@ -92,12 +92,7 @@ def rows(found: list[dict[str, Any]], options: argparse.Namespace, seconds: floa
 
 
 def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what became of one robot.
-
-    Args:
-        number: Its number.
-        options: Flags of the bench.
-    """
+    """Return what became of one robot."""
     import sim2real
     from sim2real.errors import Sim2RealError
     from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -160,14 +155,7 @@ def deployed(
 
 
 def played(robot: hidden.Hidden, bundle: Any, options: argparse.Namespace, session: int) -> tuple[np.ndarray, ...]:
-    """Return times [s], true angles [rad] and speeds [rad/s] of a session on the simulated clock.
-
-    Args:
-        robot: The robot.
-        bundle: The policy.
-        options: Length and largest voltage.
-        session: Its number.
-    """
+    """Return times [s], true angles [rad] and speeds [rad/s] of a session on the simulated clock."""
     found = hidden.play(robot, controller(bundle, options.volts), options.seconds, session)
     return found.t, found.angle, found.speed
 
@@ -199,7 +187,6 @@ def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
     """Return the policy as the robot runs it: cos, sin and speed, and the last four steps of these and of its voltage.
 
     Args:
-        bundle: The trained policy.
         volts: Its commands are cut off here [V].
     """
     from sim2real.policy.runner import NumpyBackend

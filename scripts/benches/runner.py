@@ -41,10 +41,7 @@ def policy(observations: int, actions: int, rate_hz: float, hidden: tuple[int, .
     """Return a policy of random weights.
 
     Args:
-        observations: Size of its observation.
-        actions: Size of its action.
         rate_hz: Its rate [Hz].
-        hidden: Widths of its hidden layers.
     """
     rng, sizes = np.random.default_rng(0), (observations, *hidden, actions)
     bounds = {"low": np.full(actions, -LIMIT_V), "high": np.full(actions, LIMIT_V), "log_std": np.zeros(actions)}

@@ -46,11 +46,7 @@ class Session:
 
 
 class Mechanism:
-    """A robot's own plant, driven on its joints' side, with what it did lately.
-
-    Args:
-        robot: The robot.
-    """
+    """A robot's own plant, driven on its joints' side, with what it did lately."""
 
     def __init__(self, robot: LoopRobot) -> None:
         assert robot.embedded is not None
@@ -100,11 +96,7 @@ def record(pipeline: Pipeline, limits: GateLimits, signal: np.ndarray, seed: int
     """Play commands and write the log.
 
     Args:
-        pipeline: The robot.
-        limits: Of the gate.
         signal: Shape ``(N, actions)``: one command a step, as ``Robot.around`` returns them.
-        seed: Of latencies and losses.
-        log: The log to write.
 
     Raises:
         SafetyStop: What the gate, or the plausibility of what was measured, stopped.

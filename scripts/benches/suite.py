@@ -67,7 +67,6 @@ def run_tests(folder: Path, paths: list[str], workers: int) -> tuple[yardstick.M
     """Return time and outcome of the tests below some paths.
 
     Args:
-        folder: For the compilation cache and the report of pytest.
         paths: Folders and files of tests; none: all.
         workers: Processes that run tests.
     """

@@ -95,10 +95,7 @@ def extract(commit: str, paths: Sequence[str], folder: Path, root: Path) -> None
     """Write the files of a commit below some paths into a folder.
 
     Args:
-        commit: Hash of the commit.
         paths: Files and folders, relative to the root.
-        folder: Where they are written.
-        root: The repository.
 
     Raises:
         Sim2RealError: When there is no git, no repository at the root, or no such commit in its history.

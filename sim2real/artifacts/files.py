@@ -28,7 +28,6 @@ def malformed(path: Path, again: str) -> Iterator[None]:
     """Turn what reading a malformed file raises into an error that names the file.
 
     Args:
-        path: The file.
         again: How to make it anew, for the hint.
     """
     try:
@@ -59,7 +58,6 @@ def read_json(path: Path, kind: type[T]) -> T:
     """Return the document in a JSON file, checked against a dataclass; entries that it does not know are ignored.
 
     Args:
-        path: The file.
         kind: A dataclass; lists of numbers become arrays where it has arrays; null becomes NaN where a number stands.
 
     Raises:
@@ -76,7 +74,6 @@ def write_json(path: Path, document: object) -> None:
     """Write a dataclass, or what it consists of, as JSON; a reader sees the old file or the new one, never a part.
 
     Args:
-        path: The file.
         document: What to write; infinite numbers and NaN, which JSON lacks, become null.
 
     Raises:

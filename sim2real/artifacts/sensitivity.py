@@ -71,7 +71,6 @@ class Sensitivity:
 
         Args:
             multiples: Shape ``(M,)``.
-            success: Mean success on the model as identified.
             episodes: Episodes of which each success is the mean.
             parameters: The parameters, in any order.
         """

@@ -199,10 +199,6 @@ class Timing(Shown):
     def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:
         """Write it into a folder.
 
-        Args:
-            folder: Where to.
-            name: What the files are called.
-
         Returns:
             Output -> name of the file in the folder.
         """

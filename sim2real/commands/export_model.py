@@ -63,7 +63,6 @@ def export(
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
         identification: What was identified, or its folder.
-        out: The file to write.
         to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
 
     Returns:
@@ -113,11 +112,6 @@ def write(
 
     Args:
         to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
-        out: The file.
-        found: What was identified.
-        robot: The robot.
-        table: Its parameters.
-        about: Names and texts to keep with it.
     """
     sides = {p.name: p.side for p in table}
     off = {p.name: p.nominal for p in table}  # of optional terms that nobody asked for

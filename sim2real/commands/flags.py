@@ -124,10 +124,7 @@ def parse(
 
     Args:
         default: A dataclass; its values are the defaults.
-        arguments: What the user typed behind the command.
         prog: The command, for the help.
-        description: First lines of the help.
-        epilog: Last lines of the help.
         kind: Type to parse into where it is more than the default's class (a generic class with its argument).
 
     Raises:

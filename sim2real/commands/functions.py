@@ -84,11 +84,7 @@ def run(
 
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
-        runs: Folder of all runs.
         record: How to record; default: that of the pipeline. A dict has what is different from it.
-        identify: How to identify.
-        train: How to train.
-        deploy: How to deploy.
         resume: A run folder to go on with, from the first stage that is not finished there.
         iterations: How often to go around at most; see ``sim2real run --help``.
         until: ``QUANTITY=VALUE`` that ends going around.
@@ -121,7 +117,6 @@ def report(run: AnyPath | Run, runs: AnyPath = "runs") -> Path:
 
     Args:
         run: A run, its folder or its name, or a pipeline's name, whose newest run is taken.
-        runs: Folder of all runs.
 
     Returns:
         The page.

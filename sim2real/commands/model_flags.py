@@ -63,22 +63,12 @@ def by_model(arguments: Sequence[str]) -> bool:
 
 
 def parse_identify(arguments: Sequence[str], epilog: str) -> IdentifyModelFlags:
-    """Return the flags of ``identify`` for a robot that is described by its model.
-
-    Args:
-        arguments: What the user typed behind the command.
-        epilog: Last lines of the help.
-    """
+    """Return the flags of ``identify`` for a robot that is described by its model."""
     return _parse(IdentifyModelFlags(), IdentifyConfig, arguments, "identify", epilog)
 
 
 def parse_check(arguments: Sequence[str], epilog: str) -> CheckModelFlags:
-    """Return the flags of ``check`` for a robot that is described by its model.
-
-    Args:
-        arguments: What the user typed behind the command.
-        epilog: Last lines of the help.
-    """
+    """Return the flags of ``check`` for a robot that is described by its model."""
     return _parse(CheckModelFlags(), CheckLogFlags, arguments, "check", epilog)
 
 

@@ -50,9 +50,6 @@ ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
 def run(config: NewConfig) -> None:
     """Write a pipeline's folder.
 
-    Args:
-        config: What it is for.
-
     Raises:
         UsageError: When the name is none, the folder exists, or the model cannot be driven.
     """

@@ -31,7 +31,6 @@ def repeated(run: Callable[[C], R], config: C, again: Callable[[C, R], C | None]
     """Return each way in which something was done, with what came out; the last is the one to use.
 
     Args:
-        run: Does it.
         config: How, the first time.
         again: Returns from how it was done and what came out how to do it once more; None where it need not be.
         most: How often it is done once more at most.
@@ -43,12 +42,7 @@ def repeated(run: Callable[[C], R], config: C, again: Callable[[C, R], C | None]
 
 
 def better(config: Any, done: StageFolder) -> tuple[Any, str]:
-    """Return how to do a stage once more, and why; None where it need not be.
-
-    Args:
-        config: How it was done.
-        done: What it left.
-    """
+    """Return how to do a stage once more, and why; None where it need not be."""
     if done.stage == "identify":
         found = Identification.load(done.output("parameters"))
         return with_wider_bounds(config, found), f"an estimate lies at a bound: {found.verdict.next}"
@@ -59,12 +53,7 @@ def better(config: Any, done: StageFolder) -> tuple[Any, str]:
 
 
 def with_wider_bounds(config: IdentifyConfig, found: Identification) -> IdentifyConfig | None:
-    """Return how to identify once more: with the bounds that the verdict asks for; None where it asks for none.
-
-    Args:
-        config: How it was identified.
-        found: What was found.
-    """
+    """Return how to identify once more: with the bounds that the verdict asks for; None where it asks for none."""
     if found.verdict.status != "hit a bound":
         return None
     words, wider = shlex.split(found.verdict.next), config
@@ -82,9 +71,6 @@ def lacking(found: Identification) -> str:
 
     What a policy does need not tell a delay from inertia: the sum of the delays of an arm, 18 ms, came out as 0, with
     twice its armature, and that was accepted, as a delay may be 0.
-
-    Args:
-        found: What was identified from them.
     """
     if found.verdict.status != "accepted":
         return found.verdict.status
@@ -96,7 +82,6 @@ def for_longer(config: TrainConfig, history: History) -> TrainConfig | None:
     """Return how to train once more: with more policy steps; None where the policy succeeds in simulation.
 
     Args:
-        config: How it was trained.
         history: How that went.
     """
     enough = GOOD if config.ppo.target is None else min(GOOD, config.ppo.target)

@@ -31,9 +31,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
     """Run the four stages in one run folder, from the first one on that is not current there, and around again.
 
     Args:
-        pipeline: The robot.
         flags: Of all stages, and how often to go around.
-        call: Runs a stage.
 
     Raises:
         UsageError: When the recording is to be dry, or a goal that is not of this task.
@@ -66,9 +64,6 @@ def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path | 
     """Run what is not current, or what an interrupted iteration left; then again and again what each verdict asks for.
 
     Args:
-        pipeline: The robot.
-        flags: Of the run.
-        call: Runs a stage.
         run_dir: Its folder; None: the first stage makes it.
         plan: What an interrupted iteration had to do; None: no iteration was interrupted.
 
@@ -121,11 +116,7 @@ def _iterate(
     """Run the stages of an iteration.
 
     Args:
-        flags: Of the run.
         call: Runs a stage, or returns what an interrupted iteration left of it.
-        run_dir: The run's folder.
-        plan: The iteration's.
-        number: The iteration's.
 
     Returns:
         What each stage that ran left, and why the deployment was refused before the policy moved anything.
@@ -175,7 +166,6 @@ class Resumed:
         """Find the attempts that finished since an iteration started.
 
         Args:
-            call: Runs a stage.
             run_dir: The run's folder; None: there is nothing yet.
             before: Stage folders that were finished when it started.
         """
@@ -201,10 +191,6 @@ def _ran(flags: RunFlags, call: Call, run_dir: Path | None, stage: str, config: 
     A policy may hold still, or balance what falls: there the smallest error grows a hundred times within a segment.
 
     Args:
-        flags: Of the run.
-        call: Runs a stage.
-        run_dir: Its folder.
-        stage: The stage's name.
         config: Its configuration: that of an identification names the deployment's logs, or there is a recording.
 
     Returns:
@@ -232,13 +218,6 @@ def _done(flags: RunFlags, call: Call, stage: str, config: Any, run_dir: Path | 
     """Run a stage; in a run that goes around by itself once more where its result says how: wider bounds, or longer.
 
     A worn robot leaves the bounds of a data sheet; one with more friction takes more steps to learn for.
-
-    Args:
-        flags: Of the run.
-        call: Runs a stage.
-        stage: The stage's name.
-        config: Its configuration.
-        run_dir: The run's folder.
     """
     from sim2real.commands.retry import MOST, better, repeated
 
@@ -262,15 +241,7 @@ def _deployed(run_dir: Path) -> StageFolder:
 def _judged(
     row: Iteration, pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: StageFolder
 ) -> tuple[Iteration, Plan]:
-    """Return an iteration's row with what its deployment found, and what that asks for.
-
-    Args:
-        row: Of the iteration.
-        pipeline: The robot.
-        flags: Of the run.
-        run_dir: Its folder.
-        deployed: The deployment's folder.
-    """
+    """Return an iteration's row with what its deployment found, and what that asks for."""
     result = _result(deployed)
     if success := next((g for g in result.gap if g.quantity == "success"), None):
         row = replace(row, real=success.real, simulation=success.simulation)
@@ -304,15 +275,7 @@ def _next_seed(flags: RunFlags, run_dir: Path) -> int:
 
 
 def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, deployed: StageFolder, result: Deployment) -> Plan:
-    """Return what a deployment asks for.
-
-    Args:
-        pipeline: The robot.
-        flags: Of the run.
-        run_dir: Its folder.
-        deployed: The deployment's folder.
-        result: What it found.
-    """
+    """Return what a deployment asks for."""
     from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, terms_to_identify
 
     if flags.goal and _reached(result, *flags.goal):

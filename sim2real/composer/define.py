@@ -10,11 +10,7 @@ from typing import Any
 
 
 class cached_property(property):  # noqa: N801 - a decorator, called like dm_control's
-    """A property that is evaluated once per object.
-
-    Args:
-        func: The getter.
-    """
+    """A property that is evaluated once per object."""
 
     def __init__(self, func: Callable[..., Any]) -> None:
         super().__init__(fget=func)

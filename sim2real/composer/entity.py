@@ -121,7 +121,6 @@ class Entity(ABC):
         """Attach another entity without degrees of freedom; return its frame, to which joints may be added.
 
         Args:
-            entity: The other entity.
             attach_site: A site of this entity's model; default: its world.
         """
         frame = (self.attachment_site if attach_site is None else attach_site).attach(entity.mjcf_model)
@@ -214,7 +213,6 @@ class Entity(ABC):
         """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent.
 
         Args:
-            physics: The physics.
             position: ``(3,)`` [m]; None: it stays.
             quaternion: ``(4,)``, scalar first; None: it stays.
         """
@@ -243,7 +241,6 @@ class Entity(ABC):
         """Move and turn from the present pose.
 
         Args:
-            physics: The physics.
             position: Added, ``(3,)`` [m].
             quaternion: The turn, ``(4,)``; applied after the present one.
             rotate_velocity: Turn the linear velocity too; the angular one is in the local frame and turns by itself.
@@ -279,7 +276,6 @@ class Entity(ABC):
         """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint.
 
         Args:
-            physics: The physics.
             velocity: Linear, ``(3,)`` [m/s]; None: it stays.
             angular_velocity: ``(3,)`` [rad/s, local frame]; None: it stays.
         """

@@ -52,7 +52,6 @@ class Environment(dm_env.Environment):
     """Runs a task, with the interface of ``dm_env``.
 
     Args:
-        task: The task.
         time_limit: Longest episode [s]; it ends after the first control step that reaches it.
         random_state: A ``numpy.random.RandomState`` or a seed.
         n_sub_steps: Physics steps in a control step; deprecated, set the task's time steps.
@@ -61,7 +60,6 @@ class Environment(dm_env.Environment):
         max_reset_attempts: How often a reset is tried when it raises ``EpisodeInitializationError``.
         recompile_mjcf_every_episode: Run ``initialize_episode_mjcf`` and compile at every reset, not only at the first.
         fixed_initial_state: Draw the same random numbers at every reset.
-        delayed_observation_padding: What fills buffers at first.
         legacy_step: After a step, also compute positions and velocities of the new state.
         arena: The root entity of a task that has none of its own.
 

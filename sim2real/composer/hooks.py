@@ -30,11 +30,7 @@ WITH_ACTION = ("before_step", "before_substep")
 
 
 class Hooks:
-    """The hooks of a task and its entities; those that do nothing are left out.
-
-    Args:
-        task: The task.
-    """
+    """The hooks of a task and its entities; those that do nothing are left out."""
 
     def __init__(self, task: Task) -> None:
         self._task = task

@@ -113,9 +113,7 @@ class Observables:
         """Add an observable, or a function of ``physics`` that returns the value.
 
         Args:
-            name: The observable's name.
             observable: The observable, or the function.
-            enabled: Whether it is part of the observation.
         """
         if not isinstance(observable, Observable):
             observable = Generic(observable)

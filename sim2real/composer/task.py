@@ -160,9 +160,7 @@ class Task(ABC):
         """Act before a control step; default: the action, shape ``(nu,)``, becomes the control.
 
         Args:
-            physics: The physics.
             action: What the agent does, as ``action_spec`` says.
-            random_state: The random numbers of this episode.
         """
         del random_state
         physics.set_control(action)
@@ -171,9 +169,7 @@ class Task(ABC):
         """Act before a step of the physics.
 
         Args:
-            physics: The physics.
             action: What the agent does, as ``action_spec`` says.
-            random_state: The random numbers of this episode.
         """
 
     def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027

@@ -138,8 +138,6 @@ class AnyPhysics(Protocol):
 
         Args:
             elements: An element, or several of one kind.
-            name: The attribute.
-            value: What it is set to.
         """
         ...
 
@@ -148,9 +146,6 @@ class AnyPhysics(Protocol):
 
         Args:
             elements: An element, or several of one kind.
-            name: The attribute.
-            value: What the part is set to.
-            index: Which part.
         """
         ...
 

@@ -63,14 +63,10 @@ class ComposedWorld(BaseWorld):
     send another message: see ``output``.
 
     Args:
-        name: Unique in the graph.
-        task: The task.
         command: Name of the input that carries the action.
         field: Field of that input's message: shape ``(nu,)``.
         parameters: Name -> (element or elements, attribute), such as ``{"friction": (joint, "frictionloss")}``.
         rate: Ticks per second [Hz]; default, and only choice: once a control step.
-        color: Colour in drawings.
-        order: Place in drawings.
         **options: Passed on to ``MjxEnvironment``.
 
     Raises:
@@ -153,12 +149,7 @@ class ComposedWorld(BaseWorld):
         return self.output(self.init_state(rng, graph_state) if state is None else state)
 
     def entered(self, state: State, action: jax.Array) -> State:
-        """Return the state with which a control step under an action begins; default: as it is.
-
-        Args:
-            state: The state after the step before.
-            action: The action.
-        """
+        """Return the state with which a control step under an action begins; default: as it is."""
         del action
         return state
 
@@ -214,7 +205,6 @@ class ComposedWorld(BaseWorld):
         """Return the fields of the model that differ from the compiled one: parameters, and what hooks set at a start.
 
         Args:
-            params: The node's parameters.
             state: What ``init_state`` returned.
         """
         physics = self._view()
@@ -226,7 +216,6 @@ class ComposedWorld(BaseWorld):
         """Return where the physics starts.
 
         Args:
-            params: The node's parameters.
             state: What ``init_state`` returned.
         """
         del params

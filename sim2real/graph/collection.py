@@ -37,7 +37,6 @@ def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, object] | N
     """Check that every sender is in the graph: the object itself, not only a node of the same name.
 
     Args:
-        nodes: The nodes by name.
         among: Check only senders with these names (others are left out of the graph on purpose); None: all senders.
 
     Raises:

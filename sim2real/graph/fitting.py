@@ -19,7 +19,6 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
     Args:
         samples: Shape ``(n,)``: recorded delays [s].
         components: Largest number of components; the Bayesian information criterion chooses how many are used.
-        seed: Seed of the fit's initial values.
 
     Returns:
         A constant, or a ``distrax.MixtureSameFamily``, clipped at 0 when drawn from.

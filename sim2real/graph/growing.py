@@ -19,8 +19,6 @@ class Growing:
     """Draws one episode, twice as long each time; what was drawn before stays as it is.
 
     Args:
-        nodes: The nodes by name.
-        rng: Source of the delays.
         check: Called with each timeline before it is used.
 
     Attributes:

@@ -24,7 +24,6 @@ def between(leaf: Array, low: jax.Array, weight: jax.Array, held: jax.Array, rou
         low: Shape ``(w,)``: index of the message before each value.
         weight: Shape ``(w,)``: position between that message and the next one, in [0, 1].
         held: Shape ``(w,)``: index of the message that holds.
-        rounded: Whether integers are interpolated and rounded.
     """
     leaf = jnp.asarray(leaf)
     if not _on_a_line(leaf, rounded):
@@ -44,7 +43,6 @@ def mean_of(leaf: Array, share: jax.Array, held: jax.Array, rounded: bool) -> ja
         leaf: The messages, shape ``(W, ...)``.
         share: Shape ``(W,)``: part of the time in which each message, or a newer one, holds.
         held: The messages that hold.
-        rounded: Whether integers are averaged and rounded.
     """
     leaf = jnp.asarray(leaf)
     if not _on_a_line(leaf, rounded):

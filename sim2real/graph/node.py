@@ -40,8 +40,6 @@ class Connection:
     """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``.
 
     Args:
-        input_node: The reader.
-        output_node: The sender.
         blocking: As in ``BaseNode.connect``, and so are the others.
         delay: Expected communication delay [s]; None: the 0.99 quantile of ``delay_dist``.
         delay_dist: Communication delay in simulation: seconds, or a distribution over seconds; None: 0.
@@ -123,7 +121,6 @@ class BaseNode:
     """A computation that runs at a fixed rate: override ``step`` and the ``init_*`` methods that it needs.
 
     Args:
-        name: Unique in the graph.
         rate: Nominal frequency [Hz].
         delay: Expected computation delay [s]; the schedules of readers start later by it. Default: the 0.99 quantile
             of ``delay_dist``.
@@ -132,8 +129,6 @@ class BaseNode:
         advance: Start as soon as the blocking inputs have arrived, even before the scheduled time. Needs a blocking
             input; with a non-blocking input as well the schedule holds.
         scheduling: What an overrun does to later steps.
-        color: Colour in drawings.
-        order: Place in drawings.
 
     Raises:
         UsageError: When a rate or a delay makes no sense.
@@ -186,7 +181,6 @@ class BaseNode:
         """Feed an input of this node with the outputs of another.
 
         Args:
-            output_node: The sender.
             blocking: Whether a step waits for the messages that are due by the nominal schedule.
             delay: Expected communication delay [s], from which phases are computed; default: the 0.99 quantile of
                 ``delay_dist``.
@@ -288,10 +282,7 @@ class BaseWorld(BaseNode):
     """A simulated world: its steps lie on a fixed grid and each output leaves at the end of its tick.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
-        color: Colour in drawings.
-        order: Place in drawings.
     """
 
     def __init__(self, name: str, rate: float, color: str | None = None, order: int | None = None) -> None:

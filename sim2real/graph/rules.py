@@ -19,7 +19,6 @@ def slot(node: BaseNode, k: np.ndarray | int, phase: int | None = None) -> np.nd
     """Return when step ``k`` is scheduled [ticks] (rule 2): ``floor(k * 1e6 / rate + 0.5) + phase``.
 
     Args:
-        node: The node.
         k: Number of the step, from 0; or an array of them.
         phase: The node's phase [ticks]; None: computed.
     """
@@ -62,7 +61,6 @@ def next_drift(scheduling: Scheduling, scheduled, drift, previous_end):  # noqa:
     """Return how far the schedule has moved once a step's start is known [ticks] (rule 3).
 
     Args:
-        scheduling: What an overrun does to the later steps.
         scheduled: The step's slot [ticks].
         drift: How far the schedule had moved before [ticks].
         previous_end: End of the node's previous step [ticks].
@@ -81,7 +79,6 @@ def eligible(connection: Connection, received: np.ndarray, first_seq: int = 0) -
     """Return the earliest reader start [ticks] that consumes each message of a non-blocking input (rule 6).
 
     Args:
-        connection: The connection.
         received: Shape ``(..., M)``: arrivals [ticks].
         first_seq: Sequence number of the first message along the last axis.
     """
@@ -117,10 +114,6 @@ def at_delay(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex,
     """Return an edge whose delay is trainable as it is at another delay; what is lost stays lost.
 
     Args:
-        connection: Whose messages they are.
-        edge: The edge at any delay.
-        reader: When the reader's steps run.
-        sender: When the sender's steps end.
         delay: The delay [ticks].
     """
     sent = sender.end[:, : edge.received.shape[1]]
@@ -132,10 +125,7 @@ def consumer(connection: Connection, received: np.ndarray, reader: Vertex, sende
     """Return which step consumes each message (rule 6).
 
     Args:
-        connection: The connection.
         received: Shape ``(E, M)``: arrivals [ticks].
-        reader: The reader's steps.
-        sender: The sender's steps.
 
     Returns:
         Shape ``(E, M)``, int64: the reader's step; -1 where no step consumes the message.

@@ -72,7 +72,6 @@ def derive(
     """Apply the rules to given delays.
 
     Args:
-        nodes: The nodes by name.
         delays: Node -> computation delays, shape ``(E, N)`` [ticks].
         transfers: (node, input) -> communication delays, shape ``(E, M)`` [ticks].
         duration: Steps that start before this belong to the timeline [ticks].
@@ -129,10 +128,7 @@ def computation_delays(
     """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration.
 
     Args:
-        node: The node.
         duration_s: The duration [s].
-        episodes: Number of episodes E.
-        rng: Source of the delays.
         known: Delays that were drawn for a shorter duration, and are kept.
     """
     last = to_ticks(duration_s) - 1 - phase_ticks(node)
@@ -152,9 +148,7 @@ def transport_delays(
     """Draw a connection's communication delays [ticks].
 
     Args:
-        connection: The connection.
         shape: Number of episodes, and of messages.
-        rng: Source of the delays.
         known: Delays that were drawn for fewer messages, and are kept.
     """
     return _more(connection.delay_dist, rng, shape, repr(connection), known)

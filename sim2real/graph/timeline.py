@@ -66,7 +66,6 @@ class Timeline:
         """Return the timeline of one recorded episode (E = 1).
 
         Args:
-            episode: The record.
             nodes: The nodes by name; those that are not in the record, and connections to them, are left out.
 
         Messages whose delay is trainable arrive at its least value, as in a timeline that is drawn: the record has them

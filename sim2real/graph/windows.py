@@ -36,9 +36,6 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
 
     Args:
         connection: The connection; without a trainable delay no step is affected.
-        edge: Its messages.
-        reader: The reader's steps.
-        sender: The sender's steps.
 
     Returns:
         Shape ``(E, N)``, bool.

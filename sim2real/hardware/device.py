@@ -78,7 +78,6 @@ class CommandKind:
 
     Args:
         name: What they are called in messages, in the plural.
-        unit: Their unit.
         stale: What is safe to send when no new command comes: zeros, or the last command once more.
     """
 
@@ -105,9 +104,6 @@ class WithoutHost:
     """What motors do by themselves when their host dies; `str` says it in a sentence.
 
     Args:
-        model: The motors' model.
-        motors: Their names.
-        does: What they do.
         after_s: Time after the last instruction at which they notice [s]; inf: never.
         source: How that is known.
         why: A few words on why they never notice, or "".

@@ -101,7 +101,6 @@ class PlantClock:
         step_ns: Spacing of the grid [ns].
         start_ns: Time of the grid's first point, CLOCK_MONOTONIC [ns].
         history_ns: How far back from the newest grid point `sample` must reach [ns].
-        truth: Log of effects and states.
     """
 
     def __init__(self, plant: Plant, step_ns: int, start_ns: int, history_ns: int, truth: TruthLog) -> None:
@@ -131,7 +130,6 @@ class PlantClock:
         """Tell the plant a servo's controller settings, if it is a `ConfigurablePlant`.
 
         Args:
-            servo_id: The servo.
             p_gain: Position P Gain [counts].
             d_gain: Position D Gain [counts].
             profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
@@ -146,7 +144,6 @@ class PlantClock:
         Args:
             t_ns: When it takes effect [ns].
             t_host_ns: When the emulator received it, for the truth log [ns]; 0: it does not come from the host.
-            servo_id: The servo.
             mode: As in `Plant.command`.
             goal: As in `Plant.command`.
         """
@@ -165,7 +162,6 @@ class PlantClock:
         Interpolated linearly between grid points; after the newest one the position is extrapolated by the velocity.
 
         Args:
-            servo_id: The servo.
             t_ns: The time [ns].
         """
         place = max(0.0, (t_ns - self._start_ns) / self._step_ns)

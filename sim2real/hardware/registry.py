@@ -41,8 +41,6 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
 
     Args:
         what: What it is, in a word.
-        name: Its name.
-        group: The entry point group.
         contract: What says how it is called, for the hint: a name in sim2real.
 
     Raises:

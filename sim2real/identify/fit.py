@@ -67,7 +67,6 @@ def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = N
     """Return values by name as Python numbers, lists where each recording has its own.
 
     Args:
-        table: The parameters.
         z: Shape ``(P,)``: the unbounded vector.
         kept: Shape ``(P,)``, bool: as in ``table.decode``.
     """
@@ -88,15 +87,10 @@ def fit(
     """Identify a model.
 
     Args:
-        model: The model.
-        recordings: The logs.
         spans: Segments to search and refine on, and others to predict.
         length_s: Their length [s].
-        config: How.
         table: The parameters; default: the model's.
         long_spans: Segments of ``config.long_s`` for the last refinement.
-        told: Progress.
-        begins: Called with the residuals before anything is compiled.
     """
     problem = windows = Problem(model, recordings, spans, length_s, config, table)
     if begins:
@@ -145,9 +139,7 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
     """Search as the problem's configuration says.
 
     Args:
-        problem: The residuals.
         start: Shape ``(P,)``: middle of the first generation.
-        told: Progress.
     """
     total = problem.config.generations * (1 + problem.config.restarts)
     # At a bound the map to values is flat: a search that begins there does not get away.

@@ -76,7 +76,6 @@ def inertia_parameters(body: str, mass: float, com: np.ndarray, inertia: np.ndar
     """Return the ten parameters of a body, named ``BODY_alpha`` and so on, around its nominal inertia.
 
     Args:
-        body: Its name.
         mass: [kg].
         com: Centre of mass, ``(3,)`` [m].
         inertia: About the centre of mass, ``(3, 3)`` [kg m^2].
@@ -96,7 +95,6 @@ def set_inertia(model: Any, body: int, theta: Any) -> Any:
 
     Args:
         model: The ``mjx.Model``.
-        body: Number of the body.
         theta: Shape ``(10,)``: see ``THETA``.
     """
     mass, com, inertia = from_log_cholesky(theta)

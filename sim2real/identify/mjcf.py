@@ -18,7 +18,6 @@ def identified_mjcf(spec: Any, table: ParameterTable, values: Mapping[str, Any],
     Args:
         spec: ``mujoco.MjSpec`` of the nominal model; it is not changed.
         table: Parameters; those whose ``leaf`` starts with ``prefix`` are fields of the model: ``dof_damping[0]``.
-        values: Their values by name.
         prefix: Where in the nodes' parameters the ``mjx.Model`` stands.
 
     Raises:

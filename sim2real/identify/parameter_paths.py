@@ -33,7 +33,6 @@ def set_leaf(tree: Any, path: str, value: Any) -> Any:
     Args:
         tree: Mappings and dataclasses, ``mjx.Model`` among them.
         path: Such as ``world.model.dof_damping[0]``.
-        value: The new value.
 
     Raises:
         UsageError: When the path leads nowhere.

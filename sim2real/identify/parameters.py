@@ -134,7 +134,6 @@ class ParameterTable:
 
     Args:
         parameters: The parameters; names must differ.
-        recordings: How many recordings there are.
     """
 
     def __init__(self, parameters: Iterable[Parameter], recordings: int = 1) -> None:
@@ -245,7 +244,6 @@ class ParameterTable:
         """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable.
 
         Args:
-            z: The vector.
             kept: Shape ``(P,)``, bool: others are held at what a model without them has; default: all are kept.
         """
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))

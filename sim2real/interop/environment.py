@@ -36,10 +36,6 @@ class RobotEnvironment:
     parameters. An episode is truncated where its timeline ends. Actions are clipped to their bounds, as the gate does
     on the robot.
 
-    Args:
-        env: The graph as an environment.
-        contract: What a policy sees and does.
-
     Attributes:
         observation: The entries of an observation, in order.
         action: The entries of an action, in order.
@@ -75,7 +71,6 @@ class RobotEnvironment:
         """Return the copy after the policy's next step.
 
         Args:
-            state: The copy.
             action: Shape ``(A,)`` [the action's units].
         """
         key, own = jax.random.split(state.key)

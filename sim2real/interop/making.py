@@ -38,7 +38,6 @@ def robot_environment(
         values: Parameters with other values than the model's. The nominal model has delays where both are among them:
             ``sensor_delay`` and ``actuator_delay`` [s].
         config: World, number and length of timelines, randomisation and seed; default: the pipeline's.
-        runs: Folder of all runs.
 
     Raises:
         UsageError: When there is no such pipeline, run or parameter.
@@ -68,7 +67,6 @@ def vector_env(
 
     Args:
         source: As in ``robot_environment``, or what that returned.
-        num_envs: Number of copies.
         autoreset_mode: What happens to a copy that is done: ``NextStep``, ``SameStep`` or ``Disabled``.
         **options: Those of ``robot_environment``.
     """
@@ -84,7 +82,6 @@ def baselines_env(
 
     Args:
         source: As in ``robot_environment``, or what that returned.
-        num_envs: Number of copies.
         seed: Seed of the episodes; default: a random one.
         **options: Those of ``robot_environment``.
     """

@@ -23,7 +23,6 @@ class RobotBraxEnv(PureBraxEnv):
     brax makes over an episode are its values.
 
     Args:
-        robot: One copy.
         fresh_starts: Whether each episode of a copy starts from a state of its own, at the price of a reset a step.
 
     Attributes:

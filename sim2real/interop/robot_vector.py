@@ -18,8 +18,6 @@ class RobotVectorEnv(CopiesVectorEnv):
     fulfilled.
 
     Args:
-        robot: One copy.
-        num_envs: Number of copies.
         autoreset_mode: What happens to a copy that is done.
 
     Attributes:

@@ -13,10 +13,6 @@ def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
 
     This shows the effect of a hiccup that step times alone do not show: punctual steps that use old messages.
 
-    Args:
-        episode: A log.
-        node: The reader.
-
     Returns:
         Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if steps are missing in the log, as it is then
         not known which step used which message.

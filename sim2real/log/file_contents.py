@@ -102,11 +102,6 @@ class Contents:
     def columns(self, channel: int, layout: Layout, span: Range) -> np.ndarray:
         """Decode the messages of a channel, whose type has a fixed size.
 
-        Args:
-            channel: The channel's number.
-            layout: Layout of its messages.
-            span: Range of log times to keep.
-
         Returns:
             A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
             [ns], and ``data`` with the fields of the message.
@@ -138,7 +133,6 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
     """Read a log file once.
 
     Args:
-        path: The file.
         span: Range whose chunks are opened for their messages; None: none is opened.
 
     Raises:

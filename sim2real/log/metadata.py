@@ -26,7 +26,6 @@ def encode(name: str, document: Mapping[str, Any]) -> dict[str, str]:
 
     Args:
         name: The record's name, for errors.
-        document: The document.
 
     Raises:
         Sim2RealError: When a value cannot be written as JSON.

@@ -34,7 +34,6 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     those that were read) and ``skipped`` (descriptions of what was unreadable).
 
     Args:
-        path: The file.
         start_s: Read steps that ended, and messages that arrived, at this time or later [s from the episode's start];
             None: from the start.
         end_s: Read those before this time [s from the episode's start]; None: to the end.

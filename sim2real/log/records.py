@@ -122,7 +122,6 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
     that look like a chunk or the session's end.
 
     Args:
-        data: The file.
         damage: Damage that is found is added here.
 
     Raises:
@@ -162,8 +161,6 @@ def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
     """Return the content of a chunk, decompressed and checked; empty if it is damaged.
 
     Args:
-        data: The file.
-        record: The chunk.
         damage: Damage that is found is added here.
     """
     try:
@@ -195,9 +192,7 @@ def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Dam
     """Return a record parsed by a class of ``mcap.records``; None if it is damaged.
 
     Args:
-        kind: The class.
         data: The file, or a chunk's content.
-        record: The record's place in it.
         damage: Damage that is found is added here.
     """
     try:

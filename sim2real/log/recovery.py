@@ -39,7 +39,6 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
     The new file has a ``session_end`` only if the old one has: a session that crashed still counts as crashed.
 
     Args:
-        source: Any MCAP file.
         target: The new file; it must not exist.
 
     Raises:
@@ -127,8 +126,6 @@ class _Copier:
         """Copy a record of the data section.
 
         Args:
-            data: The source file.
-            record: The record.
             damage: Damage that is found is added here.
         """
         if record.opcode == Opcode.HEADER:

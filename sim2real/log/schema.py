@@ -76,7 +76,6 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
     """Return the topic of a node's output.
 
     Args:
-        node: The node's name.
         example: An output, such as ``init_output`` returns.
         units: Field, or entry of one (``"aim[0]"``) -> unit, as far as known.
 
@@ -151,8 +150,6 @@ def joint_source(
     """Return how a node's output becomes ``sensor_msgs/msg/JointState``.
 
     Args:
-        node: The node's name.
-        example: An output of the node.
         joints: Joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the output: ``"th"``, or
             ``"q[2]"`` for an element of the flattened field.
         units: Field, or entry of one -> unit, as far as known.
@@ -196,7 +193,6 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
     """Return original name -> ROS name.
 
     Args:
-        originals: The original names.
         where: What they are part of, for errors.
         kind: What they are names of, for errors.
 

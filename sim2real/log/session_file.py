@@ -188,8 +188,6 @@ class SessionFile:
             monotonic_ns: When it happened, on the monotonic clock [ns].
             ticks: When it happened, for a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
             level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
-            kind: A short name.
-            message: What happened.
         """
         topic = self._topics[-1]
         if not self._channels:

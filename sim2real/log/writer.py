@@ -125,7 +125,6 @@ class McapRecorder:
 
         Args:
             kind: A short name, for example ``"watchdog"``.
-            text: What happened.
             level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
             ticks: When it happened, for a simulated clock [us from the episode's start]; None: now.
         """
@@ -152,7 +151,6 @@ class McapRecorder:
 
         Args:
             status: How the session ended, in a word or a sentence.
-            exit_code: Exit code of the command.
             summary: More facts for ``session_end`` (overruns, drops, ...): JSON-able.
             told: Called with a sentence every few seconds while it waits.
 

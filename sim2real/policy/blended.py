@@ -11,7 +11,6 @@ class BlendedRunner:
     """A runner whose action grows from none to the policy's during the first part of each episode.
 
     Args:
-        runner: The policy.
         blend_s: How long that takes [s]; 0: the action is the policy's from the start.
     """
 

@@ -375,10 +375,7 @@ def check_parity(
     """Compare the actions of an export.
 
     Args:
-        weights: Those of the policy.
         ones: Actions ``(A,)`` without ONNX.
-        others: The same with it.
-        who: What made the first.
         most: Largest difference, as a fraction of the actions' range.
 
     Raises:

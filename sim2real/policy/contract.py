@@ -59,8 +59,6 @@ class ObservationTerm:
         """Return a term of the present whose entries are at most ``most`` away from 0.
 
         Args:
-            name: Its name.
-            units: The unit of each entry.
             most: The largest magnitude [their units]; infinite: not known.
         """
         known = most <= LARGEST_BOUND

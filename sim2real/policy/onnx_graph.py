@@ -26,8 +26,6 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
     and an output ``next_carry_0`` besides.
 
     Args:
-        weights: Those of one of our own networks.
-        contract: Stored in the model's metadata.
         spec: Which of them; default: a perceptron whose output is clipped.
     """
     from onnx import helper
@@ -85,8 +83,6 @@ def make_model(
     Args:
         nodes: From ``observation (1, O)`` and ``carry_<i> (1, ...)`` to ``action (1, A)`` and ``next_carry_<i>``.
         constants: Name -> array that they take.
-        sizes: Numbers of entries of observation and action.
-        initial: What is carried into an episode's first step.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 

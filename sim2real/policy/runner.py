@@ -161,7 +161,6 @@ class PolicyRunner:
 
     Args:
         contract: Observations, actions and rate of the policy.
-        backend: The network.
     """
 
     def __init__(self, contract: PolicyContract, backend: Backend) -> None:

@@ -26,7 +26,6 @@ class UprightRunner:
     """A runner that stops the robot when it leans too far.
 
     Args:
-        runner: The policy.
         tilt_rad: Returns how far the robot leans, from an observation ``(O,)`` [rad].
         limit_rad: How far it may [rad].
     """

@@ -164,9 +164,7 @@ class Robot(RecordedRobot):
 
         Args:
             port: Device file of the port, or ``embedded`` for the emulated robot.
-            limits: Limits of the safety gate.
             truth_path: File for the emulated robot's true states and latencies.
-            seed: Seed of the emulated robot.
         """
 
     @abstractmethod
@@ -174,7 +172,6 @@ class Robot(RecordedRobot):
         """Bring the robot to rest where the task starts; torque is off afterwards.
 
         Args:
-            session: The open robot.
             settle_s: Longest time to wait for rest, per attempt [s].
         """
 
@@ -183,7 +180,6 @@ class Robot(RecordedRobot):
         """Return the graph on hardware that sends an excitation signal.
 
         Args:
-            session: The open robot.
             signal: Shape ``(N,)`` or ``(N, actions)``: one command per step.
         """
 
@@ -205,7 +201,6 @@ class Robot(RecordedRobot):
         """Return the graph on hardware that runs a policy, and parameters of its nodes.
 
         Args:
-            session: The open robot.
             policy: What runs the policy: ``reset()`` begins an episode, a call with an observation ``(O,)`` returns the
                 action ``(A,)``, both numpy arrays; see ``PolicyNode``.
             trial: Number of the trial. If the task differs between trials, e.g. in its target, the same number stands
@@ -223,11 +218,9 @@ class Robot(RecordedRobot):
         """Return the graph in simulation, and the training task.
 
         Args:
-            values: Parameters by name.
             draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in
                 place of the values.
             computation: Node -> distribution of its computation delay.
-            delays: Whether the graph has delays.
         """
 
     @abstractmethod
@@ -235,8 +228,6 @@ class Robot(RecordedRobot):
         """Return the nodes' parameters for an episode in simulation that starts at rest.
 
         Args:
-            values: Parameters by name.
-            policy: The policy.
             trial: Number of the trial, as in ``deployment_nodes``.
         """
 

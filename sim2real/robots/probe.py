@@ -97,7 +97,6 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
 
     Args:
         witness: Has the robot, at rest; what it kept of earlier steps goes.
-        probe: The steps.
 
     Raises:
         Sim2RealError: The joint does not answer.

@@ -20,12 +20,6 @@ def as_columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def as_sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the columns of what the supervisor sent besides its command, and of the command to the motors.
-
-    Args:
-        robot: The robot.
-        decided: Fields of the supervisor's messages.
-        commanded: Fields of the actuator's messages.
-    """
+    """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
     field = robot.command
     return as_columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})

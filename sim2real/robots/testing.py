@@ -57,7 +57,6 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
     """Check parameters, channels, units and nodes of the model to identify, without compiling it.
 
     Args:
-        robot: The robot.
         max_delay_s: Upper bound of delays [s].
     """
     model, roles = robot.identifiable(max_delay_s), robot.roles
@@ -80,11 +79,7 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
 
 
 def check_simulation(robot: Robot) -> None:
-    """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled.
-
-    Args:
-        robot: The robot.
-    """
+    """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
     roles, values = robot.roles, robot.nominal()
     known = {p.name: p for p in robot.identifiable(0.06).parameters}
     _include(known, set(values), "parameters that can be identified")
@@ -123,13 +118,7 @@ def check_simulation(robot: Robot) -> None:
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
-    """Check that the embedded robot opens, takes torque, and ends without.
-
-    Args:
-        robot: The robot.
-        folder: Takes what the embedded robot writes.
-        limits: Limits of the safety gate.
-    """
+    """Check that the embedded robot opens, takes torque, and ends without."""
     truth = folder / "truth.bin"
     with robot.connect("embedded", limits, truth, 0) as session:
         reading = session.rig.measure()

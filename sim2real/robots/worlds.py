@@ -51,11 +51,7 @@ class WorldModel(ABC):
 
     @abstractmethod
     def make_world(self, resumed: bool = False) -> BaseNode:
-        """Return the node, with the name that the robot's roles give it.
-
-        Args:
-            resumed: Whether episodes begin in the middle of a recording.
-        """
+        """Return the node, with the name that the robot's roles give it."""
 
     @cached_property
     def node(self) -> BaseNode:
@@ -66,7 +62,6 @@ class WorldModel(ABC):
         """Return the node's parameters.
 
         Args:
-            values: Parameters by name.
             start: Shape ``(2 * channels,)``: positions, then velocities.
         """
         node = self.node
@@ -78,7 +73,6 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """Return a robot in the world of a name.
 
     Args:
-        robot: The robot.
         name: The world; None: the robot's own.
 
     Raises:

@@ -51,7 +51,6 @@ class AsyncGraph:
         supervisor: The node whose steps the caller of ``reset``, ``step`` and ``run`` sees, usually the policy.
         clock: The wall clock or the simulated clock.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
-        recorder: Receives all steps and messages.
         duration_s: Length of drawn timelines [s]; default: no end, further delays are drawn when they are needed.
             Simulated clock only.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
@@ -98,7 +97,6 @@ class AsyncGraph:
         """Return the state in which the graph starts; see ``init_graph_state``.
 
         Args:
-            rng: A JAX key.
             params: Parameters that are used as given; the other nodes' come from ``init_params``.
             order: Names of nodes that are initialised first.
         """

@@ -77,8 +77,6 @@ class Window:
     memory of a numpy argument without copying it.
 
     Args:
-        connection: The connection.
-        form: Format of its messages.
         size: Number of messages that are kept.
         delay_dist: The trainable delay that steps see in ``InputState.delay_dist``, or None.
     """
@@ -116,7 +114,6 @@ class NodeData:
     """What one node carries from step to step.
 
     Args:
-        node: The node.
         graph_state: The state at the episode's start.
         emulate_delays: Whether trainable delays are applied to the windows, which are then longer. False on the wall
             clock, where the messages' delays are real.
@@ -171,8 +168,6 @@ def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str
     """Return the graph's state after the last finished step of each node.
 
     Args:
-        graph_state: The state at the episode's start.
-        data: The nodes' data by name.
         supervisor: The node whose steps ``GraphState.step`` counts.
     """
     carried = {name: d.carried for name, d in data.items()}

@@ -11,11 +11,6 @@ from sim2real.errors import Sim2RealError
 class NodeFailed(Sim2RealError):  # noqa: N818 - an event, as in sim2real.errors
     """A node raised an exception other than a ``Sim2RealError``; that exception is the cause.
 
-    Args:
-        message: What happened.
-        node: The node's name.
-        hint: What to do next.
-
     Attributes:
         node: The node's name.
     """
@@ -39,8 +34,6 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
     A ``Sim2RealError`` is returned itself, with a note; any other is wrapped in a ``NodeFailed``.
 
     Args:
-        error: What was raised.
-        node: The node's name.
         during: What the node was doing, e.g. ``startup``, ``step 12`` or ``stop``.
     """
     if isinstance(error, Sim2RealError):

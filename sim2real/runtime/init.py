@@ -58,7 +58,6 @@ def init_graph_state(
     Args:
         nodes: The nodes by name; their senders may be left out.
         supervisor: The supervisor, or its name.
-        rng: A JAX key.
         params: Parameters that are used as given; for nodes without an entry ``init_params`` is called.
         order: Names of nodes that are initialised first; then comes the supervisor, then the others.
         bounds: Those of the trainable delays; None: as the connections have them.

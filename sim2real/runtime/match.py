@@ -21,9 +21,7 @@ def matched(node: str, what: str, got: T, reference: str, like: object) -> T:
     """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``; no value changes.
 
     Args:
-        node: The node's name.
         what: Description of ``got``, for errors.
-        got: Arrays.
         reference: Description of ``like``, for errors.
         like: Arrays, or shapes and dtypes.
 
@@ -46,7 +44,6 @@ def check_match(node: str, what: str, got: object, reference: str, like: object)
     float, ``0.5`` not an integer), and float64 counts as float32 unless 64 bits are enabled.
 
     Args:
-        node: The node's name.
         what: Description of ``got``, for errors.
         got: Arrays, or shapes and dtypes.
         reference: Description of ``like``, for errors.

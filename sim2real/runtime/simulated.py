@@ -32,12 +32,6 @@ class _Link:
 
     The two differ for a trainable delay: the window takes messages in at the least delay, so that the step can pick
     those that have arrived at the delay that it has. The record has the arrivals at that delay.
-
-    Args:
-        edge: The timeline's.
-        told: The record's.
-        episode: Which episode of both.
-        steps: Steps of the reader in it.
     """
 
     def __init__(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
@@ -45,14 +39,7 @@ class _Link:
         self.plan(edge, told, episode, steps)
 
     def plan(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
-        """Take a timeline, which may be a longer one; see the class for the arguments.
-
-        Args:
-            edge: The timeline's.
-            told: The record's.
-            episode: Which episode of both.
-            steps: Steps of the reader in it.
-        """
+        """Take a timeline, which may be a longer one; see the class for the arguments."""
         self.sender = edge.sender
         self.told_received: list[int] = told.received[episode].tolist()
         self.told_seq_in: list[int] = told.seq_in[episode].tolist()
@@ -133,15 +120,9 @@ class SimulatedRun:
     """One episode on the simulated clock.
 
     Args:
-        nodes: The nodes by name.
-        supervisor: The supervisor's name.
-        steppers: Prepared steppers by name.
-        data: The nodes' data by name.
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
         own: Whether the supervisor makes its steps itself.
-        timeline: The timelines.
-        episode: Index of the episode to play.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
         growing: Draws longer and longer timelines, of which ``timeline`` is the first; None: the episode ends with it.
     """

@@ -55,7 +55,6 @@ class StepLog:
         """Add the age of the newest message that a step finds on an input.
 
         Args:
-            name: The input's name.
             begin: The step's start [ticks].
             sent: When the newest message was sent [ticks]; None: no new message, the step uses the previous one again.
         """

@@ -42,11 +42,7 @@ class Result(NamedTuple):
 
 
 class Stepper:
-    """Runs the steps of one node, for any number of episodes; compiles when the first is prepared.
-
-    Args:
-        node: The node.
-    """
+    """Runs the steps of one node, for any number of episodes; compiles when the first is prepared."""
 
     def __init__(self, node: BaseNode) -> None:
         self.node = node
@@ -86,8 +82,6 @@ class Stepper:
         """Run one step and wait for its results.
 
         Args:
-            data: The node's data.
-            step_state: What the step gets.
             ages: Input name -> ages of its messages [s], shape ``(W,)``, for inputs whose trainable delay is applied.
         """
         if self._compiled is not None:
@@ -104,10 +98,7 @@ class Stepper:
         """Return the results of a step to which a caller has replied; the node is run if the caller gave no output.
 
         Args:
-            data: The node's data.
-            given: What the step gets.
             ages: As in ``run``.
-            reply: The caller's reply.
         """
         before = {} if reply.step_state is None else _changed(given, reply.step_state)
         if reply.leaves is not None:
@@ -119,10 +110,8 @@ class Stepper:
         """Let a recorder see what the next step is given, if it wants to.
 
         Args:
-            recorder: The recorder.
             given: What the step gets, with whole windows.
             ages: As in ``run``.
-            reply: The caller's reply.
         """
         if isinstance(recorder, StepStateRecorder) and recorder.keep:
             recorder.given(self.node.name, _served(self.node, reply.step_state or given, ages))
@@ -157,7 +146,6 @@ def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
         ts: The step's ``ts`` afterwards [s]; None if it was not replaced.
         begin: The step's start [ticks].
         now: The time after the step [ticks].
-        node: The node's name.
 
     Raises:
         Sim2RealError: Unless ``begin <= ts < now``.

@@ -32,11 +32,7 @@ def interpret(
     is checked against the ``seq`` that the tables also have.
 
     Args:
-        nodes: The nodes by name.
-        wiring: The tables.
-        episode: Index of the episode.
         step: Makes a step: (node, seq, windows) -> output.
-        defaults: Default output of each node.
         given: Outputs of nodes that do not run.
 
     Raises:
@@ -96,9 +92,6 @@ def interpret_hashes(
 
     Args:
         nodes: Hash nodes (``sim2real.graph.testing``) without trainable delays, by name.
-        wiring: The tables.
-        episode: Index of the episode.
-        states: Initial states.
         outputs: Default outputs, numbers.
 
     Returns:

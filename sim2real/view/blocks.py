@@ -153,7 +153,6 @@ def interval(low: float | None, high: float | None, digits: int = 4) -> str:
     Args:
         low: Lower end; None: unknown.
         high: Upper end; None: unknown.
-        digits: Significant digits.
     """
     return MISSING if low is None or high is None else f"{number(low, digits)} to {number(high, digits)}"
 

@@ -24,11 +24,7 @@ _WIDE, _HIGH = 3.2, 1.9
 
 
 class Picture:
-    """A figure that a notebook shows.
-
-    Args:
-        figure: The figure of matplotlib.
-    """
+    """A figure that a notebook shows."""
 
     def __init__(self, figure: Figure) -> None:
         self.figure = figure
@@ -52,8 +48,6 @@ def plot_timeline(
     """Draw when steps run, and which message is used by which step.
 
     Args:
-        timeline: The timelines.
-        episode: Which of them.
         begin_s: First time that is shown [s].
         end_s: Last time that is shown [s].
         order: The nodes from top to bottom; default: as in the timeline.

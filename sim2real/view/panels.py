@@ -54,10 +54,8 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
     """Draw panels one above the other; panels over the same time share an axis. Returns SVG.
 
     Args:
-        panels: The panels.
         name: Name of the figure, unique on its page.
         label: Description of the figure, for screen readers.
-        shade: Legend of the shaded intervals.
     """
     zooms = {panel.zoom for panel in panels}
     closer = zooms != {None}
@@ -97,7 +95,6 @@ def with_unit(label: str, units: Mapping[str, str], field: str | None = None) ->
     """Return an axis label with the unit, if that is known.
 
     Args:
-        label: The label without unit.
         units: Field -> unit.
         field: Field that the axis shows; None: ``label``.
     """

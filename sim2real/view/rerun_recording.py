@@ -44,7 +44,6 @@ def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) ->
     """Open a run in the Rerun viewer, or save it as a recording.
 
     Args:
-        run_dir: The run's folder.
         save: Write this file (``.rrd``) instead of opening the viewer.
         scene: Draws the robot in 3-D; None: no 3-D view.
 
@@ -75,7 +74,6 @@ def build(recording: Any, tabs: Sequence[Tab], name: str, scene: Scene | None = 
     Args:
         recording: A ``rerun.RecordingStream``.
         tabs: The content, see ``content.tabs_of``.
-        name: What the viewer calls the recording.
         scene: Draws the robot in 3-D; None: no 3-D view.
     """
     recording.send_recording_name(name)

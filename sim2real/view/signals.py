@@ -112,7 +112,6 @@ def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Map
 
     Args:
         columns: See ``simulated_series``.
-        log: The robot's session.
         units: Field -> unit, beside those of the log.
     """
     units = {**log.units, **units}
@@ -133,7 +132,6 @@ def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> l
     """Return one series for each entry of a field; none if it does not hold numbers.
 
     Args:
-        name: Name of the field.
         source: The node or model that it comes from.
         t_s: Times ``(N,)`` [s].
         values: Values ``(N, ...)``.

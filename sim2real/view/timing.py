@@ -62,7 +62,6 @@ def color_of(episode: Episode, node: str, default: str) -> str:
 
     Args:
         episode: The log, whose metadata may have the node's colour.
-        node: The node.
         default: Returned if the node has no colour that matplotlib knows.
     """
     own = episode.metadata.get("graph", {}).get(node, {}).get("color")

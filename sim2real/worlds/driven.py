@@ -77,9 +77,7 @@ class DrivenWorld(MjxWorld):
     implicit.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
-        model: The model.
         units: What 1 stands for in the log's own gains ``kp`` and ``kd``, where it has them.
         terms: Whether there are ``DriveTerms``: they are evaluated before every physics step.
         **options: Options of ``MjxWorld``.
@@ -130,7 +128,6 @@ class DrivenWorld(MjxWorld):
         """Return parameters with an initial state; joints that were not recorded stand as the model's loops have them.
 
         Args:
-            params: The parameters.
             angle: Shape ``(joints,)``: of the recorded joints, from the model's zero [rad or m].
             speed: Shape ``(joints,)`` [rad/s or m/s].
         """

@@ -43,7 +43,6 @@ def damping(p: FrictionParams, velocity: Value) -> Value:
     """Return the friction of the viscous and drag terms divided by the speed [1/s].
 
     Args:
-        p: Coefficients.
         velocity: [rad/s].
     """
     terms = [] if p.viscous is None else [p.viscous]
@@ -55,7 +54,6 @@ def dry(p: FrictionParams, velocity: Value, load: Value = 0.0) -> Value:
     """Return the largest dry friction: the Coulomb, Stribeck and load-dependent terms [rad/s^2].
 
     Args:
-        p: Coefficients.
         velocity: [rad/s].
         load: Load on gears and bearings [rad/s^2]; its sign does not matter.
     """

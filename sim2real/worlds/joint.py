@@ -54,12 +54,9 @@ class JointWorld(SteppedWorld):
     damping depends on the velocity. With semi-implicit Euler, an identified delay is biased by half a substep.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
         substep_s: Largest step of the integrator [s]; a tick is split into equal parts no longer than this. On a motor
             with an eccentric mass, 5 ms gave the same fit as 0.6 ms.
-        color: Colour in drawings.
-        order: Place in drawings.
     """
 
     def __init__(
@@ -86,7 +83,6 @@ class JointWorld(SteppedWorld):
         """Return the forces on the joints.
 
         Args:
-            params: The node's parameters.
             position: [rad].
             velocity: [rad/s].
             command: What ``command`` returned for this tick.
@@ -101,7 +97,6 @@ class JointWorld(SteppedWorld):
         """Return the state one tick later.
 
         Args:
-            params: The node's parameters.
             state: The state, with fields ``position`` and ``velocity``.
             command: The command, constant during the tick.
         """

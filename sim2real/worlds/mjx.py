@@ -59,13 +59,9 @@ class MjxWorld(BaseWorld):
     """A MuJoCo model that ticks in MJX; its controls come from one input.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz]; a tick is a whole number of the model's time steps.
-        model: The model.
         command: Name of the input that carries the controls.
         field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
-        color: Colour in drawings.
-        order: Place in drawings.
         impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, in single precision and without derivatives.
         nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
         njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess.
@@ -172,12 +168,7 @@ class MjxWorld(BaseWorld):
         return self.model
 
     def fields(self, params: MjxParams, state: Any) -> dict[str, jax.Array]:
-        """Return the fields of the model that differ from the compiled one.
-
-        Args:
-            params: The node's parameters.
-            state: Not used.
-        """
+        """Return the fields of the model that differ from the compiled one."""
         del state
         found = {}
         old, new = (jax.tree_util.tree_flatten_with_path(m)[0] for m in (self._mjx_model, params.model))
@@ -188,12 +179,7 @@ class MjxWorld(BaseWorld):
         return found
 
     def start(self, params: MjxParams, state: Any) -> Start:
-        """Return where the physics starts.
-
-        Args:
-            params: The node's parameters.
-            state: Not used.
-        """
+        """Return where the physics starts."""
         del state
         return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
 
@@ -206,10 +192,8 @@ class MjxWorld(BaseWorld):
         """Return what the world sends.
 
         Args:
-            state: Not used.
             qpos: Positions ``(nq,)`` [m or rad].
             qvel: Velocities ``(nv,)`` [m/s or rad/s].
-            qacc: Not used.
         """
         del state, qacc
         return MjxState(qpos, qvel)

@@ -16,11 +16,8 @@ class OdeWorld(SteppedWorld):
     """A world that integrates ``derivative`` with the classical Runge-Kutta method of order four.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
         substep_s: Largest step of the integrator [s]; a tick is split into equal parts no longer than this.
-        color: Colour in drawings.
-        order: Place in drawings.
     """
 
     def __init__(
@@ -33,8 +30,6 @@ class OdeWorld(SteppedWorld):
         """Return the time derivative of the state.
 
         Args:
-            params: The node's parameters.
-            state: The state.
             command: The command, constant during the tick.
 
         Returns:
@@ -50,8 +45,6 @@ class OdeWorld(SteppedWorld):
         """Return the state one tick later.
 
         Args:
-            params: The node's parameters.
-            state: The state.
             command: The command, constant during the tick.
         """
 

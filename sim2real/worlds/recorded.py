@@ -32,7 +32,6 @@ class RecordedActuator(BaseNode):
     """The node that sent the recorded commands.
 
     Args:
-        name: Unique in the graph.
         rate: Largest number of commands per second [Hz].
         message: A command; it is the node's default output.
     """
@@ -56,9 +55,7 @@ class RecordedSensor(BaseNode):
     """The node that measured one joint: shows the world's position, as an encoder reads it.
 
     Args:
-        name: Unique in the graph.
         rate: Samples per second [Hz].
-        message: Makes a message from positions.
         encoder: The encoder; its parameters may be identified. None: positions are shown as they are.
     """
 

@@ -23,7 +23,6 @@ def position_duty(goal: Value, position: Value, gain: Value, counts_per_unit: fl
         position: Present position [rad].
         gain: PWM steps per count of error.
         counts_per_unit: Encoder counts per radian.
-        full: PWM steps at full duty.
     """
     off = jnp.floor(goal * counts_per_unit + 0.5) - jnp.floor(position * counts_per_unit + 0.5)
     return jnp.trunc(jnp.clip(gain * off, -full, full)) / full

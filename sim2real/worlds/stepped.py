@@ -28,11 +28,8 @@ class SteppedWorld(BaseWorld):
     If the parameters of the node ``actuator`` have a ``delay``, it is that of its commands.
 
     Args:
-        name: Unique in the graph.
         rate: Ticks per second [Hz].
         substep_s: Largest step of the integrator [s]; a tick is split into equal parts no longer than this.
-        color: Colour in drawings.
-        order: Place in drawings.
     """
 
     def __init__(
@@ -52,8 +49,6 @@ class SteppedWorld(BaseWorld):
         """Return the state one tick later.
 
         Args:
-            params: The node's parameters.
-            state: The state.
             command: The command, constant during the tick.
         """
 
@@ -85,7 +80,6 @@ class SteppedWorld(BaseWorld):
 
         Args:
             substep: Maps a state and a substep's length [s] to the state after it.
-            state: The state at the start of the tick.
         """
         h = 1.0 / (self.rate * self.substeps)
         # Unrolled on a GPU, where a loop costs a kernel launch per substep. On a CPU, unrolling the pendulum's five

@@ -24,7 +24,6 @@ class WornFriction:
             xp: ``numpy`` or ``jax.numpy``.
             values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, where 1/e of it is left, ``(..., nv)``.
             control: Controls ``(..., nu)``.
-            qpos: Not used.
             qvel: Velocities ``(..., nv)`` [rad/s].
         """
         del qpos

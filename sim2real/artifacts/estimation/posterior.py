@@ -27,7 +27,6 @@ def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
     """Return values for points on a scale.
 
     Args:
-        transform: Name of the scale.
         x: The points, of any shape.
         numpy: ``numpy``, or ``jax.numpy`` inside a program.
     """
@@ -98,8 +97,6 @@ class Posterior:
         """Draw parameter sets, of all alternatives by their shares: name -> ``(count,)``.
 
         Args:
-            rng: Random numbers.
-            count: How many.
             widen: Factor on the standard deviations.
         """
         if not self.others:

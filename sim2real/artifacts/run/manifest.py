@@ -68,8 +68,6 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any], lock: bool = False
     """Write a stage folder's manifest; a reader sees the old one or the new one, never a part.
 
     Args:
-        folder: The stage's folder.
-        manifest: What to write.
         lock: Whether to hold a lock on it, which readers see as long as this process lives.
 
     Returns:

@@ -121,7 +121,6 @@ class OpenStage:
         """Name a file or folder that the stage writes, before or after writing it; it is hashed when the stage ends.
 
         Args:
-            name: What later stages ask for.
             path: Inside of the stage's folder; relative paths are relative to it.
 
         Returns:
@@ -158,13 +157,10 @@ def open_stage(
     """Run a stage in a folder of its own, with a manifest from the first moment to the last.
 
     Args:
-        root: Folder of all runs.
-        pipeline: Name of the pipeline.
         stage: One of ``STAGES``, or of ``TESTS``.
         config: The resolved configuration, a dataclass.
         inputs: Name -> file or folder that the stage reads; hashed before it starts.
         run_dir: Run folder to add to; None makes a new one.
-        dry_run: Whether the stage moves nothing.
 
     Yields:
         The running stage; at its end the manifest says 'finished', 'dry run', 'failed' or 'interrupted', and the exit
@@ -316,9 +312,6 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     """Return the newest finished artifact of a stage.
 
     Args:
-        root: Folder of all runs.
-        pipeline: Name of the pipeline.
-        stage: The stage whose artifact is wanted.
         run_dir: Run folder to look in first; without the artifact there, the newest of all runs is taken.
 
     Raises:

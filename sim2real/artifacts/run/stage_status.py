@@ -42,10 +42,6 @@ def why_stale(attempt: StageFolder, found: Mapping[str, Standing]) -> str:
     """Return why a finished attempt is out of date; "" where it is current.
 
     A stage is current where it was made from the newest finished attempt at the stage before it, and that is current.
-
-    Args:
-        attempt: The attempt.
-        found: How the stages before it stand.
     """
     before, output = TAKES.get(attempt.stage, ("", ""))
     if before not in found:

@@ -34,7 +34,6 @@ def reach(
 
     Args:
         physics: The physics; its positions are changed.
-        site: The site.
         joints: The joints that may move.
         position: Of the site in the world, ``(3,)`` [m].
         quaternion: Of the site in the world, ``(4,)``.

@@ -34,7 +34,6 @@ class PropPlacer(Initializer):
     """Draws a pose for one prop after the other, until it touches nothing; then lets them settle if asked to.
 
     Args:
-        props: The entities to place.
         position: Position ``(3,)`` [m], or a variation.
         quaternion: Orientation ``(4,)``, or a variation.
         ignore_collisions: Take the first pose, whatever it touches.
@@ -90,8 +89,6 @@ class PropPlacer(Initializer):
         """Place the props.
 
         Args:
-            physics: The physics.
-            random_state: Source of randomness.
             ignore_contacts_with_entities: Entities that may be touched, such as those that are placed later.
 
         Raises:

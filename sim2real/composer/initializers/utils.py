@@ -16,7 +16,6 @@ class JointStaticIsolator:
     """Inside a ``with`` block only some joints move: all others are put back when it ends.
 
     Args:
-        physics: The physics.
         joints: The joints that may move, or one of them.
 
     Raises:

@@ -16,7 +16,6 @@ class BraxEnv(PureBraxEnv):
     task's ``action_spec`` says. ``info["failed"]`` is 1 where no initial state was found.
 
     Args:
-        environment: The task as a pure environment.
         fresh_starts: Whether each episode of a copy starts from a state of its own, at the price of a reset a step.
 
     Raises:

@@ -36,10 +36,6 @@ class CopiesVectorEnv(VectorEnv):
     copy depend on its seed and its actions, and on no other copy.
 
     Args:
-        pure: One copy.
-        num_envs: Number of copies.
-        observation_space: Of one copy.
-        action_space: Of one copy.
         autoreset_mode: What happens to a copy that is done, ``AutoresetMode`` or its value, e.g. ``"SameStep"``.
 
     Raises:

@@ -39,7 +39,6 @@ class PureBraxEnv(Env):
     ``metrics`` has the values of whole episodes, in the step that ends them, and 0 in all others.
 
     Args:
-        pure: One copy.
         sizes: Lengths of an observation and of an action.
         dt_s: Time between two actions [s].
         max_episode_length: Steps until the time limit; None: there is none.

@@ -16,7 +16,6 @@ class PureTask:
     """A task on MJX; see ``PureEnvironment``.
 
     Args:
-        environment: The task.
         flat: Whether the observation is one vector, instead of a dictionary.
     """
 

@@ -17,8 +17,6 @@ class MjxVectorEnv(CopiesVectorEnv):
     """Copies of a task, with the interface of ``gymnasium.vector``; observations are dictionaries of observables.
 
     Args:
-        environment: The task as a pure environment.
-        num_envs: Number of copies.
         autoreset_mode: What happens to a copy that is done; see ``CopiesVectorEnv``.
 
     Raises:

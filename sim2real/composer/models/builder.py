@@ -25,9 +25,7 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
     """Add an element to a body of this model.
 
     Args:
-        model: The model.
         body: The body, or the frame of an attached model.
-        tag: The element's tag in MJCF.
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
     """
     if tag == "inertial":
@@ -85,7 +83,6 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -
     """Add an element that stands in no body; MuJoCo's parser reads its attributes.
 
     Args:
-        model: The model.
         kind: What is added, such as ``actuator``.
         tag: Its tag in MJCF, such as ``motor``.
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
@@ -158,8 +155,6 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
     For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
 
     Args:
-        model: The model.
-        element: The element.
         key: The attribute that was set or taken back; None: its class changed.
 
     Raises:
@@ -209,7 +204,6 @@ def reclass(model: Tree[Handle], element: Handle, name: str, value: Any) -> None
     """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``.
 
     Args:
-        model: The model.
         element: The element, or the body.
         name: ``dclass`` or ``childclass``.
         value: The class, or its name.
@@ -251,8 +245,6 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
     """Add a joint, a site, a geom or a pulley to a tendon's path.
 
     Args:
-        model: The model.
-        tendon: The tendon.
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
         attrs: The attributes in MJCF; elements, or their names.
     """
@@ -275,8 +267,6 @@ def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Any]) ->
     """Add an element to those that a tuple names.
 
     Args:
-        model: The model.
-        element: The tuple.
         tag: ``element``.
         attrs: ``objname``, an element or a name, with ``objtype``; ``prm``, a number.
     """

@@ -25,7 +25,6 @@ class Defaults:
     """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another.
 
     Args:
-        model: The model.
         name: The class; ``main`` is the one that holds for everything.
     """
 
@@ -122,8 +121,6 @@ class DefaultElement(Element):
     themselves.
 
     Args:
-        owner: The class.
-        kind: What the elements are.
         native: What holds their defaults in the ``MjSpec``.
         tag: The tag under which they were asked for: a class has the same defaults for all actuators.
     """

@@ -82,9 +82,7 @@ class Element(Handle):
         """Return the elements of a kind below this body, in the order of the document.
 
         Args:
-            kind: Of elements.
             immediate_children_only: Only those that stand in this body itself.
-            exclude_attachments: Only those of this body's own model.
         """
         if self.kind != "body":
             return []
@@ -117,8 +115,6 @@ class Element(Handle):
 
         Args:
             prefix_root: The model from which names are seen; default: the element's own.
-            self_only: Whether what stands in it is left out.
-            pretty_print: Whether every element has a line of its own.
         """
         return xml.to_xml_string(self, prefix_root, self_only, pretty_print)
 

@@ -22,12 +22,7 @@ E = TypeVar("E", bound=Listed, covariant=True)
 
 
 class ElementList(Sequence[E], Generic[E]):
-    """Elements of one kind or tag in a body or a section; always those that are there now.
-
-    Args:
-        find: Returns them.
-        tag: What they are.
-    """
+    """Elements of one kind or tag in a body or a section; always those that are there now."""
 
     def __init__(self, find: Callable[[], Sequence[E]], tag: str) -> None:
         self._find, self._tag = find, tag

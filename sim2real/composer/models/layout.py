@@ -130,8 +130,6 @@ def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> A
 
     Args:
         model: The compiled ``mujoco.MjModel``.
-        field: The field.
-        ids: Numbers of the elements.
         single: Whether one element was bound, rather than a sequence of them.
     """
     if field.size == "nmocap":
@@ -151,8 +149,6 @@ def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...
 
     Args:
         model: The compiled ``mujoco.MjModel``.
-        kind: What the elements are.
-        names: Their full names.
 
     Raises:
         UsageError: When the model has no element of one of the names.

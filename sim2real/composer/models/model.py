@@ -49,7 +49,6 @@ class Model(Tree[Element]):
         """Return a model from MJCF.
 
         Args:
-            xml_string: The document.
             assets: Contents of files by name: they are looked for there first.
             model_dir: Where relative paths of files begin; default: the working directory.
             resolve_references: False: attributes that name elements read as text until ``resolve_references()``.
@@ -67,7 +66,6 @@ class Model(Tree[Element]):
         """Return a model from an MJCF file.
 
         Args:
-            path: The file.
             assets: Contents of files by name: they are looked for there first.
             resolve_references: As in ``from_xml_string``.
 
@@ -88,7 +86,6 @@ class Model(Tree[Element]):
         """Return a model from an open MJCF file.
 
         Args:
-            file: The file.
             assets: As in ``from_xml_string``.
             model_dir: As in ``from_xml_string``.
             resolve_references: As in ``from_xml_string``.

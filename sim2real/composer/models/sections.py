@@ -37,8 +37,6 @@ class Section:
     Attributes read and set the fields of the ``MjSpec``; ``add`` adds an element to the sections that hold some.
 
     Args:
-        model: The model.
-        name: The section's name.
         path: Where its fields are in the ``MjSpec``; '' for the spec itself.
         kinds: The kinds of elements that stand in it.
     """
@@ -177,11 +175,7 @@ class Flags:
 
 
 class DocumentsOnly:
-    """A section that documents may have, and programs cannot add to: plug-ins and flexes.
-
-    Args:
-        name: The section.
-    """
+    """A section that documents may have, and programs cannot add to: plug-ins and flexes."""
 
     __slots__ = ("_name",)
 

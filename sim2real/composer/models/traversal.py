@@ -42,7 +42,6 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
     """Give an element, as its own, the values that it takes from its classes of defaults.
 
     Args:
-        element: The element.
         attributes: Names of the attributes; default: all.
     """
     for said in builder.said_by_classes(element):  # a class has one actuator for all tags

@@ -194,9 +194,6 @@ class Tree(Scope, Generic[H]):
         """Note that an element was added after all others; return its handle.
 
         Args:
-            kind: What it is.
-            native: The element of the spec.
-            tag: Its tag in MJCF.
             values: The attributes that were given to it.
         """
         self._order[native] = next(self._clock)
@@ -219,8 +216,6 @@ class Tree(Scope, Generic[H]):
 
         Args:
             kind: Of elements, or ``attachment_frame``, ``attached_model``.
-            identifier: The name.
-            name: The same.
         """
         identifier = name if identifier is None else identifier
         if identifier is None:
@@ -248,9 +243,7 @@ class Tree(Scope, Generic[H]):
         """Return all elements of a kind, in the order of the document: own ones, then those of attached models.
 
         Args:
-            kind: Of elements.
             immediate_children_only: Only those that stand directly in the model, which holds sections and its world.
-            exclude_attachments: Only this model's own.
         """
         kind = KIND_OF_TAG.get(kind, kind)
         if kind in TREE_KINDS:
@@ -271,10 +264,7 @@ class Tree(Scope, Generic[H]):
         """Yield the elements of a kind below a native body, in the order of the document.
 
         Args:
-            body: The body of the spec.
-            kind: Of elements.
             shallow: Only those that stand in the body itself.
-            own: Only this model's own.
         """
         attachment = self.attachments.get(body.name[:-1]) if body.name.endswith("/") else None
         children = list(getattr(body, translate.plural(kind)))

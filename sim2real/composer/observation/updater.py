@@ -46,7 +46,6 @@ class _Channel:
 
     Args:
         name: The observable's key in the observation.
-        observable: The observable.
         physics: The physics that it samples.
         random_state: What noise and delays are drawn from.
         steps_per_read: Physics steps from one observation to the next.

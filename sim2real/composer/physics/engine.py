@@ -70,7 +70,6 @@ class Camera:
     """A view of a physics.
 
     Args:
-        physics: What is seen.
         height: Pixels, at most the model's ``visual/global/offheight``.
         width: Pixels, at most the model's ``visual/global/offwidth``.
         camera_id: Number or name of one of the model's cameras; -1 is the free camera.
@@ -187,8 +186,6 @@ class Camera:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
         Args:
-            overlays: Texts to draw over it.
-            depth: Measure distances instead of colours.
             segmentation: Tell objects by numbers and types (``mjtObj``) instead; (-1, -1) is none.
             scene_option: What is drawn: an ``MjvOption``; default: ``option``.
             render_flag_overrides: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by
@@ -230,7 +227,6 @@ class MovableCamera(Camera):
     """A free camera that can be put anywhere.
 
     Args:
-        physics: What is seen.
         height: See ``Camera``.
         width: See ``Camera``.
         max_geom: See ``Camera``.
@@ -269,8 +265,6 @@ class TextOverlay:
     """A text over an image, in two columns.
 
     Args:
-        title: The left column.
-        body: The right one.
         style: ``'normal'``, ``'shadow'`` or ``'big'``.
         position: ``'top left'``, ``'top right'``, ``'bottom left'`` or ``'bottom right'``.
 

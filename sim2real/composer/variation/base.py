@@ -37,13 +37,7 @@ class Variation(ABC):
         current_value: ArrayLike | None = None,
         random_state: RandomState | None = None,
     ) -> Any:
-        """Return a value.
-
-        Args:
-            initial_value: What the attribute was before it was ever varied.
-            current_value: What the attribute is.
-            random_state: Source of randomness.
-        """
+        """Return a value."""
 
     def __add__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.add, self, other)
@@ -118,8 +112,6 @@ class BinaryOperation(Variation):
 
     Args:
         op: The operator, a function of two values.
-        first: The left value.
-        second: The right value.
     """
 
     def __init__(self, op: Callable[[Any, Any], Any], first: Varying, second: Varying) -> None:

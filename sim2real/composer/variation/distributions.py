@@ -21,9 +21,7 @@ class Distribution(Variation):
     """A distribution whose parameters may vary themselves; they can be read as attributes.
 
     Args:
-        *args: Positional parameters of the sampling function.
         single_sample: Draw one sample, whatever the shape of the initial value.
-        **kwargs: Named parameters.
     """
 
     __slots__ = ("_args", "_kwargs", "_single_sample")
@@ -72,8 +70,6 @@ class Uniform(Distribution):
     """Uniform in ``[low, high)``.
 
     Args:
-        low: The lower bound.
-        high: The upper bound.
         single_sample: Draw one sample, whatever the shape of the initial value.
     """
 
@@ -91,7 +87,6 @@ class UniformInteger(Distribution):
 
     Args:
         low: The lower bound; without ``high``, the upper one.
-        high: The upper bound.
         single_sample: Draw one sample, whatever the shape of the initial value.
     """
 
@@ -145,8 +140,6 @@ class Normal(Distribution):
     """Normal with mean ``loc`` and standard deviation ``scale``.
 
     Args:
-        loc: The mean.
-        scale: The standard deviation.
         single_sample: Draw one sample, whatever the shape of the initial value.
     """
 
@@ -163,8 +156,6 @@ class LogNormal(Distribution):
     """The exponential of a normal variable.
 
     Args:
-        mean: Of the logarithm.
-        sigma: Standard deviation of the logarithm.
         single_sample: Draw one sample, whatever the shape of the initial value.
     """
 
@@ -217,7 +208,6 @@ class BiasedRandomWalk(Variation):
     """A zero-mean Ornstein-Uhlenbeck process, one step a call; it goes on from episode to episode, but not on MJX.
 
     Args:
-        stdev: Standard deviation of the values.
         timescale: Calls after which the correlation has fallen to 1/e; 0: uncorrelated.
 
     Raises:

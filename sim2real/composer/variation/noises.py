@@ -14,7 +14,6 @@ class Additive(Variation):
     """Adds a variation to the initial value, or to the current one.
 
     Args:
-        variation: What is added.
         cumulative: Add to the current value rather than to the initial one.
     """
 

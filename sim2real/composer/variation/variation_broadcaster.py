@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 
 
 class VariationBroadcaster:
-    """Hands the same draws to several users: the n-th call of every proxy returns the n-th draw.
-
-    Args:
-        wrapped_variation: What is drawn from.
-    """
+    """Hands the same draws to several users: the n-th call of every proxy returns the n-th draw."""
 
     def __init__(self, wrapped_variation: Varying) -> None:
         self._wrapped = wrapped_variation

@@ -24,7 +24,6 @@ def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -
 
     Args:
         nodes: The node and its senders, by name.
-        name: The node.
         key: JAX key of parameters, states and default outputs.
     """
     keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}
@@ -123,14 +122,7 @@ class RuntimeConformance(ABC):
 
     @abstractmethod
     def play(self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, episode: int) -> Played:
-        """Play one episode of a timeline in the runtime under test.
-
-        Args:
-            nodes: The nodes by name.
-            supervisor: Name of the supervisor.
-            timeline: The timelines to play.
-            episode: Which of them.
-        """
+        """Play one episode of a timeline in the runtime under test."""
 
     trainable: bool = True
     """Whether the runtime applies trainable delays."""

@@ -53,8 +53,6 @@ def hash_step(state: int, seq: int, windows: list[tuple[list[int], list[int]]]) 
     """Return state and output after a step of a hash node.
 
     Args:
-        state: The state before.
-        seq: Number of the step.
         windows: For each input, in the order of their names: seq and value of each message, oldest first.
     """
     acc = mix(state, seq)
@@ -161,9 +159,7 @@ class MakeNode(Protocol):
         """Return the node.
 
         Args:
-            name: Unique in the graph.
             rate: Steps per second [Hz].
-            world: Whether to make a world.
             **options: Options of ``BaseNode``; none for a world.
         """
         ...
@@ -173,9 +169,7 @@ def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
     """Return a hash node in plain Python.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        world: Whether it is a world.
         **options: Options of ``BaseNode``; not used by a world.
     """
     return HashWorldInPython(name, rate) if world else HashInPython(name, rate, **options)
@@ -185,9 +179,7 @@ def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNo
     """Return a hash node in JAX.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        world: Whether it is a world.
         **options: Options of ``BaseNode``; not used by a world.
     """
     return HashWorldInJax(name, rate) if world else HashInJax(name, rate, **options)
@@ -197,9 +189,7 @@ def contracting_node(name: str, rate: float, world: bool, **options: Any) -> Bas
     """Return a node with float messages.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        world: Whether it is a world.
         **options: Options of ``BaseNode``; not used by a world.
     """
     return ContractingWorld(name, rate) if world else Contraction(name, rate, **options)
@@ -218,10 +208,8 @@ def random_graph(
     so steps overrun and messages come in bursts. All options of connections occur; loops have a skipped connection.
 
     Args:
-        seed: Seed of all random choices.
         size: Number of nodes that are not worlds, 1 to 6; default: random.
         worlds: Number of worlds, 0 to 2; default: random.
-        make: Makes the nodes.
         trainable: Whether hash nodes have messages of random dtypes, and some connections a trainable delay.
     """
     rng = np.random.default_rng(seed)
@@ -269,7 +257,6 @@ def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNo
     """Connect two nodes with random options, sometimes twice.
 
     Args:
-        rng: Source of the options.
         reader: The node that reads; if it is a world, its inputs do not block.
         sender: The node that sends.
         skip: True: the connection is skipped; False: it may be.

@@ -17,7 +17,6 @@ class Reference:
     """One episode of a graph, computed from its delays alone.
 
     Args:
-        nodes: The nodes by name.
         timeline: Source of the computation and communication delays and of the number of steps.
         episode: Index of the episode in ``timeline``.
 
@@ -80,14 +79,7 @@ class Reference:
         return known[i]
 
     def window(self, node: str, name: str, k: int, width: int) -> list[int]:
-        """Return the messages that a step sees on an input, oldest first; -1 in empty slots (rule 7).
-
-        Args:
-            node: The reader's name.
-            name: The input's name.
-            k: Number of the step.
-            width: Length of the window.
-        """
+        """Return the messages that a step sees on an input, oldest first; -1 in empty slots (rule 7)."""
         seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
         connection = self.nodes[node].inputs[name]
         if isinstance(connection.delay_dist, TrainableDist):
@@ -114,12 +106,7 @@ class Reference:
         return as_message(mix(state, 7), getattr(self.nodes[node], "dtype", "uint32"))
 
     def hashes(self, states: Mapping[str, int], outputs: Mapping[str, int]) -> dict[str, list[int]]:
-        """Return the state of each hash node after each of its steps.
-
-        Args:
-            states: Initial states by node.
-            outputs: Default outputs by node.
-        """
+        """Return the state of each hash node after each of its steps."""
         made: dict[str, list[int]] = {n: [] for n in self.nodes}
         order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
         while order:  # steps that start at the same time may need each other's outputs: repeat until all are done

@@ -41,9 +41,6 @@ class ServoLink(ABC):
 
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
 
-    Args:
-        config: Port and limits.
-
     Attributes:
         form: How packets are written.
         table: The servos' memory.
@@ -78,7 +75,6 @@ class ServoLink(ABC):
         """Raise the error that an answer reports: SafetyStop if the servo has stopped itself.
 
         Args:
-            answer: An answer with an error.
             what: Description of the instruction, for errors.
         """
 
@@ -92,8 +88,6 @@ class ServoLink(ABC):
         """Return a register's value in counts; of a goal that was withheld, that goal.
 
         Args:
-            servo_id: The servo.
-            register: The register.
             despite_error: Whether to return it although the servo reports an error.
         """
         what = f"read of {register.name}"
@@ -106,9 +100,6 @@ class ServoLink(ABC):
         """Read the same bytes of several servos' memory with one instruction.
 
         Args:
-            servo_ids: The servos.
-            address: Address of the first byte.
-            length: Number of bytes of each servo.
             what: Description of the instruction, for errors.
             despite_error: Whether to return them although a servo reports an error.
 
@@ -132,7 +123,6 @@ class ServoLink(ABC):
         """Read registers that are near each other, of several servos, with one instruction.
 
         Args:
-            servo_ids: The servos.
             registers: The registers, in the order of their addresses.
             what: Description of the instruction, for errors.
 
@@ -148,11 +138,6 @@ class ServoLink(ABC):
         """Write a register, and wait for the servo to confirm that the instruction came.
 
         Some servos do not say whether they took the value: `set` reads it back.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
         """
         if self._withholds(register, (value,)):
             return self._withhold(register, {servo_id: value})
@@ -160,26 +145,14 @@ class ServoLink(ABC):
         return self._exchange(lambda: (packet, 0), (servo_id,), f"write of {value} to {register.name}")[1]
 
     def set(self, servo_id: int, register: Register, value: int) -> None:
-        """Write a register if it holds another value; raise HardwareLost if the servo does not keep it.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
-        """
+        """Write a register if it holds another value; raise HardwareLost if the servo does not keep it."""
         if self.read(servo_id, register) == value:
             return
         self.write(servo_id, register, value)
         self.require(servo_id, register, value)
 
     def require(self, servo_id: int, register: Register, value: int) -> None:
-        """Raise HardwareLost if a register does not hold the value that was written.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
-        """
+        """Raise HardwareLost if a register does not hold the value that was written."""
         found = self.read(servo_id, register)
         if found != value:
             raise HardwareLost(
@@ -206,11 +179,6 @@ class ServoLink(ABC):
 
     def force(self, servo_id: int, register: Register, value: int) -> bool:
         """Write a register despite a held lock, missing answers or errors, until it reads back. Never raises.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
 
         Returns:
             Whether the servo holds the value.

@@ -28,7 +28,6 @@ class ServoModel:
 
         Args:
             watchdog_s: The time that its bus watchdog is set to [s]; 0: off.
-            motors: Names of the servos of this model.
         """
         if self.stops_alone is None or not watchdog_s:
             why = "it has no bus watchdog" if self.stops_alone is None else "its bus watchdog is off"

@@ -89,18 +89,11 @@ class PacketFormat(ABC):
         Args:
             servo_id: The receiver; of a status packet, the sender.
             code: As in `Packet`.
-            parameters: Bytes after it.
         """
         return self.frame(servo_id, bytes((code,)) + parameters)
 
     def build_status(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-        """Return the bytes of a status packet, a servo's answer: here with the error byte in the instruction's place.
-
-        Args:
-            servo_id: The sender.
-            error: Error byte.
-            parameters: Bytes after it.
-        """
+        """Return the bytes of a status packet, a servo's answer, with the error byte for the instruction."""
         return self.build(servo_id, error, parameters)
 
     @abstractmethod
@@ -116,26 +109,14 @@ class PacketFormat(ABC):
         """Return what a status packet says; None for any other packet."""
 
     def read(self, servo_ids: Sequence[int], address: int, length: int) -> bytes:
-        """Return the instruction that reads the same bytes of one or several servos.
-
-        Args:
-            servo_ids: The servos.
-            address: Address of the first byte.
-            length: Number of bytes.
-        """
+        """Return the instruction that reads the same bytes of one or several servos."""
         place = self._word(address) + self._word(length)
         if len(servo_ids) == 1:
             return self.build(servo_ids[0], Instruction.READ, place)
         return self.build(BROADCAST_ID, Instruction.SYNC_READ, place + bytes(servo_ids))
 
     def write(self, servo_id: int, register: Register, value: int) -> bytes:
-        """Return the instruction that writes a register.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
-        """
+        """Return the instruction that writes a register."""
         return self.build(servo_id, Instruction.WRITE, self._word(register.address) + register.encode(value))
 
     def write_each(self, register: Register, values: Mapping[int, int]) -> bytes:
@@ -163,11 +144,7 @@ class PacketFormat(ABC):
 
 
 class Parser:
-    """Finds packets in a byte stream that arrives in chunks, and resynchronises after garbage.
-
-    Args:
-        form: How packets are written.
-    """
+    """Finds packets in a byte stream that arrives in chunks, and resynchronises after garbage."""
 
     def __init__(self, form: PacketFormat) -> None:
         self._form = form
@@ -179,9 +156,6 @@ class Parser:
 
     def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
         """Process the next bytes.
-
-        Args:
-            chunk: The bytes.
 
         Returns:
             The packets that they complete; each with the number of bytes of `chunk` up to and with its last byte.

@@ -17,13 +17,11 @@ class Register:
 
     Args:
         name: The manual's name, in lower case.
-        address: Address of the first byte.
         size: Number of bytes, little endian: 1, 2 or 4.
         minimum: Smallest value that may be written [counts].
         maximum: Largest value that may be written [counts].
         default: Value after power-up [counts].
         sign: Bit that means "negative", the others being a magnitude; `TWOS_COMPLEMENT`; None: it is never negative.
-        writable: Whether it can be written.
         eeprom: Whether its value outlives a loss of power.
     """
 
@@ -66,13 +64,11 @@ class MemoryTable:
 
     Args:
         named: Whatever a module of registers defines; what is no register does not count.
-        size: Number of bytes.
         torque: The register that holds 0 while torque is off.
         goals: The registers that can move the motor while torque is on.
         model_number: The register that says which model it is.
         servo_id: The register that holds its id.
         return_delay: The register that says how long it waits before it answers, in units of 2 us.
-        position: The register of the measured position.
     """
 
     named: Iterable[object]

@@ -33,10 +33,6 @@ class GuardedServos(Generic[L]):
     its handler calls `make_safe`. If this process is killed or hangs, the guardian takes the torque off: a separate
     process that is started before torque goes on.
 
-    Args:
-        config: Port and limits.
-        ids: The servos' ids.
-
     Attributes:
         models: Id -> model of the servos that were found, whose torque `close` takes off.
         armed: Whether torque is on, as far as is known.
@@ -124,7 +120,6 @@ class GuardedServos(Generic[L]):
         """Return what a servo answers to a ping.
 
         Args:
-            servo_id: The servo.
             whose: What it moves, for errors.
 
         Raises:

@@ -35,7 +35,6 @@ class ServoBus(GuardedServos[BusLink]):
             print(bus.read_state().position_rad)
 
     Args:
-        config: Port and limits.
         ids: The servos' ids; `handshake` sets them too.
     """
 
@@ -69,9 +68,6 @@ class ServoBus(GuardedServos[BusLink]):
         """Take the torque off, set the operating mode, and let the servos answer without delay.
 
         EEPROM registers are written only if their value differs, as writing wears them out.
-
-        Args:
-            mode: The operating mode.
         """
         for servo_id in self.ids:
             self.write(servo_id, reg.TORQUE_ENABLE, 0)
@@ -87,9 +83,6 @@ class ServoBus(GuardedServos[BusLink]):
         Before torque goes on, goals are set to rest: no PWM, no speed, or the present position. The servos' bus
         watchdogs are cleared before torque goes on and armed afterwards. The guardian watches from before torque goes
         on until it is off.
-
-        Args:
-            on: Whether to switch it on.
 
         Raises:
             SafetyStop: `make_safe` or `close` was called before, or the guardian has taken over.
@@ -148,13 +141,7 @@ class ServoBus(GuardedServos[BusLink]):
         return self.link.read(servo_id, register)
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
-        """Write a register and wait for the servo to confirm it.
-
-        Args:
-            servo_id: The servo.
-            register: The register.
-            value: In counts.
-        """
+        """Write a register and wait for the servo to confirm it."""
         return self.link.write(servo_id, register, value)
 
     def check(self) -> None:

@@ -14,11 +14,6 @@ from sim2real.hardware.dynamixel.drive import Drive
 class DynamixelServos(ServoBus, Device):
     """DYNAMIXEL X servos on one port, commanded in the unit of their drive.
 
-    Args:
-        config: Port and limits of the bus.
-        ids: The servos' ids.
-        drive: What they are driven with.
-
     Raises:
         UsageError: The drive is made for another number of servos.
     """
@@ -78,9 +73,6 @@ def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silen
     """Return servos on a port, not opened yet; what the name ``dynamixel`` stands for.
 
     Args:
-        port: Device file of the port.
-        ids: The servos' ids.
-        drive: What they are driven with.
         baud_rate: Bits per second.
         silence_s: Longest time without an instruction while torque is on [s].
     """

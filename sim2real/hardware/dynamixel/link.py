@@ -58,7 +58,6 @@ class BusLink(ServoLink):
         """Raise the error that an answer reports: SafetyStop if the servo has stopped itself.
 
         Args:
-            answer: An answer with an error.
             what: Description of the instruction, for errors.
         """
         servo_id, error = answer.servo_id, answer.error

@@ -71,13 +71,7 @@ class Protocol2(PacketFormat):
         return packet + crc16(packet).to_bytes(2, "little")
 
     def build_status(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-        """Return the bytes of a status packet; see `PacketFormat.build_status`.
-
-        Args:
-            servo_id: The sender.
-            error: Error byte.
-            parameters: Bytes after it.
-        """
+        """Return the bytes of a status packet; see `PacketFormat.build_status`."""
         return self.build(servo_id, Instruction.STATUS, bytes((error,)) + parameters)
 
     def following(self, prefix: bytearray) -> int | None:

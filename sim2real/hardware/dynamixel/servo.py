@@ -22,8 +22,6 @@ class EmulatedServo(ServoFirmware):
     """Registers and firmware of one DYNAMIXEL X servo, without time, bus and physics.
 
     Args:
-        servo_id: Its id on the bus.
-        model_number: Its model number.
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
         encoder_counts: Resolution of the encoder [counts per revolution].
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.

@@ -31,7 +31,6 @@ class EmbeddedRobot:
 
     Args:
         plant: `package.module:Name` or `path/to/file.py:Name`; see `load_plant`.
-        config: Behaviour of bus and servos.
         plant_args: Keyword arguments for the plant: JSON-able.
         truth_path: The truth file; None: a temporary file, deleted by `stop`.
 

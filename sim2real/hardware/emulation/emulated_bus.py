@@ -106,9 +106,6 @@ class PlannedBus(ABC):
     `actuate`, `configure` and `reply`.
 
     Args:
-        plant: The mechanism.
-        config: Behaviour of bus and servos.
-        truth: Log of true states and latencies.
         send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
         start_ns: Time 0 of the plant.
         now_ns: Clock by which lateness is measured.
@@ -247,8 +244,6 @@ class PlannedBus(ABC):
 
         Args:
             servo_id: The servo that answers.
-            request: What it answers.
-            answer: The bytes.
             return_delay_s: How long the servo waits before it answers [s].
             sample: What it has measured, if it answers with present values.
         """
@@ -313,8 +308,6 @@ class BusEmulation(Emulation):
         """Return the emulated bus with these settings.
 
         Args:
-            plant: The mechanism.
-            truth: Log of true states and latencies.
             send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
             start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
         """
@@ -325,8 +318,6 @@ def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, An
     """Return the header of a truth file.
 
     Args:
-        plant: The mechanism.
-        config: Behaviour of bus and servos.
         start_ns: Time 0 of the plant [ns].
     """
     return {

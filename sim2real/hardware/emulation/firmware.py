@@ -13,8 +13,6 @@ class ServoFirmware(Firmware, ABC):
     """Registers of one servo, and the rules of its firmware, without time, bus and physics.
 
     Args:
-        servo_id: Its id on the bus.
-        model_number: Its model number.
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
         encoder_counts: Resolution of the encoder [counts per revolution].
 

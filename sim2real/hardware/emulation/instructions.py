@@ -22,9 +22,6 @@ class InstructedBus(PlannedBus, Generic[S, E]):
     """Emulated servos of one family on a bus, driving a plant; see `PlannedBus`.
 
     Args:
-        plant: The mechanism.
-        config: Behaviour of bus and servos.
-        truth: Log of true states and latencies.
         send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
         start_ns: Time 0 of the plant.
         now_ns: Clock by which lateness is measured.

@@ -18,7 +18,6 @@ class MountedPlant:
 
     Args:
         plant: The plant inside, as `load_plant` takes it.
-        plant_args: Its keyword arguments.
         joints: Fields of `Joint`, one row per servo, in the order of the plant's `servo_ids`.
         zero_rad: What an encoder reads, from count 0, where the device says 0 [rad]; the plant inside says so for a
             joint at 0.
@@ -48,7 +47,6 @@ class MountedPlant:
         """Command a servo; see `Plant.command`.
 
         Args:
-            servo_id: The servo.
             mode: One of `OperatingMode`.
             goal: Of the servo, not of its joint.
         """
@@ -65,7 +63,6 @@ class MountedPlant:
         """Set a servo's position controller, where the plant inside has one; see `ConfigurablePlant`.
 
         Args:
-            servo_id: The servo.
             p_gain: Position P Gain [counts].
             d_gain: Position D Gain [counts].
             profile_velocity_rad_s: Largest speed of the servo's setpoint [rad/s]; inf: no limit.

@@ -100,7 +100,6 @@ class TruthLog:
         """Buffer one row; `Kind` says what times and values mean.
 
         Args:
-            kind: Kind of the row.
             servo_id: The servo; 0 for the whole plant.
             t_host_ns: See `Kind` [ns].
             t_ns: See `Kind` [ns].

@@ -30,7 +30,6 @@ class TwinPlant:
     Args:
         mjcf: The model, with one position actuator per joint.
         joints: Name of each joint, in the order of the servos -> its name in the model.
-        servo_ids: The servos' ids.
         p_gain: Position P Gain to which the actuators' ``kp`` corresponds [counts].
         factors: Factors on the model's parameters: ``gain``, ``damping``, ``armature``, ``friction``; default: 1.
         step_s: MuJoCo's time step [s].
@@ -103,7 +102,6 @@ class TwinPlant:
         """Set a servo's goal.
 
         Args:
-            servo_id: The servo.
             mode: Position; any other mode counts as torque off.
             goal: Goal position [rad from the encoder's count 0].
         """
@@ -116,7 +114,6 @@ class TwinPlant:
         """Set a servo's position controller.
 
         Args:
-            servo_id: The servo.
             p_gain: Position P Gain [counts].
             d_gain: Not emulated; drives set it to 0.
             profile_velocity_rad_s: Largest speed of the setpoint [rad/s]; inf: no limit.

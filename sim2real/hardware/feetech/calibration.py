@@ -33,8 +33,6 @@ class CalibratedJoint:
     """A joint that a servo moves: angle = direction * gear * (count - zero_count) * (2 pi / 4096).
 
     Args:
-        name: The joint's name.
-        servo_id: The servo.
         zero_count: What the servo reads at the joint's zero [counts].
         direction: 1, or -1 if the joint's angle falls as the count rises.
         low_count: Lowest count that the joint may have.
@@ -91,7 +89,6 @@ def read_calibration(path: Path | str, travel_rad: Mapping[str, float] | None = 
     to count 0 while its range is recorded gets the range 0 to 4095, whatever its travel is.
 
     Args:
-        path: The file.
         travel_rad: Joint -> angle from stop to stop [rad]; a joint that is not in it may have any range, as one that
             turns freely.
 

@@ -36,7 +36,6 @@ class StsServos(GuardedServos[StsLink], Device):
     torque off, a process of its own that is started before torque goes on.
 
     Args:
-        bus: Port and limits of the bus.
         joints: The joints, each with the servo that moves it; `read_calibration` makes them of LeRobot's file.
         drive: How the servos follow a position; its joints do not matter here.
 
@@ -226,7 +225,6 @@ def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, si
     """Return servos on a port, not opened yet; what the name ``feetech`` stands for.
 
     Args:
-        port: Device file of the port.
         ids: The servos' ids, in the order of commands and measurements.
         drive: How they follow a position, and the joints that they move.
         baud_rate: Bits per second.

@@ -17,8 +17,6 @@ class StsDrive:
 
     Args:
         p_gain: P gain; LeRobot uses 16.
-        d_gain: D gain.
-        i_gain: I gain.
         speed_rad_s: Speed at which a servo's setpoint moves to its goal; inf: the setpoint is the goal.
         acceleration_rad_s2: How fast that speed may change, rounded to a multiple of 0.15 rad/s^2; inf: at once.
         torque: Largest fraction of the torque that a servo may use, in [0, 1].

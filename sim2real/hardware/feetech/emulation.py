@@ -59,7 +59,6 @@ class StsEmulation(BusEmulation):
     """Settings of emulated STS3215 servos on their bus; see `Emulation` for the others.
 
     Args:
-        model_number: The servos' model number.
         alarms: The alarms that they report from `overload_after_s` on; bits of the error byte.
         wrong_id: Probability that an answer says that it is another servo's.
         cut: Probability that an answer ends after its fourth byte.

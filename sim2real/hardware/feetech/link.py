@@ -30,7 +30,6 @@ class StsLink(ServoLink):
         """Raise SafetyStop, as the error byte holds alarms.
 
         Args:
-            answer: An answer with an error.
             what: Description of the instruction, for errors.
         """
         del what

@@ -68,7 +68,6 @@ class ProfiledPlant:
         """Command a servo; see `Plant.command`.
 
         Args:
-            servo_id: The servo.
             mode: As in `Plant.command`.
             goal: As in `Plant.command`.
         """
@@ -86,7 +85,6 @@ class ProfiledPlant:
         """Set a servo's position controller, and the top speed of its setpoint.
 
         Args:
-            servo_id: The servo.
             p_gain: P gain [counts].
             d_gain: D gain [counts].
             profile_velocity_rad_s: Top speed of the setpoint [rad/s].

@@ -27,8 +27,6 @@ class StsServo(ServoFirmware):
     torque that is left after an overload (Protective Torque), the step mode, other ids and baud rates.
 
     Args:
-        servo_id: Its id on the bus.
-        model_number: Its model number.
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
         encoder_counts: Resolution of the encoder [counts per revolution].
         goal_wakes: Whether writing a goal switches the torque on.

@@ -92,8 +92,6 @@ class GateCounts:
         stale: Calls with a command that was too old.
         cut: For each actuator, calls in which a limit changed its command.
         low: For each actuator, the lowest command that was returned.
-        high: The highest.
-        total: The sum of all.
     """
 
     passed: int = 0
@@ -117,9 +115,6 @@ class SafetyGate:
     """Clamps commands of one or several actuators, limits their rate of change, and replaces stale ones.
 
     Once it has raised SafetyStop, every later call raises it again, until `reset`.
-
-    Args:
-        config: The limits.
     """
 
     def __init__(self, config: GateConfig) -> None:

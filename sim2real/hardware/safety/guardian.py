@@ -39,7 +39,6 @@ class Guardian:
     continue (Linux), and it takes the torque off. It reports on stderr what it did.
 
     Args:
-        port_fd: File descriptor of the open port.
         off: The packet that takes the torque of all servos off.
         servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death

@@ -25,7 +25,6 @@ class Guard:
     """Decides when to take the torque off, and does it.
 
     Args:
-        port_fd: File descriptor of the open port.
         answer_s: How long a servo's answer may take [s].
         off: The packet that takes the torque of all servos off.
         servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
@@ -38,7 +37,6 @@ class Guard:
         """Wait until the control process says goodbye; act when it dies, or is silent for too long with torque on.
 
         Args:
-            link: File descriptor of the socket to the control process.
             silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
         """
         armed, tripped, heard_s = False, False, time.monotonic()

@@ -39,9 +39,6 @@ class Plausibility:
 
     Suspicious joints do not stop the robot; they are listed in ``suspects``.
 
-    Args:
-        config: The gate's limits.
-
     Attributes:
         suspects: Descriptions of what was suspicious since ``reset``.
     """

@@ -49,9 +49,7 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
     """Return the motion of a problem.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate.
-        late: Name of the measurements' delay.
     """
     data, table = problem.data, problem.table
     pick = _apart(problem)

@@ -66,10 +66,6 @@ class Hidden:
 
         The ends are where the distribution passes ``q`` less and more its error: a quantile within a gap of the
         distribution has no standard error of its own.
-
-        Args:
-            q: The share.
-            deviations: Half the interval's width in standard errors.
         """
         below = np.cumsum(self.share) - 0.5 * self.share
         error = self._error(np.array(_at(self._below(), below, q)))
@@ -157,7 +153,6 @@ def straight(
     a distribution, and climbs to one of many maxima of nearly the same height.
 
     Args:
-        seen: Errors at every delay.
         drift: About the drift [s/s].
         delay_s: The mean delay [s].
         deviation_s: The deviation of delays [s].
@@ -180,9 +175,7 @@ def rough(seen: Seen, x: np.ndarray, steps: int = 40) -> _At:
     """Return roughly where the likelihood is largest, by expectation and maximisation with a share for every delay.
 
     Args:
-        seen: Errors at every delay.
         x: Shape ``(P,)``: the unknowns there.
-        steps: How often either is done.
     """
     count, fields, size = seen.errors.shape
     move, share = np.zeros(seen.jacobian.shape[2]), np.full(size, 1.0 / size)

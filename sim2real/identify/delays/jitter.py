@@ -66,7 +66,6 @@ def late_commands(problem: Problem, z: np.ndarray, pick: np.ndarray, counts: np.
     """Simulate segments with one command after the other later than it was sent.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate.
         pick: Shape ``(E,)``: the segments, recording by recording; the first of them are taken.
         counts: Shape ``(E, C)``, bool: which measurements count.
@@ -99,9 +98,7 @@ def one_later(timeline: Timeline, given: Iterable[str], width: int, later_s: np.
     """Return copies of segments, ``width + 1`` of each, of which all but the last have a command that is later.
 
     Args:
-        timeline: Their recorded timing.
         given: Nodes that send commands.
-        width: Commands of a segment.
         later_s: Shape ``(copies,)``: filled with by how much [s]: less where the next one follows soon, 0 in bursts.
     """
     moved, copies = dict(timeline.vertices), np.arange(len(later_s))
@@ -141,7 +138,6 @@ def deviation(
         delays: Shape ``(N,)``: the measurements' delays, as far as they are known [s].
         deviation_s: About the deviation of their delays [s].
         noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
-        late: What late commands do.
     """
     late = [own for own in late if own.slopes.size]
     if not late:
@@ -182,7 +178,6 @@ class Variances:
         seen: What is seen, at the estimate.
         delays: Shape ``(N,)``: the measurements' delays, as far as they are known [s].
         noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
-        late: What late commands do.
     """
 
     def __init__(self, seen: Seen, delays: np.ndarray, noise: np.ndarray, late: Sequence[LateCommands]) -> None:

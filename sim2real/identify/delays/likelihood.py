@@ -53,7 +53,6 @@ class Likelihood:
     """The likelihood of all measurements, and each one's part in its gradient.
 
     Args:
-        seen: Errors at every delay.
         grid: Shape ``(K,)``: delays at equal distances that messages may have [s].
         drift: The drift of the clock [s/s].
     """
@@ -120,9 +119,7 @@ def maximise(likelihood: Likelihood, p: np.ndarray, steps: int = 40) -> np.ndarr
     ``trust-exact`` end differ by less than 0.01, L-BFGS stops up to 7.5 below.
 
     Args:
-        likelihood: The likelihood.
         p: Shape ``(size,)``: where to begin.
-        steps: Most steps.
     """
     value, gradient, _ = likelihood(p)
     damping = 1e-3
@@ -153,7 +150,6 @@ def covariance(likelihood: Likelihood, gradient: np.ndarray) -> np.ndarray:
     (Newey and West, Econometrica 55, 1987).
 
     Args:
-        likelihood: The likelihood.
         gradient: Shape ``(N, size)``: its rows' gradients at the largest one.
     """
     count = len(gradient)

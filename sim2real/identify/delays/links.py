@@ -75,7 +75,6 @@ def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
     """Return the links of a problem.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate of a fit, from which dynamics and delays are found anew together.
 
     Raises:
@@ -118,9 +117,6 @@ def describe(name: str, parts: tuple[str, ...], found: Found, held_s: float = 0.
     """Return what was found as numbers with intervals.
 
     Args:
-        name: The link.
-        parts: What its mean is the sum of.
-        found: Delays and losses.
         held_s: The sum of the other parts, at which they were held [s].
     """
     own = found.hidden

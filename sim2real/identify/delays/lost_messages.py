@@ -37,7 +37,6 @@ def losses(again: np.ndarray, chance: np.ndarray, rounds: int = 10) -> Losses:
     Args:
         again: Shape ``(N,)``, bool: whether a measurement has the value of the one before it.
         chance: Shape ``(N,)``: how probable that is for a message that came; looked at where ``again`` is true.
-        rounds: Rounds of expectation and maximisation.
     """
     # Transitions from a message that came or was lost (row) to one that came or was lost (column).
     move = np.array([[0.95, 0.05], [0.5, 0.5]])

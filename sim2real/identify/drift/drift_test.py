@@ -146,10 +146,8 @@ def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fi
     """Fit one change to a log, and say how sure its size is for a robot that did not change.
 
     Args:
-        problem: The log.
         mean: Shape ``(P,)``: what was identified, on the parameters' scales.
         root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
-        way: The change.
 
     Returns:
         The change; None where this log does not feel it, as a torque limit that no motion of it reached.
@@ -174,7 +172,6 @@ def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -
     """Return how far along a change the log is fitted best.
 
     Args:
-        problem: The log.
         point: Size of the change -> the unbounded vector ``(P,)``.
         unit: The size that goes from bound to bound.
     """
@@ -199,9 +196,7 @@ def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float
 
     Args:
         at: The log, with the change that fits it best.
-        way: The change.
         root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
-        variance: Of a residual.
 
     Returns:
         How much further it goes; the variance of its size by the log's residuals, and by what is open; how many
@@ -233,9 +228,7 @@ def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
     The right change needs little more; another one that imitates it needs much, and that costs.
 
     Args:
-        at: The point.
         root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
-        variance: Of a residual.
     """
     flat, rest = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
     # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
@@ -260,8 +253,6 @@ def weigh(found: Sequence[Fitted], loss: float, table: ParameterTable, posterior
     Args:
         found: What the log says about each change, the one that explains most first.
         loss: Of the log, without any change.
-        table: The parameters.
-        posterior: What was identified.
         seconds: Length of the log [s].
     """
     rows = []

@@ -42,10 +42,7 @@ def head(title: str, about: Sequence[tuple[str, str]], says: Sequence[str], impo
     """Return the first lines of a file.
 
     Args:
-        title: What it is.
-        about: Names and texts to keep with it.
         says: What a user has to know, a line each.
-        imports: Import statements.
     """
     facts = [f"{name}: {_plain(text)}" for name, text in about]
     return [f'"""{_plain(title)}', "", *facts, "", *says, '"""', "", *imports, ""]

@@ -21,10 +21,7 @@ def json_document(
     """Return the document.
 
     Args:
-        found: What was identified.
         terms: The robot in MuJoCo's terms; None where no MuJoCo model has it.
-        delays: Its delays.
-        about: Names and texts to keep with it.
     """
     mujoco = ("timestep_s", "joints", "bodies", "unexpressed")
     return {

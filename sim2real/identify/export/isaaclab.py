@@ -32,11 +32,6 @@ _SCALED = {"friction_distribution_params": "frictionloss", "armature_distributio
 def isaaclab_source(terms: Terms, title: str, about: Sequence[tuple[str, str]]) -> str:
     """Return a Python file with a dict ``ACTUATORS`` and a class ``IdentifiedEvents``.
 
-    Args:
-        terms: The robot.
-        title: What is exported.
-        about: Names and texts to keep with it.
-
     Raises:
         UsageError: When an actuator is told something else than a position.
     """

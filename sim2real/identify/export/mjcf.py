@@ -31,14 +31,7 @@ class Late:
 
 
 def late_mjcf(text: str, terms: Terms, late: Late, about: Sequence[tuple[str, str]]) -> str:
-    """Return a model with delays, profiles, sensors of its joints, and its intervals.
-
-    Args:
-        text: The model with what was identified.
-        terms: Its terms.
-        late: Its timing.
-        about: Names and texts to keep with it.
-    """
+    """Return a model with delays, profiles, sensors of its joints, and its intervals."""
     spec = _mj.MjSpec.from_string(text)
     step_s, delays = spec.option.timestep, terms.delays
     for actuator in spec.actuators:

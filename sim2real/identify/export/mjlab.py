@@ -26,11 +26,6 @@ _JOINT_FIELDS = {"damping": "joint_damping", "armature": "joint_armature", "fric
 def mjlab_source(terms: Terms, title: str, about: Sequence[tuple[str, str]]) -> str:
     """Return a Python file with a tuple ``ACTUATORS`` and a dict ``EVENTS``.
 
-    Args:
-        terms: The robot.
-        title: What is exported.
-        about: Names and texts to keep with it.
-
     Raises:
         UsageError: When an actuator is told something else than a position.
     """

@@ -87,10 +87,8 @@ def find_terms(
     """Return an identification in MuJoCo's terms.
 
     Args:
-        found: What was identified.
         mjcf: Parameters by name -> the robot's model with them.
         sides: Delay -> ``command`` or ``measurement``.
-        draws: How many robots are drawn from the posterior.
     """
     best = values_of(found)
     model = _mj.MjModel.from_xml_string(mjcf(best))
@@ -122,7 +120,6 @@ def find_delays(found: Identification, sides: Mapping[str, str]) -> Delays:
     """Return the delays that were identified.
 
     Args:
-        found: What was identified.
         sides: Delay -> ``command`` or ``measurement``.
     """
     delays = [p for p in found.parameters if p.kind == "delay"]

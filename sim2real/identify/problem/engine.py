@@ -47,8 +47,6 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
 
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.
-        nodes: The nodes.
-        given: Nodes whose outputs are recorded.
         jacobian: How derivatives are taken; only programs differentiate forward.
 
     Raises:
@@ -164,7 +162,6 @@ class CRollouts:
             moved: What ``step`` returned for the episode.
             tables: As in the graph's ``run``.
             given: As in the graph's ``run``.
-            record: The node.
         """
         world = self._world
         messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
@@ -180,7 +177,6 @@ class CRollouts:
             params: The nodes' parameters, as ``begin`` got them.
             tables: As in the graph's ``run``.
             given: As in the graph's ``run``.
-            record: The node.
         """
         inputs = self.inputs(gs, params, tables, given)
         dtype, count = jnp.result_type(float), inputs.controls.shape[0]

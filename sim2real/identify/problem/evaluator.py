@@ -33,8 +33,6 @@ class Evaluator(Protocol):
 
         Args:
             z: Shape ``(P,)``: the point.
-            data: What is fitted.
-            on_compile: Called around a compilation.
         """
         ...
 
@@ -43,8 +41,6 @@ class Evaluator(Protocol):
 
         Args:
             z: Shape ``(P,)``: the point.
-            data: What is fitted.
-            on_compile: Called around a compilation.
         """
         ...
 
@@ -63,7 +59,6 @@ class Evaluator(Protocol):
         Args:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``.
-            data: What is fitted.
         """
         ...
 
@@ -78,7 +73,6 @@ class Evaluator(Protocol):
             values: Parameters by name, ``(R, ...)``.
             eps: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: lengths of the first parts [s].
-            data: The recordings.
         """
         ...
 
@@ -88,17 +82,12 @@ class Evaluator(Protocol):
         Args:
             z: Shape ``(P,)``: initial states are linearised there.
             rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
-            data: What is fitted.
         """
         ...
 
 
 class CompiledEvaluator:
-    """Evaluates the residuals by programs that hold the rollouts.
-
-    Args:
-        residuals: The residuals.
-    """
+    """Evaluates the residuals by programs that hold the rollouts."""
 
     precision, fresh = 1e-6, True
 
@@ -160,7 +149,6 @@ def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
     """Return parameters by name at a point, with some values given; traceable.
 
     Args:
-        residuals: Has the table.
         z: Shape ``(P,)``: the point.
         row: Shape ``(P,)``: values that replace those at ``z``, where they are no NaN.
     """

@@ -32,12 +32,7 @@ _SEARCHED = 8
 
 
 class OutsideEvaluator:
-    """Evaluates residuals on C; an ``Evaluator``.
-
-    Args:
-        residuals: The residuals.
-        rollouts: C.
-    """
+    """Evaluates residuals on C; an ``Evaluator``."""
 
     def __init__(self, residuals: SegmentResiduals, rollouts: CRollouts) -> None:
         self._residuals, self._rollouts = residuals, rollouts
@@ -136,7 +131,6 @@ class OutsideEvaluator:
         Args:
             candidates: Shape ``(N, P)``.
             states: Their initial states, linearised before; None: they are not fitted.
-            data: What is fitted.
         """
         raw = self._raw(candidates, states, data)
         priors = self._priors(candidates)

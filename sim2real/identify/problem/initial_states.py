@@ -32,8 +32,6 @@ class InitialStates:
     """Fits the initial states of segments.
 
     Args:
-        residuals: The residuals.
-        errors: Rolls segments out.
         model: The ``MjModel``.
     """
 
@@ -49,7 +47,6 @@ class InitialStates:
         Args:
             z: Shape ``(P,)``: the parameters.
             values: The same by name, ``(1, ...)``.
-            data: What is fitted.
             again: Whether the derivatives are taken once more, at the states that were found.
         """
         for point, own, there, states in self._last:
@@ -87,8 +84,6 @@ class InitialStates:
             values: Parameters of each by name, ``(R, ...)``.
             eps: Shape ``(R,)``: the segments.
             fit_s: Shape ``(R,)``: length of the first part of each, to which its state is fitted [s].
-            data: The recordings.
-            steps: How many.
         """
         still = np.zeros((len(eps), self._n))
         slope, errors = self._slopes(values, eps, still, data)

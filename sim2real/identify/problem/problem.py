@@ -54,11 +54,7 @@ class Problem:
     """Segments of recordings, ready to be simulated for any parameters.
 
     Args:
-        model: The pipeline's model.
-        recordings: The logs.
-        spans: The segments.
         length_s: Their length [s].
-        config: How residuals are made.
         table: The parameters; default: the model's.
         moved: Changes the recorded timing of the segments before it is simulated.
         like: Another problem of the same model, table and configuration, whose programs this one shares.
@@ -171,7 +167,6 @@ class Problem:
         Args:
             z: Shape ``(P,)``: the parameters.
             data: What is fitted; default: all fitted segments.
-            on_compile: Called around a compilation.
         """
         found = self.evaluator.linearised(np.asarray(z), self.data if data is None else data, on_compile)
         count = len(self.train)
@@ -186,7 +181,6 @@ class Problem:
         Args:
             z: Shape ``(P,)``: the parameters.
             data: What is fitted; default: all fitted segments.
-            on_compile: Called around a compilation.
         """
         return self.evaluator.loss(np.asarray(z), self.data if data is None else data, on_compile)
 
@@ -232,9 +226,7 @@ class Problem:
         """Return the same recordings cut into other segments; it shares the programs.
 
         Args:
-            spans: The segments.
             length_s: Their length [s].
-            moved: Changes their recorded timing.
         """
         return Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
 

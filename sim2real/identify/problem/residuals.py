@@ -69,13 +69,6 @@ class LinearisedSegments(NamedTuple):
 class SegmentResiduals:
     """The residuals of a model, for any data of one robot.
 
-    Args:
-        model: The model.
-        nodes: Its nodes.
-        table: The parameters.
-        config: How residuals are made.
-        engine: What rolls a segment out.
-
     Attributes:
         prior: Shape ``(2 * channels,)``: how far an initial state may be from its estimate. Wide: a narrow prior would
             seem to tell the delays apart, by nothing but the bias of that estimate.
@@ -127,10 +120,7 @@ class SegmentResiduals:
         """Return the sensor's predictions of a segment, leaves ``(K, ...)``.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
-            data: The recordings.
         """
         own, start = self._started(values, eps, shift, data)
         tables, given = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.given))
@@ -164,10 +154,7 @@ class SegmentResiduals:
         """Return the inputs with which C simulates a segment.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
-            data: The recordings.
         """
         params, gs, tables, given = self._begun(values, eps, shift, data)
         return self.outside.inputs(gs, params, tables, given)
@@ -176,11 +163,8 @@ class SegmentResiduals:
         """Return ``residuals`` of a segment that C simulated.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
             moved: What ``CRollouts.step`` returned for it.
-            data: The recordings.
         """
         _, gs, tables, given = self._begun(values, eps, shift, data)
         return self._compared(self.outside.outputs(gs, moved, tables, given, self.model.sensor), eps, data)
@@ -191,10 +175,7 @@ class SegmentResiduals:
         It is 0 where nothing is compared: where ``data.ts`` is -1.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
-            data: The recordings.
         """
         return self._compared(self.simulate(values, eps, shift, data), eps, data)
 
@@ -211,11 +192,7 @@ class SegmentResiduals:
         """Fit a segment's initial state by Gauss-Newton steps.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
-            data: The recordings.
             fit_s: Length of the segment's first part, to which the state is fitted [s]; default: the whole segment.
-            points: At how many points the residuals are linearised.
 
         Returns:
             The best of these points.
@@ -245,10 +222,7 @@ class SegmentResiduals:
         """Return a segment's residuals ``(K, F)`` at the best initial state near its estimate.
 
         Args:
-            values: Parameters.
-            eps: The segment.
             state: What ``initial_state`` returned at these parameters, or at some close by; None: it is not fitted.
-            data: The recordings.
         """
         if state is None:
             return self.residuals(values, eps, jnp.zeros(len(self.prior)), data)
@@ -260,10 +234,7 @@ class SegmentResiduals:
         """Return the residuals ``(K, F)`` of a segment whose initial state is fitted to its first part.
 
         Args:
-            values: Parameters by name.
-            eps: Number of the segment.
             fit_s: Length of that part [s].
-            data: The recordings.
         """
         if self.config.initial_state != "free":
             return self.residuals(values, eps, jnp.zeros(len(self.prior)), data)
@@ -274,7 +245,6 @@ class SegmentResiduals:
 
         Args:
             z: Shape ``(P,)``: the parameters.
-            data: The recordings.
             pick: Shape ``(B,)``: numbers of the segments.
         """
         if self.config.initial_state != "free":
@@ -291,7 +261,6 @@ class SegmentResiduals:
         Args:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``: the middle of the generation.
-            data: The recordings.
             pick: Shape ``(B,)``: places in ``data.fitted`` of the segments to take; default: all.
         """
         pick = jnp.arange(len(data.fitted)) if pick is None else pick
@@ -322,9 +291,7 @@ class SegmentResiduals:
         """Return the initial state ``(2 * channels,)`` as measured around the start.
 
         Args:
-            eps: Number of the segment.
             delay_s: How late samples come [s].
-            data: The recordings.
         """
         c = data.starts[eps]  # (channels, 4): a cubic in time
         if self.config.initial_state == "rest":

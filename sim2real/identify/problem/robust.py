@@ -17,7 +17,6 @@ def tamed(residual: Any, loss: Loss, reach: float, xp: Any = jnp) -> Any:
 
     Args:
         residual: Any shape, in deviations.
-        loss: The kind.
         reach: Above this the loss grows more slowly than the square, in deviations.
         xp: ``jax.numpy`` or ``numpy``.
     """

@@ -97,11 +97,7 @@ def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters:
     """Return segments as an argument of compiled programs.
 
     Args:
-        cuts: The segments.
-        tables: Their timing.
         from_s: Measurements before this time are not compared [s from the segment's start].
-        fields: How many numbers are compared of each measurement.
-        parameters: How many free parameters there are.
     """
     segments = len(cuts.spans)
     fitted = np.flatnonzero([s.fitted for s in cuts.spans])
@@ -141,8 +137,6 @@ def cut(
 
     Args:
         model: Says which nodes and fields matter.
-        nodes: Its nodes.
-        recordings: The logs.
         spans: Which parts, recording by recording.
         length_s: Length of each [s].
         lead_s: Commands of this long before a segment are kept, because they still act in it [s].
@@ -262,8 +256,6 @@ def beyond(
 
     Args:
         model: Says which nodes and fields matter.
-        recordings: The logs.
-        spans: Fitted and held-out segments.
         length_s: Their length [s].
         share: Only what goes beyond by more than this share of the fitted range is reported.
     """

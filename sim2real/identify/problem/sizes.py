@@ -18,7 +18,6 @@ def rounded(count: int, steps: int = 4) -> int:
 
     Args:
         count: At least 1.
-        steps: A power of two.
     """
     if count <= max(_EXACT, steps):
         return count
@@ -30,9 +29,7 @@ def padded(tree: Any, size: int, axis: int = 0) -> Any:
     """Return arrays that repeat their last entry along an axis until they have a size.
 
     Args:
-        tree: Arrays of the same length along the axis.
         size: That length or more.
-        axis: The axis.
     """
 
     def one(leaf: np.ndarray) -> np.ndarray:

@@ -83,13 +83,10 @@ def refine(
     """Descend from each start, and from the best end to the minimum.
 
     Args:
-        problem: The residuals.
         starts: Shape ``(K, P)``.
         data: What is fitted; default: all fitted segments.
         coarse: Whether the first descents do: to compare with a model by percents.
         settle: Whether the end is tested, and points around it tried where it is no minimum.
-        on_step: Called after every evaluation.
-        on_compile: Called around a compilation.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
@@ -129,7 +126,6 @@ def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> floa
     there. The delays' common shift, which a log does not determine, does not count.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the point.
         data: What is fitted; default: all fitted segments.
     """
@@ -146,12 +142,6 @@ def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> floa
 
 class _Descent:
     """Descends on one problem and data.
-
-    Args:
-        problem: The residuals.
-        data: What is fitted.
-        on_step: Called after every evaluation.
-        on_compile: Called around a compilation.
 
     Attributes:
         shift: Shape ``(P,)``: the delays' common shift, which a log does not determine; zeros where initial states are
@@ -180,7 +170,6 @@ class _Descent:
 
         Args:
             z: Shape ``(P,)``: the point.
-            gain: The share.
             pin: How stiffly the delays' common shift is held in the middle, see ``_PIN``.
         """
         z = np.asarray(z, np.float64)

@@ -79,13 +79,11 @@ def search(
     Args:
         losses: See ``Losses``.
         start: Shape ``(P,)``: middle of the first generation.
-        config: How to search.
         data: What ``losses`` gets.
         weight: Shape ``(S,)``: batches are drawn from the segments with a weight above 0; None without batches.
         on_generations: Called with the number of generations done since the last call, and the best loss and candidate
             of this run so far.
         programs: Compiled programs of earlier calls with the same losses; those of this one are added.
-        on_compile: Called around each compilation.
         alone: Loss of one candidate on all segments, where there is a program for it; default: that of ``losses``.
         host: Whether ``losses`` are ``HostLosses``; these need ``alone``.
 

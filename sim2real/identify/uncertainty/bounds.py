@@ -16,7 +16,6 @@ def is_physical(p: Parameter, upper: bool) -> bool:
 
     Args:
         p: The parameter, with its bounds.
-        upper: Whether the upper one is meant.
     """
     return not upper and p.low == 0.0 and not p.narrowed and (p.kind == "delay" or p.transform == "linear")
 
@@ -26,7 +25,6 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
 
     Args:
         p: The parameter, with its bounds.
-        upper: Whether it lies at the upper one.
         max_delay_s: For which delays the model is made [s].
     """
     if p.kind == "delay":
@@ -45,7 +43,6 @@ def way_out_of(trip: RoundTrip, parameters: dict[str, Parameter], max_delay_s: f
     """Return flags for a round-trip delay that lies at a bound.
 
     Args:
-        trip: The sum of the delays.
         parameters: Name -> parameter, with its bounds.
         max_delay_s: For which delays the model is made [s].
     """

@@ -29,9 +29,6 @@ def posterior(found: Fit, at: Linearised, spread: Uncertainty, every: Fit, choic
     """Return the estimate with its uncertainty, and the models that explain the recordings as well.
 
     Args:
-        found: The estimate.
-        at: Its residuals.
-        spread: Its uncertainty.
         every: The estimate with all optional terms, from which the estimate's were chosen.
         choice: What was chosen; None: nothing was to be chosen.
     """
@@ -115,13 +112,7 @@ def _models(every: Fit, found: Fit, spread: Uncertainty, choice: Selection) -> l
 
 
 def _possible(posterior: Posterior, table: ParameterTable, spread: Uncertainty) -> Posterior:
-    """Return a posterior without those values of limits that the recordings rule out.
-
-    Args:
-        posterior: Of some of the parameters.
-        table: Those of the estimate.
-        spread: Its uncertainty.
-    """
+    """Return a posterior without those values of limits that the recordings rule out."""
     low = posterior.low.copy()
     for name, column, verdict, bound in zip(table.names, table.columns, spread.verdict, spread.low, strict=True):
         if verdict == NOT_REACHED and name in posterior.names:
@@ -135,9 +126,6 @@ def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTabl
 
     Args:
         covariance: Shape ``(Q, Q)``, linearised.
-        table: Its parameters.
-        known: Those of the estimate.
-        spread: The estimate's uncertainty.
     """
     deviation, usual = np.sqrt(np.diag(covariance)), float(np.median(spread.widening))
     factor = np.full(len(deviation), usual)

@@ -60,8 +60,6 @@ def from_linearised(problem: Problem, at: Linearised, without: Collection[str] =
     """Judge a linearised point.
 
     Args:
-        problem: The residuals.
-        at: The point.
         without: Names of parameters that may be absent: whether the data determines them does not count.
     """
     table = problem.table

@@ -43,11 +43,7 @@ def negligible(
     Others' intervals grow by how far they move when such a parameter is at its bound.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate.
-        at: The residuals there.
-        spread: Its uncertainty.
-        check: What the data determines there.
     """
     table = problem.table
     open_names = {n for group in check.undetermined for n in group}
@@ -73,7 +69,6 @@ def indifferent(p: Parameter, bound: float) -> float:
     """Return the value of a limit that is not reached: any is as good, so the data sheet's, or the nearest there is.
 
     Args:
-        p: The limit.
         bound: What it is at least.
     """
     return min(max(p.nominal, bound), p.high)

@@ -59,11 +59,6 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
     other parameters. Predictions of draws that are as much wider spread as far as slow residuals lie off, on average.
     White noise of the measurement is left out, and so is the share of either delay in their sum, which no log tells.
     Where there is nothing else, the factor is 1.
-
-    Args:
-        table: The parameters.
-        at: Residuals and Jacobian at the estimate.
-        spread: Its uncertainty.
     """
     raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
     inside = raw != 0.0

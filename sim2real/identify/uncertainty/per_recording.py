@@ -18,9 +18,6 @@ def identify_each(found: Fit) -> list[tuple[Mapping[str, Any], Uncertainty]]:
     """Return what each recording says by itself, with its uncertainty, in order.
 
     A descent from where the others led stays in their optimum: what differs is the robot, not which optimum was found.
-
-    Args:
-        found: The estimate of all.
     """
     problem, table = found.problem, found.problem.table
     of = problem.recording[problem.train]

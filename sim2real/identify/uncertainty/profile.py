@@ -57,11 +57,7 @@ def profile(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty
     """Return how much worse the model is for values of a parameter, from where it has no effect on.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate.
-        at: The residuals there.
-        spread: Its uncertainty.
-        column: Number of the parameter.
     """
     p = problem.table.columns[column].parameter
 
@@ -86,10 +82,7 @@ def worse_with(
     """Return how much worse the model is with some values given, ``(G,)``; how all others move, ``(G, P)``; residuals.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the estimate.
-        at: The residuals there.
-        spread: Its uncertainty.
         rows: Shape ``(G, P)``: values; NaN: the estimate, from which the parameter is fitted anew.
         held: Numbers of those that are not fitted anew in any row.
     """

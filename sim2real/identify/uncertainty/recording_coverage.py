@@ -122,7 +122,6 @@ def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
 
     Args:
         velocity: Shape ``(N,)``.
-        sigma: Deviation of a measured velocity.
     """
     velocity = np.asarray(velocity, np.float64)
     # A rare spike must not make everything else count as standing still.

@@ -61,9 +61,7 @@ def round_trip(table: ParameterTable, x: np.ndarray, spread: Uncertainty) -> Rou
     """Return the sum of all delays; None where none is identified.
 
     Args:
-        table: The parameters.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
-        spread: Its uncertainty.
     """
     free = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
     if not free:

@@ -105,7 +105,6 @@ def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Line
     little inside, and the residuals carried on to the estimate along the Jacobian.
 
     Args:
-        problem: The residuals.
         z: Shape ``(P,)``: the point.
         data: What is fitted; default: all fitted segments.
     """
@@ -208,8 +207,6 @@ def between_parts(
     nothing about a parameter of which a single part says more than all others together: such intervals stay.
 
     Args:
-        spread: The uncertainty without it.
-        table: The parameters.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         moved: Shape ``(K, P)``: estimates without each part, on the scales.
         share: Shape ``(K, P)``: which share of the information about each parameter a part holds.
@@ -228,8 +225,6 @@ def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np
     """Return intervals that are wider by a factor each.
 
     Args:
-        spread: The uncertainty without it.
-        table: The parameters.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         factor: Shape ``(P,)``: on standard errors and on the reach of intervals.
     """
@@ -286,7 +281,6 @@ def shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tupl
     """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift.
 
     Args:
-        table: The parameters.
         x: Shape ``(P,)``: the point, on their scales.
         shift: Shape ``(P,)``: what ``time_shift`` returns.
     """

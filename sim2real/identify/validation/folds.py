@@ -78,10 +78,8 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: in
     """Return what to leave out: each recording once, or blocks of equal length where there are too few recordings.
 
     Args:
-        problem: Its fitted segments are divided.
         blocks: How many blocks, of all recordings together.
         names: What recordings of one name are left out together are called; default: each goes by itself.
-        least: With fewer recordings each is divided into blocks.
 
     Raises:
         UsageError: When there is too little to leave a part out.
@@ -125,7 +123,6 @@ def leave_out(
     """Identify without each part, from the estimate of all, and predict it.
 
     Args:
-        found: The estimate of all.
         parts: What is left out, one at a time.
         settle_s: First part of what is predicted, to which its initial state is fitted [s].
         choose: Whether the data that is left chooses the optional terms of the model; else all are kept.
@@ -189,10 +186,6 @@ def _descend(
     Never from the estimate of all: a refinement that finds nothing better would return what saw this part.
 
     Args:
-        found: The estimate of all.
-        parts: The parts.
-        stats: Their loss around it.
-        k: Number of the part.
         kept: Shape ``(T,)``, bool: which terms are part of the model.
         smaller: Shape ``(P,)``: the estimate with fewer terms without the same part, from which to begin as well.
         coarse: Whether the descent ends where it gains little: sets are compared by percents.
@@ -285,7 +278,6 @@ def moving(problem: Problem, segments: np.ndarray) -> list[bool]:
     """Return of each column of the residuals whether its joint moves in one of some segments.
 
     Args:
-        problem: The recordings.
         segments: Shape ``(S,)``: numbers of segments.
     """
     there, column, found = problem.ts[segments] >= 0.0, 0, list[bool]()

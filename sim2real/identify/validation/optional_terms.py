@@ -49,7 +49,6 @@ class Statistics:
         """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
 
         Args:
-            table: The parameters.
             kept: Shape ``(T,)``, bool: which terms are part of the model.
             left_out: Number of the part that is left out; None: none is.
             bounded: Whether parameters that would leave their bounds stop there, and the others go where that is best.
@@ -121,7 +120,6 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
     """Return the loss of parts of the recordings around a point.
 
     Args:
-        problem: The residuals.
         at: The point; of fitted segments only.
         parts: Shape ``(K, S)``, bool: which fitted segments belong to each part.
     """
@@ -207,8 +205,6 @@ def narrowed(choice: Selection, table: ParameterTable, scores: np.ndarray, error
     far from it, they are wrong: on a linear axis they made a set of two terms out of one that was ten times better.
 
     Args:
-        choice: What they chose.
-        table: The parameters.
         scores: Shape ``(M, K)``: mean squares on each part, of the sets of ``below``, the smallest first.
         errors: Shape ``(M, E)``: root mean square errors of each set, of any kinds.
     """

@@ -22,8 +22,6 @@ def samples(
     """Simulate all segments with each model; initial states of held-out segments are fitted to their first part alone.
 
     Args:
-        problem: The segments.
-        models: Values of all parameters by model.
         settle_s: Length of that first part [s].
         held_out: Shape ``(S,)``, bool: which segments count as held out; default: those that are not fitted.
 
@@ -101,9 +99,7 @@ def errors(
     joint is where it was told to be).
 
     Args:
-        problem: The segments.
         columns: What ``samples`` returned.
-        models: Names of the models.
         settle_s: First part of held-out segments, to which initial states were fitted: horizons begin at its end [s].
         horizons: How far ahead [s].
     """
@@ -134,7 +130,6 @@ def free_runs(
 
     Args:
         columns: What ``samples`` returned, of long segments.
-        names: The fields.
         models: Names of the models; the baselines are added.
         settle_s: First part of a segment, which does not count [s].
     """

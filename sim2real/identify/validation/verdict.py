@@ -117,7 +117,6 @@ def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> l
 
     Args:
         prediction: What ``prediction.errors`` returned.
-        positions: What is judged.
     """
     columns = [p.column for p in positions]
     held_out = [row for row in prediction if row.held_out and any(row.rmse.get(c) is not None for c in columns)]
@@ -151,11 +150,7 @@ def judge(
 
     Args:
         found: How far each position is off, the worst first.
-        table: The parameters.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
-        spread: Its uncertainty.
-        check: What the data determines at the estimate.
-        trip: The sum of the delays.
         max_delay_s: For which delays the model is made [s].
         beyond: Where held-out data goes beyond what was fitted: sentences.
         left: Length of the next step of a fit that did not converge [standard errors]; None: it converged.

@@ -86,11 +86,7 @@ class Following:
         return means - self.turn * np.round(means / self.turn) if self.turn else means
 
     def by_level(self, scale: float = 1.0) -> Following:
-        """Return the same with signs by the means, where correlations leave them open and means do not.
-
-        Args:
-            scale: From the commands' unit to the measurements'.
-        """
+        """Return the same with signs by the means, where correlations leave them open and means do not."""
         (own, _), (mean, level) = self.spread, self.mean
         near, far = (
             np.abs(self._apart(mean[:, None] - sign * scale * level)) / (own[:, None] + 1e-30) for sign in (1.0, -1.0)
@@ -219,7 +215,6 @@ def _peaks(
     """Return the highest place of each range of lags that are alike, in order; none where an end is the highest.
 
     Args:
-        alike: Correlation at each lag.
         measured: Shape ``(rows,)``.
         command: Shape ``(rows,)``.
         equal: How much higher the misfit of a peak may be that is as high as another.

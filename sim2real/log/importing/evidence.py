@@ -24,10 +24,6 @@ def order(found: Following, scale: float = 1.0) -> np.ndarray:
     """Return the command of each measured column, ``(M,)``, so that together they are closest.
 
     What is as close in the given order keeps it: commands that are alike cannot be told apart, and need not be.
-
-    Args:
-        found: Of as many commands as measurements.
-        scale: From the commands' unit to the measurements'.
     """
     # What moves belongs to what moves; of what rests, nothing is known.
     rests = np.equal.outer(*(~found.moved.any(axis=axis) for axis in (1, 0)))
@@ -48,7 +44,6 @@ def open_pairs(found: Following, scale: float = 1.0) -> list[tuple[int, int]]:
 
     Args:
         found: Of as many commands as measurements, in the order that was found.
-        scale: From the commands' unit to the measurements'.
     """
     found = found.by_level(scale)
     distance, lag = found.distance(scale), found.lag_s

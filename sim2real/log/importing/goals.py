@@ -29,8 +29,6 @@ def follows(found: Following, command: Signal, path: str) -> bool:
     """Return whether positions follow a command whose name does not say what it commands.
 
     Args:
-        found: How positions follow it.
-        command: The command.
         path: The file, for errors.
 
     Raises:
@@ -56,10 +54,6 @@ def goal(
     """Return goals in the order of the joints, their scales, and what to say of them.
 
     Args:
-        measured: Positions.
-        command: Goals.
-        found: How each position follows each goal.
-        to_rad: Units of the positions in a radian.
         path: The file, for errors.
         as_told: Keep order and signs as they are where the data leaves them open.
 
@@ -182,11 +176,9 @@ def refuse_copies(measured: Signal, command: Signal, copies: np.ndarray, path: s
     """Return a warning of commands that are the measurements.
 
     Args:
-        measured: Positions.
         command: Goals, in the order of the joints.
         copies: Which commands are copies, ``(joints,)``.
         path: The file, for errors.
-        as_told: Only warn.
 
     Raises:
         UsageError: When there are any: nothing can be identified from them.

@@ -61,7 +61,6 @@ def import_file(
     ``versions``.
 
     Args:
-        path: The file.
         mapping: The mapping from signals to fields, or the mapping file.
         samples: The samples to take, for every node; None: all.
         format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; None: chosen by the file's suffix.
@@ -80,7 +79,6 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
 
     Args:
         file: The file, or several that were joined.
-        mapping: The mapping.
         samples: The samples to take; None: all.
     """
     signals = {name: _signals(file, name, node) for name, node in mapping.nodes.items()}

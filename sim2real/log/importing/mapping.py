@@ -103,7 +103,6 @@ class ImportMapping:
         """Return the mapping of a parsed TOML document.
 
         Args:
-            tables: The document.
             pipeline: The pipeline that the log is for; None: the one that the document names.
             path: The file that the document was read from, for errors.
 
@@ -273,7 +272,6 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
     """Return a mapping as the text of a mapping file.
 
     Args:
-        mapping: The mapping.
         comments: Lines that stand above it.
     """
     lines = [

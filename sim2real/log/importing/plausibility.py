@@ -71,7 +71,6 @@ def glitches(t_s: np.ndarray, angle: np.ndarray, radian: float = 1.0) -> np.ndar
     Args:
         t_s: Shape ``(N,)``, increasing [s].
         angle: Shape ``(N, columns)``, finite, with turns counted.
-        radian: Units of the angles in a radian.
     """
     found = np.zeros(angle.shape, bool)
     if len(angle) < _FEWEST:
@@ -101,7 +100,6 @@ def leap(t_s: np.ndarray, angle: np.ndarray, radian: float = 1.0) -> tuple[int, 
     Args:
         t_s: Shape ``(N,)``, increasing [s].
         angle: Shape ``(N, columns)``, finite, with turns counted.
-        radian: Units of the angles in a radian.
     """
     steps = np.abs(np.diff(angle, axis=0)) / radian
     far = steps > reach_rad(_FASTEST_RAD_S, np.diff(t_s))[:, None]

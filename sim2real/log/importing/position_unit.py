@@ -23,9 +23,7 @@ def told_units(
     """Return how many units of the positions a radian is by each signal that says so, and how.
 
     Args:
-        signals: All of the file.
         measured: Positions, in the order of the joints.
-        command: What was commanded.
         t_s: Stamps of both [s].
         rows: The samples of the positions that are whole.
     """

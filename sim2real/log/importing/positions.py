@@ -50,11 +50,7 @@ def checked_positions(
     """Return measured positions with their turns counted and without leaps.
 
     Args:
-        file: The file.
-        signals: All of the file.
         pair: Positions, in the order of the joints, and what was commanded.
-        stamps: Of both.
-        asked: What the user knows.
 
     Raises:
         UsageError: When the unit is not clear, or positions change by more than a joint can move.
@@ -155,10 +151,8 @@ def radian(
     """Return how many units a radian is, and how that is known.
 
     Args:
-        measured: Positions.
         q: Shape ``(N, joints)``: those rows of them that have numbers.
         t_s: Shape ``(N,)``: their stamps [s].
-        asked: What the user knows.
         path: The file, for errors.
         jumping: Units in a radian by whose turn the positions jump.
         others: Units in a radian by other signals, and how they say so.

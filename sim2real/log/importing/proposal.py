@@ -50,10 +50,6 @@ class Proposal:
 def propose(file: ForeignFile, asked: Asked) -> Proposal:
     """Return the mapping that names and data speak for.
 
-    Args:
-        file: The file.
-        asked: What the user knows.
-
     Raises:
         UsageError: When something is ambiguous: the candidates are named.
     """
@@ -135,15 +131,11 @@ def _commanded(
     """Return commands in the order of the joints, the field that they become, and what to say of them.
 
     Args:
-        pair: What was measured and what was commanded.
         command: The commands, with turns counted.
-        checked: The positions.
         turn: A turn in the unit of the commands, where turns are counted; else 0.
-        found: How positions follow commands.
         samples: Stamps [s] and rows that are compared, of positions and of commands.
         places: Which column is which joint.
         path: The file, for errors.
-        asked: What the user knows.
     """
     measured, (clocks, rows) = checked.signal, samples
     kind = pair.kind or (

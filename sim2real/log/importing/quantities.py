@@ -61,7 +61,6 @@ def matched(signal: Signal, measured: Signal, places: np.ndarray) -> Signal:
     """Return the columns of a signal that belong to the measured joints: by names where both have some, else by place.
 
     Args:
-        signal: The signal.
         measured: Positions, in the order of the joints.
         places: Which column is which joint, where names do not say so.
     """
@@ -82,9 +81,6 @@ def field_of(signal: Signal, unit: str, scales: Sequence[float], turn: float = 0
     """Return how a signal becomes a field of the log.
 
     Args:
-        signal: The signal.
-        unit: Unit of the field.
-        scales: Of each column.
         turn: A turn in the signal's unit, where turns are to be counted.
     """
     scale = float(scales[0]) if len(set(scales)) == 1 else tuple(scales)
@@ -108,10 +104,8 @@ def velocity_of(
     """Return the measured velocity, where it is that of the positions, what to say, and which samples lack numbers.
 
     Args:
-        signals: All of the file.
         measured: Positions, in the order of the joints.
         t_s: Their stamps ``(N,)`` [s].
-        to_rad: Units of the positions in a radian.
         places: Which column is which joint.
     """
     fitting = velocities(signals, measured)
@@ -158,12 +152,9 @@ def extras(
     """Return what else was commanded: gains, torque on or off, and what goes with a goal; all of it by name.
 
     Args:
-        signals: All of the file.
-        command: The commands.
         measured: Positions, in the order of the joints.
         places: Which column is which joint, where names do not say so.
         path: The file, for errors.
-        followed: Whether positions follow the commands.
 
     Raises:
         UsageError: When several signals may be the same quantity.

@@ -19,11 +19,8 @@ def kept_samples(
     """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep.
 
     Args:
-        node: Its mapping.
         signals: Field -> values, shape ``(N, ...)``, or ``()`` for a constant.
         stamps: Shape ``(N,)``; None without any.
-        first: The first sample to take.
-        stop: The one after the last.
     """
     kept = np.arange(first, stop)
     series = [v for v in (*signals.values(), stamps) if v is not None and v.ndim]
@@ -43,10 +40,8 @@ def plausible_samples(
 
     Args:
         where: The node and the file, for errors.
-        node: Its mapping.
         signals: Field -> values, shape ``(N, ...)``, unscaled.
         t_s: Stamps of the samples that are kept so far [s].
-        kept: Their numbers.
 
     Raises:
         UsageError: When positions leap away and back, and the mapping does not say to drop such samples; jump at the

@@ -128,8 +128,6 @@ def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rat
     """Return the stamps of the rows of a signal.
 
     Args:
-        signals: All of the file.
-        of: The signal.
         side: ``command`` or ``measured``: whose stamps are preferred.
         path: The file, for errors.
         rate_hz: What the user says the rate is [Hz].

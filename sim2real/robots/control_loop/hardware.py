@@ -57,7 +57,6 @@ class ServoSession:
     Args:
         port: What the device is connected to; may be ``embedded``.
         device: Returns the device on a port, not opened yet.
-        gate: The safety gate's limits.
         embedded: The emulated robot; None: there is none.
         truth_path: File for the emulated robot's true states and latencies.
         seed: Seed of the emulated robot's jitter and faults.
@@ -107,9 +106,7 @@ class ServoSensor(BaseNode):
     """Reads all servos in one transaction; the message's time stamp is when the read instruction was sent.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        rig: The servos.
         message: Makes the node's message from a reading.
         rest: The message of a robot at rest, which is the default output.
         **options: Options of ``BaseNode``.
@@ -145,12 +142,9 @@ class ServoActuator(BaseNode):
     """Sends the agent's commands through the safety gate; its output is the command that was sent.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        rig: The servos.
         field: Field of the agent's message that is the command, shape ``(servos,)``.
         message: Makes the node's message from the command that was sent.
-        agent: Name of the agent.
         **options: Options of ``BaseNode``.
     """
 
@@ -204,7 +198,6 @@ class Excitation(BaseNode):
     """Takes the agent's place during a recording: sends an excitation signal.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
         signal: Shape ``(N, servos)``: one command per step; after its end zeros are sent.
         message: Makes the node's message from a command.

@@ -58,7 +58,6 @@ class IdentifiableLoop:
     """Simulates what the sensor measures from recorded commands; an ``identify.model.IdentifiableModel``.
 
     Args:
-        robot: The robot.
         max_delay_s: Upper bound of each of the two delays [s].
     """
 
@@ -80,7 +79,6 @@ class IdentifiableLoop:
         """Return the nodes' parameters.
 
         Args:
-            values: Identified parameters by name.
             start: Shape ``(2 * channels,)``: initial positions, then velocities.
         """
         late = DelayParams(values["sensor_delay"] + self.ahead_s)

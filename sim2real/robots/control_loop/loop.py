@@ -43,7 +43,6 @@ def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict
     """Return what ``init_delays`` returns: the delay in a node's ``DelayParams``, if it has one.
 
     Args:
-        node: The node whose parameters have the delay.
         input_name: The input that it belongs to.
         graph_state: The graph's state, with the parameters; None: no delay.
 
@@ -59,7 +58,6 @@ def delay_parameters(max_delay_s: float, roles: Roles = ROLES) -> list[Parameter
 
     Args:
         max_delay_s: Upper bound of each delay [s].
-        roles: Names of sensor and actuator.
     """
     delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     about = "from motion to measurement's time stamp", "from command's departure to the motor"
@@ -143,11 +141,6 @@ def control_nodes(sensor: BaseNode, agent: BaseNode, actuator: BaseNode) -> dict
     sensor has no blocking input and keeps ``FREQUENCY``, so its samples are never old nor closer together than its
     period. Without overruns the two options are the same.
 
-    Args:
-        sensor: Measures.
-        agent: Decides.
-        actuator: Sends commands.
-
     Returns:
         The three nodes by name.
     """
@@ -167,10 +160,6 @@ def simulated_loop(
     """Connect the whole loop in simulation, for training and for comparison with hardware.
 
     Args:
-        sensor: Reads the world.
-        agent: Decides.
-        actuator: Sends commands to the world.
-        world: The robot and its environment.
         delays: What ``delay_bounds`` returns; None: no delays.
 
     Returns:
@@ -191,9 +180,6 @@ def recorded_loop(
     """Connect the nodes that identification simulates: recorded commands drive the world, the sensor measures it.
 
     Args:
-        sensor: Reads the world.
-        actuator: Stands for the recorded commands.
-        world: The robot and its environment.
         max_delay_s: Upper bound of the delays [s].
         ahead_s: How much later than recorded the sensor's steps are simulated [s].
         lead_s: Time that the world adds to the actuator's delay [s].
@@ -212,8 +198,6 @@ def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str,
     """Draw the parameters of one episode.
 
     Args:
-        key: JAX key.
-        values: Parameters by name.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn in place of the
             values.
 

@@ -90,7 +90,6 @@ class LoopRobot(Robot):
         """Return parameters of the nodes for a random episode of training: dynamics, delays, start, what it is about.
 
         Args:
-            key: JAX key.
             draw: Draws dynamics and delays: key -> values by name.
         """
 
@@ -145,7 +144,6 @@ class LoopRobot(Robot):
         """Return parameters of world, sensor and actuator for an episode that begins in the middle of a recording.
 
         Args:
-            values: Parameters by name.
             start: Shape ``(2 * channels,)``: positions, then velocities.
         """
 
@@ -155,19 +153,11 @@ class LoopRobot(Robot):
 
         Args:
             values: Parameters by name, with delays as a loop needs them.
-            policy: The policy.
-            trial: Number of the trial.
         """
 
     @abstractmethod
     def agent_params(self, session: ServoSession, policy: Any, trial: int) -> Any:
-        """Return the agent's parameters on hardware.
-
-        Args:
-            session: The open robot.
-            policy: The policy.
-            trial: Number of the trial.
-        """
+        """Return the agent's parameters on hardware."""
 
     @abstractmethod
     def make_device(self, port: str, silence_s: float) -> Device:
@@ -188,9 +178,7 @@ class LoopRobot(Robot):
 
         Args:
             port: Device file of the port, or ``embedded``.
-            limits: Limits of the safety gate.
             truth_path: File for the embedded robot's true states and latencies.
-            seed: Seed of the embedded robot.
         """
 
         def device(port: str) -> Device:
@@ -208,13 +196,7 @@ class LoopRobot(Robot):
     def deployment_nodes(
         self, session: ServoSession, policy: Runner, trial: int = 0
     ) -> tuple[dict[str, BaseNode], dict[str, Any]]:
-        """Return the graph on hardware that runs a policy, and the agent's parameters.
-
-        Args:
-            session: The open robot.
-            policy: What runs the policy.
-            trial: Number of the trial.
-        """
+        """Return the graph on hardware that runs a policy, and the agent's parameters."""
         params = {self.roles.supervisor: in_numpy(self.agent_params(session, None, trial))}
         agent = PolicyNode(self.make_agent(delay=self.expected_delay_s[1]), policy)
         return self._on_hardware(session, agent), params
@@ -233,10 +215,8 @@ class LoopRobot(Robot):
         """Return the loop in simulation and the task.
 
         Args:
-            values: Parameters by name.
             draws: Samples of some parameters, each of shape ``(K,)``.
             computation: Node -> distribution of its computation delay.
-            delays: Whether the graph has delays.
         """
         roles, world = self.roles, self.make_world()
         spread_s = self.delay_spread_s
@@ -253,13 +233,7 @@ class LoopRobot(Robot):
         return nodes, LoopTask(self, agent, values, draws)
 
     def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
-        """Return node parameters of the loop in simulation, from rest.
-
-        Args:
-            values: Parameters by name.
-            policy: The policy.
-            trial: Number of the trial.
-        """
+        """Return node parameters of the loop in simulation, from rest."""
         return self.rest_params(in_a_loop(values, self.tick_s, self.delay_spread_s), policy, trial)
 
     def nominal(self) -> dict[str, float]:

@@ -20,7 +20,6 @@ class PolicyNode(BaseNode):
 
     Args:
         agent: The agent's node, with ``observe(step_state)`` and ``act(step_state, action)``; it is left unconnected.
-        runner: The policy.
     """
 
     jittable = False

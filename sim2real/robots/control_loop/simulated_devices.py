@@ -32,7 +32,6 @@ class SimSensor(BaseNode):
     """The encoders in simulation: passes on the world's message, with the delay in ``DelayParams``.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
         world: The world that it reads.
         **options: Options of ``BaseNode``.
@@ -128,12 +127,9 @@ class SimActuator(BaseNode):
     The default output is ``start`` of the agent's parameters, at which the joints are held, or zeros if they have none.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
-        joints: Number of joints.
         field: Field of the agent's message that is the command, shape ``(joints,)``.
         message: Makes the node's message from a command.
-        agent: Name of the agent.
         **options: Options of ``BaseNode``.
     """
 

@@ -45,7 +45,6 @@ class TrainableLoop(Protocol):
         """Return an episode's parameters with another start, see ``LoopRobot``.
 
         Args:
-            params: Parameters of the nodes.
             position: What is added to the joints' positions ``(joints,)`` [rad].
             velocity: What is added to their velocities ``(joints,)`` [rad/s].
         """
@@ -76,9 +75,7 @@ class LoopTask:
     """The training task of a robot in a loop; see ``sim2real.train.environment.graph_environment.TrainingTask``.
 
     Args:
-        robot: The robot.
         agent: The agent's node in the graph.
-        values: Parameters by name.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
             in place of the values.
 
@@ -133,7 +130,6 @@ class LoopTask:
         """Draw how far from the robot's own start an episode starts: positions and velocities, ``(joints,)`` each.
 
         Args:
-            key: JAX key.
             width: Share of the differences; None: all of them.
         """
         share = 1.0 if width is None else width

@@ -70,10 +70,8 @@ def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: boo
     named value, else at the keyframe, else at the model's zero.
 
     Args:
-        model: The compiled model of the file.
         recorded: The joints that were recorded.
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-        fix_base: Whether a floating base is held.
         path: The file, for messages.
 
     Raises:
@@ -110,7 +108,6 @@ def apply(spec: Any, model: Any, holding: Holding) -> None:
 
     Args:
         spec: ``mujoco.MjSpec`` whose elements have the compiled model's numbers; it is changed.
-        model: The compiled model of the file.
         holding: What ``plan`` returned.
     """
     held, dropped = {h.joint: h for h in holding.held}, holding.dropped

@@ -16,7 +16,6 @@ def find_packages(spec: Any, path: Path) -> list[str]:
 
     Args:
         spec: ``mujoco.MjSpec``; it is changed.
-        path: The model's file.
     """
     looked: list[str] = []
     for mesh in spec.meshes:

@@ -68,7 +68,6 @@ def driven(
         joints: The joints that were recorded.
         step_s: Time step [s].
         fix_base: Whether a floating base is held where the model has it.
-        contacts: Whether bodies touch.
         rubbing: Whether joints have dry friction, be it little: MJX leaves it out for good where the model has none.
         hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
 
@@ -109,9 +108,7 @@ def held_in(path: Path, model: Any, joints: Sequence[str], fix_base: bool, hold:
 
     Args:
         path: The file, for messages.
-        model: Its model.
         joints: The joints that were recorded.
-        fix_base: Whether a floating base is held.
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
 
     Raises:
@@ -147,7 +144,6 @@ def set_drives(spec: Any, drives: Mapping[str, JointDrive]) -> None:
 
     Args:
         spec: ``mujoco.MjSpec`` of the model; it is changed.
-        drives: By joint.
     """
     fixed, affine = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
     for joint, drive in drives.items():

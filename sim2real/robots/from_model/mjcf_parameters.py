@@ -201,9 +201,7 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
     """Return the parameters of a model.
 
     Args:
-        terms: By pattern.
         joints: The joints that were recorded.
-        model: The model with drives.
         own: The model as it is in the file, for nominal values.
 
     Raises:
@@ -247,7 +245,6 @@ def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[Pa
     Terms are chosen with ``--terms``; without, they are 0.
 
     Args:
-        terms: What there is.
         wanted: ``auto``, ``all``, or names with commas between, which are offered beside those of ``auto``. Of a term
             that ``auto`` leaves out, parameters that were named are offered without its others.
 
@@ -281,7 +278,6 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
 
     Args:
         placed: What ``expand`` returned.
-        values: Parameters by name.
         base: ``DriveParams`` with nominal values.
         joints: Shape ``(joints,)``: their numbers in the model.
         dofs: Shape ``(joints,)``: where the model's arrays have each joint.
@@ -320,7 +316,6 @@ def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) ->
 
     Args:
         placed: What ``expand`` returned.
-        values: Parameters by name.
         gravity: As the model has it, ``(3,)`` [m/s^2].
     """
     angle = {p.what: values[p.parameter.name] for p in placed if p.what in TILT}

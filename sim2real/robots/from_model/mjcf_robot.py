@@ -150,10 +150,7 @@ class Encoders(BaseNode):
     """Reads the joints of a ``DrivenWorld``.
 
     Args:
-        name: Unique in the graph.
         rate: Samples per second [Hz].
-        world: The world.
-        velocity: Whether velocities are measured.
     """
 
     def __init__(self, name: str, rate: float, world: DrivenWorld, velocity: bool) -> None:
@@ -332,7 +329,6 @@ class IdentifiableMjcf(IdentifiableRecording):
     Encoders are read a tick later than recorded, and interpolate a tick back: nothing shifts.
 
     Args:
-        robot: The robot.
         max_delay_s: Upper bound of the delay [s].
     """
 
@@ -349,7 +345,6 @@ class IdentifiableMjcf(IdentifiableRecording):
         """Return node parameters.
 
         Args:
-            values: Parameters by name.
             start: Shape ``(2 * joints,)``: positions as measured, then velocities.
         """
         tree = self.parameters.placed(self._params, values)

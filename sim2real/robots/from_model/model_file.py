@@ -38,7 +38,6 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     A file that cannot be read is left out where only contacts or pictures need it.
 
     Args:
-        path: The file.
         contacts: Whether bodies touch, so that all meshes are needed.
 
     Raises:

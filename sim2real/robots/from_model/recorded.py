@@ -51,7 +51,6 @@ class LoggedRobot(RecordedRobot):
         """Return node parameters with an initial state; default: ``start`` of the world's parameters.
 
         Args:
-            params: Parameters of the nodes.
             start: Shape ``(2 * channels,)``: measured positions, then velocities.
         """
         world = self.roles.world
@@ -66,7 +65,6 @@ class IdentifiableRecording:
     """Simulates what the sensor measured from recorded commands; an ``identify.model.IdentifiableModel``.
 
     Args:
-        robot: The robot.
         max_delay_s: Upper bound of the delay [s].
     """
 
@@ -100,7 +98,6 @@ class IdentifiableRecording:
         """Return node parameters.
 
         Args:
-            values: Parameters by name.
             start: Shape ``(2 * channels,)``: initial positions, then velocities.
         """
         return self._robot.started(self.parameters.placed(self._params, values), start)

@@ -65,7 +65,6 @@ def decide(policy: Any, carry: Any, observation: Array) -> tuple[Any, Array]:
 
     Args:
         policy: See ``AgentParams``.
-        carry: What it carries into this step.
         observation: Shape ``(O,)``.
     """
     return policy.step(carry, observation) if hasattr(policy, "step") else (carry, policy.get_action(observation))
@@ -77,14 +76,11 @@ class GoalAgent(BaseNode):
     So the goals are continuous and of limited speed whatever the policy does, and exploration noise averages out.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
         low: Shape ``(joints,)``: lowest goals [rad].
         high: Shape ``(joints,)``: highest goals [rad].
         features: Part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``.
         history: Number of past steps in the observation.
-        aims: Number of entries of an aim.
-        sensor: Name of the sensor.
         **options: Options of ``BaseNode``.
     """
 
@@ -167,13 +163,10 @@ class DirectAgent(BaseNode):
     The policy sees features of the newest measurement, and the features and actions of the last steps.
 
     Args:
-        name: Unique in the graph.
         rate: Steps per second [Hz].
         features: What the policy sees of a measurement: message of the sensor -> ``(features,)``.
-        sizes: Numbers of features and of actions.
         history: Number of past steps in the observation.
         message: Makes the node's message from an action.
-        sensor: Name of the sensor.
         **options: Options of ``BaseNode``.
     """
 

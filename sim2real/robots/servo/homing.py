@@ -19,9 +19,6 @@ def bring_home(session: ServoSession, servos: Servos, rate_hz: float, settle_s: 
     """Bring the joints to where they rest.
 
     Args:
-        session: The open robot.
-        servos: Its servos.
-        rate_hz: How often goals are sent.
         settle_s: How long it may take to come to rest, a try [s].
 
     Raises:

@@ -21,7 +21,6 @@ def servo_terms(
     """Return the terms of the observation that ``GoalAgent`` makes.
 
     Args:
-        servos: The servos.
         aim: What an episode is about: names and units.
         features: What the policy sees of the present; None: positions, velocities, goals and aim.
         history: Past steps that it sees.

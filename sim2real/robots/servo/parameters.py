@@ -31,7 +31,6 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
     Where friction wears off with speed, how fast is a parameter, too, which all joints share.
 
     Args:
-        sheet: The servo's data sheet.
         joints: The joints, or their names.
         own: Which of these each joint has for itself, named as ``friction_JOINT``; joints share the others.
     """
@@ -74,7 +73,6 @@ def of_joints(
     """Return the value of every joint's servo: its own, else the shared one.
 
     Args:
-        values: Parameters by name.
         name: Such as ``gain``; a joint's own is ``gain_JOINT``.
         joints: The joints, or their names.
         otherwise: The value where there is neither; None: one of them must be there.
@@ -102,8 +100,6 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
     """Return the arrays of ``fields`` for parameters by name.
 
     Args:
-        values: Parameters by name.
-        sheet: The servo's data sheet.
         joints: The joints, or their names.
         step_s: The physics' time step [s].
     """
@@ -132,10 +128,6 @@ def identified_mjcf(
     """Return a model's MJCF with given parameters, for use in other tools at its own time step.
 
     Args:
-        mjcf: The composed model.
-        robot: The robot in it.
-        values: Parameters by name.
-        sheet: The servo's data sheet.
         joints: The joints, or their names.
     """
     spec: Any = mj.MjSpec.from_string(mjcf)

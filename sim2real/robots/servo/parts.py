@@ -29,8 +29,6 @@ class Servo(Robot):
 
     Args:
         name: Name of the model, or the joint with its gear.
-        axis: Axis of rotation.
-        sheet: The servo's data.
     """
 
     def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
@@ -145,9 +143,7 @@ class GoalTask(Task):
         """Set the goals.
 
         Args:
-            physics: The physics.
             action: Shape ``(joints,)``: goals [rad].
-            random_state: Not used.
         """
         del random_state
         physics.variables[GOAL] = physics.np.asarray(action)

@@ -57,9 +57,7 @@ class Hand:
         """Return a model's MJCF with what the hand holds.
 
         Args:
-            mjcf: The composed model.
             task: Of which it is the model.
-            values: Parameters by name.
         """
         spec: Any = mj.MjSpec.from_string(mjcf)
         model, body = spec.compile(), spec.body(self.body(task).full_identifier)

@@ -151,7 +151,6 @@ class ServoRobot(LoopRobot):
         ``jax.numpy`` all the same, it is only slower there.
 
         Args:
-            reading: The newest measurement.
             goal: The goals, shape ``(joints,)`` [rad].
             aim: What the episode is about, shape ``(k,)``.
         """
@@ -257,7 +256,6 @@ class ServoRobot(LoopRobot):
         """Draw an episode: half of the starts are at rest, half at any position.
 
         Args:
-            key: JAX key.
             draw: Draws dynamics and delays: key -> values by name.
         """
         k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
@@ -289,11 +287,9 @@ class ServoRobot(LoopRobot):
         """Return the parameters of all nodes.
 
         Args:
-            values: Parameters of dynamics and delays by name.
             position: Of the joints at the start ``(joints,)`` [rad]; goals start there too.
             velocity: Of the joints ``(joints,)`` [rad/s].
             aim: What the episode is about ``(k,)``.
-            policy: The policy.
         """
         start, speed = (jnp.asarray(x, jnp.float32) for x in (position, velocity))
         return {
@@ -314,8 +310,6 @@ class ServoRobot(LoopRobot):
         """Return parameters for an episode from rest.
 
         Args:
-            values: Parameters by name.
-            policy: The policy.
             trial: Number of the trial, whose aim it has.
         """
         rest = self.servos.at_rest
@@ -325,8 +319,6 @@ class ServoRobot(LoopRobot):
         """Return the agent's parameters on hardware: goals start where the joints are.
 
         Args:
-            session: The open robot.
-            policy: The policy.
             trial: Number of the trial, whose aim it has.
         """
         start = jnp.asarray(session.rig.measure().position_rad, jnp.float32)

@@ -27,12 +27,9 @@ class ServoWorld(ComposedWorld):
     """A composed task as a world: its input from the actuator has the joints' goals, its output their measured motion.
 
     Args:
-        name: Unique in the graph.
-        task: The task.
         parameters: Parts of the model that differ between copies: name -> (elements, attribute).
         resumed: Whether episodes begin in the middle of a recording. The servos' setpoints, which are not recorded,
             then start at the goals of that time; otherwise they start at the joints' positions, as when torque goes on.
-        actuator: Name of the actuator.
         worn: Whether dry friction wears off with speed; ``stribeck_rad_s`` of the parameters' values says where.
         **options: Options of ``ComposedWorld``.
     """
@@ -89,7 +86,6 @@ class ServoWorld(ComposedWorld):
         """Return the state with which a control step begins; a resumed episode's setpoints start at the goals.
 
         Args:
-            state: The state after the step before.
             action: The newest goals ``(joints,)`` [rad].
         """
         if not self._resumed:

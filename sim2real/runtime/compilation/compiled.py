@@ -142,7 +142,6 @@ class CompiledGraph:
         """Return the state at the start of an episode.
 
         Args:
-            rng: A JAX key.
             params: Parameters of some nodes; the other nodes' come from ``init_params``.
             order: Names of nodes that are initialised first.
             eps: Index of the episode, int or traced.
@@ -228,7 +227,6 @@ class CompiledGraph:
 
         Args:
             gs: What ``init`` or another rollout returned.
-            record: Nodes whose outputs are returned.
             rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced. A whole
                 episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
                 order of the records' places.
@@ -275,7 +273,6 @@ class CompiledGraph:
         """Run a row up to the supervisor's step, and return what the supervisor sees.
 
         Args:
-            gs: A state at the start of a row.
             inside: Promise that the row is not past the end of the timeline, because episodes end earlier, and that
                 the timeline has the episode. It saves masking every update.
 
@@ -297,7 +294,6 @@ class CompiledGraph:
 
         Args:
             gs: What ``observe`` returned.
-            step_state: The supervisor's step state after the step.
             output: The step's output; ignored in a row without a step.
             inside: As in ``observe``.
 

@@ -46,7 +46,6 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
 
     Args:
         nodes: The nodes of the timeline, by name.
-        timeline: The timelines.
         given: Nodes that do not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
 
     Raises:

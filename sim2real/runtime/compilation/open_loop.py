@@ -35,7 +35,6 @@ class OpenLoopGraph:
     """A graph whose computed nodes can run one after the other.
 
     Args:
-        nodes: The nodes by name.
         supervisor: Name of the node that ``init_graph_state`` initialises first.
         given: Nodes that are not run because their outputs are known.
 
@@ -68,7 +67,6 @@ class OpenLoopGraph:
         """Return the timing of all computed steps.
 
         Args:
-            timeline: The timelines of E episodes.
             given: Node -> recorded outputs, leaves ``(E, N, ...)``.
 
         Raises:
@@ -114,7 +112,6 @@ class OpenLoopGraph:
             gs: What ``begin`` returned.
             tables: Of this episode: leaves ``(K, ...)``.
             given: Node -> its recorded messages, leaves ``(N, ...)``.
-            record: The node.
             known: Outputs of nodes that were computed elsewhere: node -> leaves ``(1 + K, ...)``, the default first.
         """
         sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()} | dict(known or {})

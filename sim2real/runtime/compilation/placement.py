@@ -52,9 +52,7 @@ class Placer:
     """Places the steps of one timeline; see ``place``.
 
     Args:
-        nodes: The nodes by name.
         supervisor: The supervisor's name; a row is at most as long as its period.
-        timeline: The timelines.
         given: Nodes whose outputs are known beforehand, so that they are not computed.
 
     Attributes:
@@ -135,13 +133,7 @@ class Placer:
         return lowest, self._latest(lowest, most)
 
     def fill(self, ticks: int, rows: int, row: Steps) -> Placement:
-        """Return the placement for given rows of the steps; steps after the last row need no slot.
-
-        Args:
-            ticks: Number of world ticks in a row.
-            rows: Number of rows.
-            row: Each step's row.
-        """
+        """Return the placement for given rows of the steps; steps after the last row need no slot."""
         counted = {n: self.valid(n) & (row[n] < rows) for n in self.others}
         heard = [Heard(n, e.sender, at) for n, e, at in self.live() if self.world not in (n, e.sender)]
         slots, slot = arrange(self.supervisor, rows, {n: row[n] for n in self.others}, counted, heard)

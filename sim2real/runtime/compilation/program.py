@@ -41,10 +41,7 @@ class RowProgram:
     """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
 
     Args:
-        nodes: The nodes by name.
-        wiring: The tables.
         given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
-        episodes: Number of episodes E.
         ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
             the sender's ring has.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
@@ -102,9 +99,6 @@ class RowProgram:
         """Run some slots of the row; outside of the timelines nothing changes.
 
         Args:
-            gs: The graph's state.
-            begin: First slot.
-            end: Slot after the last.
             outputs: Node -> its steps; those of these slots are appended.
             inside: Promise that the timelines have this row and episode, which saves masking every update.
             full: Promise that each of the slots makes a step.
@@ -122,7 +116,6 @@ class RowProgram:
         """Run the world's ticks and go to the next row; outside of the timelines nothing changes.
 
         Args:
-            gs: The graph's state.
             outputs: Node -> its steps; the world's ticks are appended.
             inside: As in ``run_slots``.
         """
@@ -150,10 +143,7 @@ class RowProgram:
         """Run one tick of the world.
 
         Args:
-            name: The world's name.
-            gs: The graph's state.
             now: The tick's entries of ``world_row``.
-            ages: As for slots.
         """
         step_state = self._step_state(gs, name, now, ages or {})
         new, output = self.call(name, step_state)
@@ -171,8 +161,6 @@ class RowProgram:
         """Return the step state of a slot's step; ``seq`` is -1 if the slot makes no step.
 
         Args:
-            gs: The graph's state.
-            slot: The slot.
             inside: Promise that the timelines have this row and episode; ``seq`` is -1 elsewhere too.
         """
         table = _at(self._tables[slot], gs)
@@ -192,8 +180,6 @@ class RowProgram:
         """Put the results of a node's step into the graph's state.
 
         Args:
-            gs: The graph's state.
-            name: The node's name.
             new: The step state that the step returned.
             output: The output that it returned.
             ran: Bool scalar, whether the step counts; None: it does, which saves masking.
@@ -275,10 +261,6 @@ def scan_rows(
 
     Args:
         row: Runs one row: state -> (state, node -> its steps).
-        gs: The graph's state.
-        record: Nodes whose outputs are returned.
-        rows: Number of rows.
-        unroll: Rows in one pass of the loop.
 
     Returns:
         The last state, and the records by node.
@@ -299,11 +281,6 @@ def select(mask: Number, new: T, old: T) -> T:
     """Return ``new`` if ``mask`` is true, else ``old``, leaf by leaf.
 
     MJX's data is one leaf: its own ``where`` skips fields that need no merging.
-
-    Args:
-        mask: Bool scalar.
-        new: A tree.
-        old: A tree of the same structure.
     """
 
     def one(a: Any, b: Any) -> Any:

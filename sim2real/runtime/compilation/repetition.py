@@ -24,11 +24,6 @@ class Repetition:
 
     The tables bound the age of each message that a slot or tick reads, so most windows need no select. The loop carries
     only the outputs that a later pass reads, and the last output of each node.
-
-    Args:
-        nodes: The nodes by name.
-        wiring: Tables whose rows are patterns.
-        episodes: Number of episodes.
     """
 
     def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, episodes: int) -> None:
@@ -47,7 +42,6 @@ class Repetition:
 
         Args:
             gs: The state; its buffers hold default outputs.
-            record: Nodes whose outputs are returned.
 
         Returns:
             The last state, and the records by node. In its buffers, outputs that the loop does not carry are the

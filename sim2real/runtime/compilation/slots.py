@@ -53,7 +53,6 @@ def arrange(
 
     Args:
         supervisor: The node that must not get more slots than necessary.
-        rows: Number of rows.
         row: Row of each step. Ties are decided by the order of the nodes in this dictionary.
         counted: Node -> which of its steps are computed, shape ``(E, N)``, bool.
         heard: The messages that steps consume.

@@ -21,10 +21,6 @@ class Walk:
 
     The supervisor may have several slots in a row; its i-th one is called turn i.
 
-    Args:
-        program: Runs the rows.
-        supervisor: The supervisor's name.
-
     Attributes:
         turns: The supervisor's slots.
         places: Shape ``(E, K)``: place of each of its steps, ``row * number of turns + turn``.

@@ -114,9 +114,7 @@ def wire(
     """Turn timelines into index tables.
 
     Args:
-        nodes: The nodes by name.
         supervisor: The supervisor's name; a row is at most as long as its period.
-        timeline: The timelines.
         given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
         reusable: Whether rings are made longer than these timelines need, so that most timelines of a robot have rings
             of the same lengths.
@@ -133,13 +131,7 @@ def wire(
 
 
 def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> Wiring | None:
-    """Turn timelines into index tables whose rows are patterns; None if they have no pattern.
-
-    Args:
-        nodes: The nodes by name.
-        supervisor: The supervisor's name.
-        timeline: The timelines.
-    """
+    """Turn timelines into index tables whose rows are patterns; None if they have no pattern."""
     placer = Placer(nodes, supervisor, timeline, frozenset())
     placement = find_pattern(placer)
     return None if placement is None else _Tables(placer, placement).wiring()
@@ -151,10 +143,8 @@ def messages_read(
     """Return the messages in the windows of steps: ``seq``, ``sent``, ``received`` and ``lead`` of ``InputTable``.
 
     Args:
-        width: Length W of the window.
         newest: Shape ``(E, C)``: the newest message that each step has consumed; -1: none, or no step.
         ts: Shape ``(E, C)``: starts of the steps [ticks].
-        edge: The messages.
         sender: The steps that sent them.
     """
     window = np.maximum(newest[..., None] - np.arange(width - 1, -1, -1), -1)

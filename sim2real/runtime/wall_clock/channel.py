@@ -37,12 +37,7 @@ class Table:
 
 
 class MessageChannel:
-    """The queue of one connection's messages, between the sender's thread and the reader's.
-
-    Args:
-        connection: The connection.
-        clock: Stamps the arrivals.
-    """
+    """The queue of one connection's messages, between the sender's thread and the reader's."""
 
     def __init__(self, connection: Connection, clock: MonotonicClock) -> None:
         self.connection = connection

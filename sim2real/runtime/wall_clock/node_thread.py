@@ -25,7 +25,6 @@ class Shared:
     """What the threads of one episode share: the clock, the signal to stop, and the first failure.
 
     Args:
-        clock: The episode's clock.
         recorder: Receives all steps and messages, or None.
         graph_state: The state at the episode's start.
         wake: Called when the graph stops: wakes threads that wait for messages or for the caller.
@@ -86,11 +85,7 @@ class NodeThread(threading.Thread):
     calls ``stop`` again, as that call may have switched something on.
 
     Args:
-        stepper: The node's prepared stepper.
-        data: The node's data.
         inputs: The node's channels by input name.
-        outputs: The channels to its readers.
-        shared: What all threads share.
         handover: Synchronises the supervisor with its caller; None for the other nodes.
 
     Attributes:

@@ -30,10 +30,6 @@ class WallClockRun:
     """One episode on the wall clock.
 
     Args:
-        nodes: The nodes by name.
-        supervisor: The supervisor's name.
-        steppers: Prepared steppers by name.
-        data: The nodes' data by name.
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
         own: Whether the supervisor makes its steps itself.

@@ -34,9 +34,7 @@ class Watchdog(threading.Thread):
     """Stops the graph when a step takes too long, and calls ``stop`` of a node whose own thread is busy.
 
     Args:
-        threads: The nodes' threads.
         limits: Node name -> how long a step may take [s].
-        shared: What all threads share.
     """
 
     def __init__(self, threads: Iterable[NodeThread], limits: Mapping[str, float], shared: Shared) -> None:

@@ -58,10 +58,6 @@ class JudgedLogs:
 def run(pipeline: Pipeline, config: CheckConfig) -> bool:
     """Judge and print.
 
-    Args:
-        pipeline: The robot.
-        config: What to judge.
-
     Returns:
         Whether everything is determined, up to the time shift between delays.
     """
@@ -119,11 +115,8 @@ def find_source(
     """Return the logs that were named, the newest recording, or what recording would give.
 
     Args:
-        pipeline: The robot.
         config: Names logs, or asks for the planned excitation.
-        model: What is to be identified.
         parameters: Its parameters, whose nominal values are simulated.
-        fitting: How logs are cut and simulated.
 
     Raises:
         UsageError: When there is neither a recording nor an excitation to plan one with.
@@ -167,10 +160,6 @@ def judge(
     """Return what the recordings show, and what they determine at the nominal values, as JSON takes it.
 
     Args:
-        model: What is to be identified.
-        source: The recordings.
-        config: How logs are cut into segments.
-        parameters: The model's parameters.
         units: Field -> unit.
     """
     for episode in source.episodes:
@@ -209,7 +198,6 @@ def coverage(episode: Episode, model: IdentifiableModel, units: dict[str, str]) 
     """Return when a recording was sampled, what its joints did, and what drove them.
 
     Args:
-        episode: The log.
         model: Says which nodes and fields matter.
         units: Field -> unit.
     """

@@ -28,10 +28,6 @@ def commands(
     """Return advice with the command that follows it.
 
     Args:
-        told: The verdict.
-        pipeline: The robot.
-        found: What was identified.
-        folder: The deployment's.
         deployed: With its logs, and whether the robot has changed.
     """
     if told.status == "fine" or told.joint:
@@ -61,9 +57,6 @@ def terms_to_identify(wanted: str, pipeline: Pipeline, found: Identification, dr
 
     Args:
         wanted: What a flag or the pipeline says; see ``IdentifyConfig``.
-        pipeline: The robot.
-        found: What was identified.
-        drift: What has changed.
     """
     if wanted in ("auto", "all"):
         return wanted
@@ -84,9 +77,6 @@ def logs_to_identify(own: Sequence[Path], drift: Drift | None, found: Identifica
     """Return the logs to identify from: the deployment's, and the recordings unless the robot has changed since then.
 
     Args:
-        own: The deployment's logs.
-        drift: What has changed.
-        found: What was identified.
         folder: The deployment's; recordings are named relative to its run.
 
     Returns:

@@ -82,8 +82,6 @@ def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config
     Args:
         robot: The robot, whose steps they are.
         witness: Has the robot, open and at rest, without torque, and leaves it so; keeps what is measured and sent.
-        contract: What the policy was trained with.
-        config: What is tolerated.
 
     Returns:
         Lines for the summary.
@@ -118,7 +116,6 @@ def misfit(found: StepAnswers, trained: tuple[float, float], tolerance_s: float)
     """Return in words why a measured delay is not one that a policy was trained with; None: it is.
 
     Args:
-        found: What was measured.
         trained: Shortest and longest of the training [s].
         tolerance_s: How far it may lie outside, and how much more it may vary [s].
     """

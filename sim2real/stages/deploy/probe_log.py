@@ -21,12 +21,6 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, seen: Witness) -
     They were made faster than that: measurements in between are left out, so that a log says in a second as much as any
     other, and so are repeated commands, which change nothing.
 
-    Args:
-        folder: Of the deployment.
-        pipeline: The robot's.
-        robot: The robot.
-        seen: Who measured and commanded.
-
     Returns:
         The log; None where there was no step, or where the robot does not say what its messages are.
     """

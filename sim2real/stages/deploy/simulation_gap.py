@@ -49,8 +49,6 @@ def compare(
     else, and what is drawn, is what sensors said beside what they would say.
 
     Args:
-        robot: The robot.
-        recordings: The robot's sessions.
         policy: The policy that ran.
         found: What to simulate with; None: nothing is simulated. The first simulation of each deployment has the
             estimates, the others parameters drawn from what the recordings leave open.

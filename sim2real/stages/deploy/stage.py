@@ -105,9 +105,6 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     """Deploy the policy and write logs, scores and the gap to simulation into a stage folder; in a dry run logs alone.
 
     Args:
-        pipeline: The robot.
-        config: The stage's configuration.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the bundle.
     """
     robot = moving_robot(pipeline)

@@ -26,7 +26,6 @@ def courses(real: Sequence[Columns], simulated: Sequence[Columns], units: Mappin
     """Return how each measured column went in each episode, beside its simulations.
 
     Args:
-        real: What the sensor measured in each episode.
         simulated: The simulations of all episodes; number e is of episode ``e % len(real)``.
         units: Field -> unit.
     """

@@ -43,9 +43,6 @@ def judged(
     """Return a deployment with its model tested on its own logs, its times beside the policy's, and a verdict.
 
     Args:
-        deployed: What happened.
-        pipeline: The robot.
-        bundle: The policy.
         found: What was identified; None: there is nothing to test.
         folder: The deployment's, for the command to type.
     """
@@ -78,7 +75,6 @@ def verdict(deployed: Deployment, bundle: Bundle) -> Advice:
 
     Args:
         deployed: With replay, courses, drift and times.
-        bundle: The policy.
     """
     if told := verdict_of(deployed.replay, deployed.drift):
         return told
@@ -107,10 +103,6 @@ def verdict_of(replay: Sequence[Replay], drifted: Drift | None) -> Advice | None
 
     First what no parameters explain: then it is no use to identify again. Then drift, then a model that is further off
     than it promised.
-
-    Args:
-        replay: How far models are off.
-        drifted: What has changed.
     """
     share = {r.name: _beyond(r, AS_HERE) / max(_beyond(r, "identified"), 1e-9) for r in replay}
     odd = [r for r in replay if _beyond(r, AS_HERE) > _OFF and not share[r.name] <= _UNEXPLAINED]

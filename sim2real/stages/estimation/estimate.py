@@ -68,7 +68,6 @@ class Findings:
         """Compute how uncertain a fit is.
 
         Args:
-            fit: The fit.
             without: What was identified without one part of the recordings or another.
         """
         at = uncertainty.linearise(fit.problem, fit.z)
@@ -98,9 +97,6 @@ def document(
     """Return the estimates and their uncertainty; predictions and verdict are added later.
 
     Args:
-        pipeline: Name of the robot's pipeline.
-        found: The estimates.
-        posterior: What robots are drawn from.
         truth: The embedded robot's own values, those that are known.
         seconds: What the search took [s].
     """
@@ -147,12 +143,9 @@ def judged(
     """Return the document with its verdict, whose ``next`` are the flags with which to identify again.
 
     Args:
-        document: With predictions.
-        found: The estimates.
         units: Field -> unit.
         max_delay_s: For which delays the model is made [s].
         outside: Where held-out data goes beyond what was fitted: sentences.
-        lack: What free runs show.
     """
     judged_on = positions(found.fit.problem, units)
     rows = scores(document.prediction, judged_on)

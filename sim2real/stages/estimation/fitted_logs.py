@@ -27,8 +27,6 @@ def require_new(found: Identification, logs: Sequence[Recording], model: Identif
     A copy, an import of the same file, and a part that was cut out of a fitted log are found by their measurements.
 
     Args:
-        found: What was identified.
-        logs: The logs.
         model: The robot's, for what it measures.
         force: Whether such logs are named and used all the same.
 
@@ -58,8 +56,6 @@ def require_apart(
     """Check that no log is given twice: to be fitted and held out, or to be fitted two times.
 
     Args:
-        fitted: Logs to fit.
-        held_out: Logs to predict.
         model: The robot's, for what it measures.
         force: Whether such logs are named and used all the same.
 

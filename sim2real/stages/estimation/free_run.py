@@ -51,10 +51,7 @@ def free_runs(
     """Simulate what is held out of each log in one go; return its errors and its columns.
 
     Args:
-        found: The fit.
-        episodes: The logs.
         fitted: How many of them are fitted; the others are held out whole.
-        config: How.
         models: Model -> values of all parameters.
     """
     splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
@@ -82,26 +79,14 @@ def fitted_to(
     """Return the fit of a model to logs.
 
     Args:
-        model: The model.
-        episodes: The logs.
-        fitted: How many of them are fitted.
         windows: Segments to search on, and others to predict.
-        config: How.
-        table: The parameters.
-        told: Progress.
-        begins: Called with the residuals before anything is compiled.
     """
     longer = [s for s in spans(episodes, fitted, config, config.long_s) if s.fitted] if config.long_s else []
     return fit(model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, told, begins)
 
 
 def far_off(document: Identification, positions: Sequence[Position]) -> list[tuple[Position, float, float]]:
-    """Return positions with the error of their free runs and its share of their range, the largest share first.
-
-    Args:
-        document: With predictions.
-        positions: What is judged.
-    """
+    """Return positions with the error of their free runs and its share of their range, the largest share first."""
     rows = []
     for p in positions:
         own = [number(r.rmse) for r in document.free_run if _is(r, p) and r.model == "identified"]
@@ -117,8 +102,6 @@ def lacking(
     """Return what free runs show; where they are far off, the model is fitted with one more term.
 
     Args:
-        document: With predictions.
-        positions: What is judged.
         attempt: Fits the model with ``TERM`` as well, and returns its free runs; None: the robot has no such term.
     """
     rows = far_off(document, positions)
@@ -147,7 +130,6 @@ def with_one_more(
     Args:
         robot: The robot, without optional terms that it may offer.
         terms: Those that were identified; None where it has none.
-        config: How it was identified.
     """
     if config.terms == "auto" or TERM in (terms or ()):
         return None

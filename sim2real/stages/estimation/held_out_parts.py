@@ -39,7 +39,6 @@ def widest(table: ParameterTable, wanted: str) -> ParameterTable:
     """Return the table with the optional terms that a flag names; for ``auto`` with all of them, to choose from.
 
     Args:
-        table: The robot's.
         wanted: ``own``, ``auto``, ``all``, ``none``, or names with commas between.
     """
     if wanted == "own":
@@ -58,7 +57,6 @@ def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
     """Return the robot with the optional terms that its kind offers, where a flag chooses among some.
 
     Args:
-        robot: The robot.
         wanted: As ``widest`` takes it.
     """
     offer = getattr(robot, "with_optional_terms", None)
@@ -69,7 +67,6 @@ def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
     """Return the robot with its optional terms where parameters are of one.
 
     Args:
-        robot: The robot.
         names: Names of parameters that were identified.
     """
     own, every = (
@@ -83,8 +80,6 @@ def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> optional
     """Return which optional terms are needed: without them parts that are left out are predicted worse.
 
     Args:
-        found: The fit with all of them.
-        config: How many parts.
         names: Of the recordings; each is left out by itself.
     """
     problem, table = found.problem, found.problem.table
@@ -116,7 +111,6 @@ def examined(
 
     Args:
         found: The fit; with ``--terms auto`` the one with all optional terms, as each part's absence chooses anew.
-        config: How.
         names: Of the recordings; each is left out by itself.
         choice: The terms of the model, of which each part's absence chooses some; None: nothing is chosen.
     """
@@ -135,10 +129,7 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
     """Return an uncertainty that holds how much estimates differ without one part or another.
 
     Args:
-        spread: What the fit alone says.
-        table: The parameters.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
-        rows: What was identified without each part.
     """
     if len(rows) < _FEWEST:
         return spread
@@ -152,8 +143,6 @@ def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: fl
     """Return how far each position is off on parts that were left out: mean, worst, and what one more would be.
 
     Args:
-        rows: The parts.
-        positions: What is judged.
         horizon_s: Up to which horizon [s].
     """
     if not rows:
@@ -190,9 +179,6 @@ def promises(rows: Sequence[Left]) -> dict[str, float]:
     """Return below which error 95 % of further parts stay, up to the horizon: field -> error, where there are parts.
 
     The error on the one part that was held out is no such promise: half of all further parts are further off.
-
-    Args:
-        rows: The parts.
     """
     found = {field: _finite([row.ahead.get(field) for row in rows]) for row in rows for field in row.ahead}
     return {field: further(errors) for field, errors in found.items() if errors.size >= _LEAST_PARTS}

@@ -45,14 +45,7 @@ def recommend(found: Mapping[str, Any], identify: str, record: str) -> list[str]
 
 
 def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) -> str:
-    """Return the command line of an identification with the same settings and further flags; "" without any.
-
-    Args:
-        pipeline: The robot.
-        config: The settings of the last identification.
-        root: Folder of all runs.
-        flags: The further flags.
-    """
+    """Return the command line of an identification with the same settings and further flags; "" without any."""
     return command(pipeline, config, root, flags) if flags else ""
 
 
@@ -60,10 +53,7 @@ def onward(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -
     """Return the command line that goes on with an identification that was interrupted or did not converge.
 
     Args:
-        pipeline: The robot.
         config: The settings of that identification.
-        root: Folder of all runs.
-        file: Its values.
     """
     usual = pipeline.identify
     effort = {
@@ -80,8 +70,6 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
 
     Args:
         pipeline: The robot; settings that equal its defaults need no flag.
-        config: The settings of the last identification.
-        root: Folder of all runs.
         flags: The further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
     new = shlex.split(flags)

@@ -43,11 +43,6 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
 
     What is compared is what the sensor said with what the model's sensor would say, as late and at the log's times.
 
-    Args:
-        pipeline: The robot.
-        found: What was identified.
-        episodes: The logs.
-
     Raises:
         Sim2RealError: When the logs are too short, or what was identified does not fit the robot.
     """
@@ -87,12 +82,6 @@ def segments(
 ) -> tuple[Problem, float]:
     """Return logs in short segments, with the parameters that were identified, and how far ahead they predict [s].
 
-    Args:
-        robot: The robot.
-        found: What was identified.
-        episodes: The logs.
-        config: How residuals are made.
-
     Raises:
         Sim2RealError: When there is too little to test.
     """
@@ -121,8 +110,6 @@ def known_table(parameters: ParameterTable, found: Identification, watched: Cont
     """Return parameters with the terms that were identified and what was fixed then, and bounds that hold the search's.
 
     Args:
-        parameters: The model's.
-        found: What was identified.
         watched: Names of those that stay free though they were fixed, from what they were taken to be: a payload.
     """
     terms = {p.term for p in parameters if p.term and (p.free or p.term in (found.terms or ()))}

@@ -27,7 +27,6 @@ def spans(
 
     Args:
         episodes: The logs; those that are held out whole come last.
-        fitted: How many are fitted.
         config: Which share of each is held out, and how far apart segments start.
         length_s: Of a segment [s].
         spacing_s: Between the starts of segments that are held out [s].
@@ -68,9 +67,7 @@ def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
     """Return when the held-out part of a log begins [s].
 
     Args:
-        episode: The log.
         fitted: Whether it is fitted at all; else all of it is held out.
-        config: Which share is held out.
     """
     begin, end = reach(episode, config)
     return begin + (1.0 - config.held_out) * (end - begin) if fitted else begin

@@ -19,7 +19,6 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
     Args:
         config: Kind of excitation, duration, amplitude, frequencies and seed.
         rate_hz: Commands per second [Hz].
-        commands: Number of commands.
 
     Raises:
         UsageError: When the highest frequency is above half the rate of steps.

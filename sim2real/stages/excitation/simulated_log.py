@@ -33,12 +33,9 @@ def simulate(
     It starts at rest; joints that are told where to go start where they are told to be.
 
     Args:
-        model: The model.
         robot: Says which command is excited, and at which rate.
         signal: Shape ``(N, actions)``: one command a step, as ``Robot.around`` returns them.
-        values: Parameters by name.
         config: For which delays the model is made, and what simulates it.
-        seed: Of the timing.
     """
     nodes = model.nodes(config.max_delay_s)
     engine = choose(config.engine, nodes, model.given, config.jacobian)

@@ -47,7 +47,6 @@ class Best:
         Args:
             stage: ``search`` or ``refine``.
             share: Share of it that was done since the last call.
-            loss: The best loss so far.
             z: Shape ``(P,)``: where it is.
         """
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
@@ -59,7 +58,6 @@ class Best:
 
         Args:
             z: Shape ``(P,)``: the estimate.
-            loss: Its loss.
         """
         self.z, self.loss, self.done = np.array(z), loss, {"search": 1.0, "refine": 1.0}
         if self.on_fit:
@@ -74,9 +72,6 @@ def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], again: Ca
     itself removes the file.
 
     Args:
-        stage: The running stage.
-        pipeline: The pipeline's name.
-        logs: What is identified from.
         again: Returns the command that goes on from that file.
     """
     best, path = Best(), stage.folder / PARTIAL

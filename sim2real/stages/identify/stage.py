@@ -168,9 +168,6 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     """Identify the pipeline's parameters, in a stage folder.
 
     Args:
-        pipeline: The robot.
-        config: The stage's configuration.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the log.
     """
     robot = held_out_parts.offering(in_world(pipeline.load(), config.world), config.terms)
@@ -229,9 +226,7 @@ def find_logs(
     """Return the logs to work on, those that are held out last, and the run folder to write into.
 
     Args:
-        pipeline: The robot.
         config: Names logs, or none: then the newest finished recording is taken.
-        root: Folder of all runs.
         run_dir: Run folder that is asked first.
     """
     held_out = [Path(p) for p in config.hold_out]

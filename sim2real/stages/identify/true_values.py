@@ -42,8 +42,6 @@ def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any.
 
     Args:
-        truth: The embedded robot's account.
-        steps: The sensor's.
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
     """
     stamp = steps.begun * 1000 + origin_ns
@@ -59,8 +57,6 @@ def actuation_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any.
 
     Args:
-        truth: The embedded robot's account.
-        steps: The actuator's.
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
     """
     start, end = steps.start * 1000 + origin_ns, steps.end * 1000 + origin_ns

@@ -98,8 +98,6 @@ def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz:
     """Return what a model says of files without a mapping.
 
     Args:
-        mjcf: The model.
-        name: Name of the pipeline.
         joints: The joints that were recorded; empty: all of the model's.
         rate_hz: Samples per second, where a file has no stamps [Hz].
 
@@ -141,11 +139,6 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
 def in_lengths(mapping: ImportMapping, told: Asked, path: Path) -> tuple[ImportMapping, str]:
     """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
 
-    Args:
-        mapping: As it was proposed.
-        told: What the model says.
-        path: The file.
-
     Raises:
         UsageError: The positions were taken for degrees.
     """
@@ -169,11 +162,6 @@ def in_lengths(mapping: ImportMapping, told: Asked, path: Path) -> tuple[ImportM
 
 def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:
     """Refuse a mapping that the data contradicts.
-
-    Args:
-        path: The file.
-        episode: What was imported from it.
-        as_told: Only warn.
 
     Raises:
         UsageError: When joints follow other commands than their own, or move against them.

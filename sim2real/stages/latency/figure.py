@@ -24,9 +24,6 @@ def picture(
     """Draw a bar of the medians, and how each part that the clocks saw, or the motion, scatters, into a PNG file.
 
     Args:
-        path: The file.
-        latency: What is drawn.
-        recording: The session behind it.
         chain: The nodes, as in `Latency.of`.
         links: What the motion tells of how the device's delays are distributed.
     """

@@ -27,9 +27,7 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
     """Test the latency in a folder of its own; in a dry run nothing moves, and the device's share stays unknown.
 
     Args:
-        pipeline: The robot.
         config: The steps, and how the motion is judged.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)

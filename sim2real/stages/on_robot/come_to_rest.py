@@ -16,8 +16,6 @@ def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
     """Let commands fade, or goals stay, until the robot is at rest; the graph runs on and its log with it.
 
     Args:
-        graph: The running graph.
-        rig: The robot.
         hold: Whether to hold it then until Enter is pressed; without a terminal, until a signal comes.
 
     Raises:

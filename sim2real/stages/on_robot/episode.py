@@ -34,11 +34,7 @@ _INTERRUPTED = 130
 
 
 class Watch:
-    """A recorder that passes everything on, keeps when the episode started, and stops the graph on a NaN.
-
-    Args:
-        recorder: Where everything goes.
-    """
+    """A recorder that passes everything on, keeps when the episode started, and stops the graph on a NaN."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
@@ -81,15 +77,8 @@ def run_episode(
     """Run the graph for a while and log it; whatever happens, the motors end without torque and the log readable.
 
     Args:
-        pipeline: The robot's pipeline.
-        robot: Its parts.
-        session: The open robot.
-        nodes: The graph.
-        params: Parameters of its nodes.
-        log: The log to write.
         duration_s: How long to run [s].
         config: The stage's configuration, for the log's metadata.
-        label: What the progress bar says.
         hold: Whether the motors hold the robot where it ends, until somebody says that it can do without them.
 
     Returns:

@@ -28,9 +28,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """Open the robot for a stage, with torque off; in a dry run with torque withheld until it is closed.
 
     Args:
-        robot: The robot.
         config: Port, limits, seed, and whether it is a dry run.
-        truth_path: File for the emulated robot's account of itself.
 
     Raises:
         UsageError: The session has no rig, or its device moves in a dry run.
@@ -104,9 +102,7 @@ def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
     """Return for each actuator what the gate let through since the robot started, as JSON takes it.
 
     Args:
-        gate: The gate.
         field: Field of the command, the name of what has none.
-        unit: The command's.
 
     Returns:
         ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of what was sent, or would have been; and

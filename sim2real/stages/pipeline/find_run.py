@@ -19,8 +19,6 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
     Of a pipeline's runs the newest with a finished stage is taken: one that failed at its start does not hide it.
 
     Args:
-        root: Folder of all runs.
-        target: What the user typed.
         pipeline: The pipeline that the run has to belong to; None allows any.
 
     Raises:

@@ -70,7 +70,6 @@ class DescribedPipeline(Pipeline):
         """Return the pipeline with what it needs to read logs: a mapping where they are of another recorder.
 
         Args:
-            logs: The logs.
             mapping: Their mapping; None: one is proposed.
         """
         first = Path(logs[0])
@@ -88,7 +87,6 @@ def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
     """Return the pipeline of a model and of what a log says of it.
 
     Args:
-        told: What the user says.
         logs: The logs; the first one says which commands there are and how fast they came.
 
     Raises:
@@ -154,7 +152,6 @@ def pipeline_beside(parameters: Path, found: Identification) -> Pipeline:
 
     Args:
         parameters: Their file, or its folder.
-        found: What they say.
     """
     beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
     return from_file(beside, found.pipeline) if beside.is_file() else load_pipeline(found.pipeline)

@@ -12,7 +12,6 @@ def moving_robot(pipeline: Pipeline, world: str | None = None) -> Robot:
     """Return a pipeline's robot for the stages that need hardware or training.
 
     Args:
-        pipeline: The pipeline.
         world: World that it is simulated in; None: its own.
 
     Raises:

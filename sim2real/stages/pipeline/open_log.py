@@ -20,7 +20,6 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
     A file of another recorder is imported in memory, where the pipeline has a mapping for it.
 
     Args:
-        path: The file.
         pipeline: The pipeline that it must be of.
         robot: Its robot, in whose units the log must be; None: any units.
 

@@ -48,7 +48,6 @@ def recording_of(value: Any, pipeline: Pipeline, name: str = "recording") -> Rec
     Args:
         value: A recording, a log, or the folder of a record stage.
         pipeline: The robot that a file must be of.
-        name: What the argument is called.
 
     Raises:
         UsageError: It is something else.
@@ -67,7 +66,6 @@ def recordings_of(value: Any, pipeline: Pipeline, name: str = "recording") -> li
     Args:
         value: One recording, or several.
         pipeline: The robot that files must be of.
-        name: What the argument is called.
     """
     several = isinstance(value, Iterable) and not isinstance(value, Recording | str | Mapping)
     found = [recording_of(one, pipeline, name) for one in (value if several else [value])]
@@ -109,7 +107,6 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
     Args:
         value: A configuration, or what is different from the default, field by field; None: nothing.
         default: The default.
-        name: What the argument is called.
 
     Raises:
         UsageError: It is of another stage, or there is no such field.
@@ -135,14 +132,7 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
 
 
 def wrong(value: object, name: str, expected: str, hint: str) -> UsageError:
-    """Return the error for an argument of the wrong kind.
-
-    Args:
-        value: What was given.
-        name: What the argument is called.
-        expected: What it should be.
-        hint: How to get that.
-    """
+    """Return the error for an argument of the wrong kind."""
     return UsageError(f"{name} must be {expected}; got {type(value).__name__} {reprlib.repr(value)}", hint=hint)
 
 

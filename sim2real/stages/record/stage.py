@@ -51,9 +51,6 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
     """Record in a stage folder.
 
     Args:
-        pipeline: The robot.
-        config: The stage's configuration.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)

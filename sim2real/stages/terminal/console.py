@@ -89,7 +89,6 @@ def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar
 
     Args:
         total: Number of steps; None if unknown.
-        desc: What is being done.
         shown: False shows nothing: another process does.
     """
     if sys.stderr.isatty() or not shown:

@@ -24,11 +24,8 @@ def with_disturbances(
     """Return what episodes are drawn from, with pushes and starts as training draws them, as wide as at its end.
 
     Args:
-        episodes: Parameters and timing.
-        vary: In what episodes differ.
         task: The task, which draws starts.
         pushes: What draws pushes; None: there are none.
-        seed: Of what is drawn here.
     """
     share = vary.curriculum[1]
     last = jnp.float32(share) if vary.grows else None

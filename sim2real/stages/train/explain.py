@@ -28,11 +28,8 @@ def explain(
     """Show what episodes are drawn from, in a folder of its own, and train nothing.
 
     Args:
-        pipeline: The robot.
-        config: The training's configuration.
         identification: What it would train on; None: the nominal model.
         inputs: Files that this comes from, by name.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None makes a new one.
     """
     with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:

@@ -40,8 +40,6 @@ def observations_of(robot: LoopRobot, recording: Recording, runner: PolicyRunner
     """Return what a policy would have seen of a recording's measurements, had it been asked, ``(N, O)``.
 
     Args:
-        robot: The robot.
-        recording: The recording.
         runner: The policy, whose actions are part of what it sees later.
     """
     agent: Any = robot.make_agent()  # with observe and act, as training asks of it

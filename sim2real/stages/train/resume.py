@@ -27,9 +27,7 @@ def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFol
     """Return the interrupted training that ``config.resume`` names, None where it names none.
 
     Args:
-        pipeline: The pipeline's name.
         config: The settings of the training that goes on.
-        root: Folder of all runs.
 
     Raises:
         UsageError: There is none, or it had other settings.

@@ -79,7 +79,6 @@ def _followed(known: Posterior, along: np.ndarray, estimate: float, by: float) -
     """Return the likeliest parameters where one of them, or the sum of several, has moved.
 
     Args:
-        known: The estimate with its covariance.
         along: Shape ``(P,)``: 1 for what is moved, several for their sum, then on a linear scale; else 0.
         estimate: The value that is moved [its unit].
         by: How far [its unit].
@@ -108,7 +107,6 @@ def with_room(robot: LoopRobot, models: Sequence[Mapping[str, float]]) -> LoopRo
     """Return a robot whose graph has room for the delays of all models.
 
     Args:
-        robot: The robot.
         models: Parameters by name; the first model is the one that the graph is made of.
     """
     if not set(DELAYS) <= set(models[0]):
@@ -146,12 +144,9 @@ def sensitivity(
     """Play a policy on every model, all in one program.
 
     Args:
-        robot: The robot.
         env: Its graph with room for all models, see ``with_room``.
-        policy: The policy.
         moves: The parameters that are moved.
         models: What ``models_of`` returned for them.
-        seed: Seed of the episodes.
     """
     loops = _in_one_loop(robot, models)
     columns = {name: jnp.asarray([m[name] for m in loops], jnp.float32) for name in loops[0]}

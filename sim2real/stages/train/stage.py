@@ -76,7 +76,6 @@ def train(
             nominal model has no delays.
         checkpoint: File that holds all of the training after each evaluation; None: none is written.
         resume: Such a file, of the same training, to go on from.
-        watch: Called after each evaluation.
         teacher: Whom the policy imitates; None: it learns from rewards.
         log: A recording: on what a policy would have seen there, what will run is compared with what was trained.
 
@@ -163,9 +162,6 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     """Train, and write the policy bundle into a stage folder; of several processes the first one writes.
 
     Args:
-        pipeline: The robot.
-        config: The stage's configuration.
-        root: Folder of all runs.
         run_dir: Run folder to add to; None takes the one of the parameters, or a new one for the nominal model.
 
     Returns:

@@ -20,9 +20,7 @@ def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
     """Return a teacher and its folder.
 
     Args:
-        pipeline: The student's pipeline.
         target: The folder of a bundle or of a training; or a run, by its path or name: its newest teacher.
-        root: Folder of all runs.
 
     Raises:
         UsageError: There is no such run, or no teacher was trained in it.
@@ -45,10 +43,6 @@ def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
 
 def teacher_of(bundle: Bundle, student: PolicyContract) -> Policy:
     """Return the policy of a teacher.
-
-    Args:
-        bundle: Its bundle.
-        student: What the student sees and does.
 
     Raises:
         UsageError: It sees or does something else than the student, besides what only simulation knows.

@@ -16,7 +16,6 @@ def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progre
     """Yield what writes the figures of an evaluation into event files, one for each policy.
 
     Args:
-        folder: Takes a folder for each policy.
         names: The policies, such as ``seed 0``, in the order of the figures.
 
     Raises:

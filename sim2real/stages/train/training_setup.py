@@ -66,7 +66,6 @@ def prepare(
     """Make the environment.
 
     Args:
-        pipeline: The robot's.
         config: What to train on, and in what episodes differ.
         found: What identify found; the nominal model needs none.
         timing: How long everything takes on the robot; default: as in the recording that was identified from. The
@@ -274,9 +273,6 @@ def find_parameters(
     """Return the identification to train on, None for the nominal model, and the run folder to write into.
 
     Args:
-        pipeline: The robot.
-        config: The stage's configuration.
-        root: Folder of all runs.
         run_dir: Run folder; None: the newest one with an identification.
     """
     if config.model == "nominal":
@@ -293,10 +289,8 @@ def contract_of(
     """Return what a policy of a robot sees and does, and the delays that it is trained with.
 
     Args:
-        robot: The robot.
         task: Its task, with the actions' bounds.
         values: Parameters by name, whose delays the policy is trained with.
-        episodes: What the training's episodes are drawn from.
     """
     return PolicyContract(
         observation=robot.observation,

@@ -52,9 +52,6 @@ _ACCEPTED = "accepted"
 def run(config: ValidateConfig) -> bool:
     """Score and print.
 
-    Args:
-        config: What to score.
-
     Returns:
         Whether every position is predicted better than by every baseline.
 
@@ -144,13 +141,7 @@ def validate(
 
 
 def pipeline_of(path: Path, found: Identification, config: ValidateConfig) -> Pipeline:
-    """Return the robot that parameters are of: described beside them, or a pipeline.
-
-    Args:
-        path: The parameters.
-        found: What they say.
-        config: May name a mapping.
-    """
+    """Return the robot that parameters are of: described beside them, or a pipeline."""
     own = from_model.pipeline_beside(path, found)
     if not isinstance(own, from_model.DescribedPipeline):
         return own
@@ -161,12 +152,6 @@ def score(
     found: Identification, pipeline: Pipeline, logs: Sequence[Recording], config: ValidateConfig
 ) -> dict[str, Any]:
     """Return errors on logs that nothing was fitted to, as JSON takes them.
-
-    Args:
-        found: What was identified.
-        pipeline: The robot.
-        logs: The logs.
-        config: How far ahead.
 
     Raises:
         UsageError: When a log was fitted, or each recording has parameters of its own: of a new one they are not known.

@@ -28,9 +28,7 @@ def draw_robots(
     Args:
         values: Parameter -> the value to train on.
         found: What was identified; None: the values are a data sheet's.
-        vary: In what robots differ.
         randomise: Factor on how much; 0: only what ``vary.range`` says.
-        rng: Random numbers.
 
     Raises:
         UsageError: When ``vary.range`` names no parameter.
@@ -60,7 +58,6 @@ def widened(found: Identification, factor: float) -> Posterior:
 
     Args:
         found: What was identified, with a posterior.
-        factor: On the deviations.
     """
     posterior = found.posterior
     assert posterior is not None

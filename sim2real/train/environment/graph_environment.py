@@ -63,7 +63,6 @@ class TrainingTask(Protocol):
         """Return the reward of a row, or its terms by name, each of shape ``()``.
 
         Args:
-            graph_state: The graph's state after the row.
             action: Shape ``(A,)``.
         """
         ...
@@ -102,7 +101,6 @@ class GraphEnvironment:
 
     Args:
         graph: The compiled graph, with the task's supervisor.
-        task: The pipeline's task.
         steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
         pushes: What hits the robot; None: nothing.
         curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
@@ -182,7 +180,6 @@ class GraphEnvironment:
         Args:
             state: What ``reset`` or ``step`` returned.
             action: Shape ``(A,)``.
-            key: JAX key of the row's pushes.
         """
         return self._play(self.data, state, action, key)
 

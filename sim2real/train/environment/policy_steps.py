@@ -27,9 +27,6 @@ class PolicySteps:
 
     Where the policy makes a step in every row, nothing is changed, and nothing is computed twice.
 
-    Args:
-        env: The graph as an environment.
-
     Raises:
         UsageError: When the policy makes fewer than two steps in a timeline.
     """
@@ -75,7 +72,6 @@ class PolicySteps:
         Args:
             state: What ``reset`` or ``step`` returned.
             action: Shape ``(A,)`` [the action's units].
-            key: JAX key.
         """
         made = self._ended(self.env.step(state, action, key))
 

@@ -76,7 +76,6 @@ class TrainingEnvironment(Protocol):
         Args:
             state: What ``reset`` or ``step`` returned.
             action: Shape ``(A,)``, within the bounds [the action's units].
-            key: JAX key of the row's randomness.
         """
         ...
 
@@ -129,8 +128,6 @@ def get_width(env: TrainingEnvironment, config: PPOConfig, update: jax.Array) ->
     """Return the share of their differences that an update's new episodes have, shape ``()``; None: always all.
 
     Args:
-        env: The environment.
-        config: Number of updates.
         update: Shape ``()``: number of updates before.
     """
     if not isinstance(env, WideningEnvironment) or env.curriculum is None:
@@ -145,8 +142,6 @@ def get_reset(
     """Return what starts the episodes of an update.
 
     Args:
-        env: The environment.
-        config: Number of updates.
         update: Shape ``()``: number of updates before.
     """
     width = get_width(env, config, update)

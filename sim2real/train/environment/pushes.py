@@ -48,8 +48,6 @@ class Pushes:
         """Return the pushes that a configuration asks for; None: none.
 
         Args:
-            vary: Their size and rate.
-            world: The world's node.
             rate_hz: The policy's rate [Hz].
 
         Raises:
@@ -70,8 +68,6 @@ class Pushes:
         """Draw by how much velocities change in a row; 0 where a joint is not pushed.
 
         Args:
-            key: JAX key.
-            shape: That of the velocities.
             width: Share of the size; None: all of it.
         """
         k_whether, k_how = jax.random.split(key)
@@ -83,8 +79,6 @@ class Pushes:
         """Return the graph's state after the pushes of a row.
 
         Args:
-            graph_state: The state after the row.
-            key: JAX key.
             width: Share of the size; None: all of it.
         """
         state = graph_state.state[self.node]

@@ -54,7 +54,6 @@ class RecordedTimes(DelayDistribution):
     Args:
         samples: Shape ``(N,)``: what each step or message took [s], in their order.
         rate_hz: How many there are a second [Hz].
-        stretches: Where they are taken from.
         long_s: Longer ones are replaced by the median from ``calm_s`` on [s].
     """
 
@@ -101,9 +100,7 @@ class Recorded:
         """Return the times of a recording.
 
         Args:
-            timing: What was recorded.
             rate_hz: The policy's rate [Hz].
-            seed: Of the stretches.
             pauses: Whether the robot's pauses are kept; otherwise steps of more than a quarter of the period are left
                 out.
 
@@ -158,11 +155,7 @@ def draw_timelines(
     before the pause.
 
     Args:
-        nodes: The graph.
-        supervisor: The node whose steps the policy makes.
         episode_s: Length of an episode [s].
-        count: How many timelines.
-        seed: Of what is drawn.
         recorded: How long everything takes; None: as the nodes say.
 
     Raises:

@@ -30,8 +30,6 @@ class Network(Protocol):
         """Return parameters, a pytree of float32 arrays.
 
         Args:
-            rng: Source of all of them.
-            inputs: Number of entries of the input.
             gain: By how much to scale the last layer: 0.01 for an actor, whose first actions should be near 0.
         """
         ...
@@ -56,14 +54,7 @@ Factory = Callable[[int], Any]
 
 
 def orthogonal(rng: np.random.Generator, n_in: int, n_out: int, gain: float) -> np.ndarray:
-    """Draw an orthogonal kernel, shape ``(n_in, n_out)``; in numpy, as compiling a QR that runs once takes longer.
-
-    Args:
-        rng: Its source.
-        n_in: Number of inputs.
-        n_out: Number of outputs.
-        gain: Its singular values.
-    """
+    """Draw an orthogonal kernel, shape ``(n_in, n_out)``; in numpy, as compiling a QR that runs once takes longer."""
     q, r = np.linalg.qr(rng.normal(size=(max(n_in, n_out), min(n_in, n_out))))
     q = q * np.sign(np.diagonal(r))  # QR's choice of signs would make the distribution non-uniform
     return (gain * (q if n_in >= n_out else q.T)).astype(np.float32)
@@ -73,9 +64,7 @@ def init_mlp(rng: np.random.Generator, sizes: tuple[int, ...], last_gain: float)
     """Draw orthogonal kernels (gain sqrt(2), in the last layer ``last_gain``) and zero biases.
 
     Args:
-        rng: Source of the kernels.
         sizes: Widths of the input, of each hidden layer and of the output.
-        last_gain: Gain of the last layer.
 
     Returns:
         One pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer, float32.
@@ -105,13 +94,7 @@ class MLP:
     widths: tuple[int, ...]
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> Layers:
-        """Return orthogonal kernels and zero biases.
-
-        Args:
-            rng: Their source.
-            inputs: Number of entries of the input.
-            gain: That of the last layer.
-        """
+        """Return orthogonal kernels and zero biases."""
         return init_mlp(rng, (inputs, *self.widths), gain)
 
     def initial_carry(self) -> tuple[()]:
@@ -122,8 +105,6 @@ class MLP:
         """Return nothing, and the output, shape ``(outputs,)``.
 
         Args:
-            params: The layers.
-            carry: Nothing.
             x: Shape ``(inputs,)``.
         """
         return carry, apply_mlp(params, x)
@@ -144,13 +125,7 @@ class GRU:
     widths: tuple[int, ...]
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> dict[str, Any]:
-        """Return orthogonal kernels; the update gate's bias is 1, so that it remembers before it has learnt to.
-
-        Args:
-            rng: Their source.
-            inputs: Number of entries of the input.
-            gain: That of the last layer.
-        """
+        """Return orthogonal kernels; the update gate's bias is 1, so that it remembers before it has learnt to."""
         width = self.widths[0]
         bias = np.repeat(np.array([0.0, 1.0, 0.0], np.float32), width)
         kernels = [np.concatenate([orthogonal(rng, n, width, 1.0) for _ in range(3)], 1) for n in (inputs, width)]
@@ -165,7 +140,6 @@ class GRU:
 
         Args:
             params: What ``init`` returned.
-            carry: The unit's state before.
             x: Shape ``(inputs,)``.
         """
         seen = jnp.split(x @ params["kernel"] + params["bias"], 3)
@@ -190,11 +164,6 @@ class FlaxNetwork:
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> Any:
         """Return the module's own parameters; how it begins, its last layer too, is its own affair.
-
-        Args:
-            rng: Source of the module's key.
-            inputs: Number of entries of the input.
-            gain: Not used.
 
         Raises:
             UsageError: It has variables that are no parameters.
@@ -221,8 +190,6 @@ class FlaxNetwork:
         """Return what is carried on, and the output, shape ``(outputs,)``.
 
         Args:
-            params: The module's.
-            carry: What it carries into this step.
             x: Shape ``(inputs,)``.
         """
         variables = {"params": params}
@@ -246,9 +213,6 @@ def make_network(
 
     Args:
         kind: ``"mlp"``, ``"gru"``, ``"package.module:Class"``, or what makes one of its own.
-        hidden: Widths of the hidden layers of our own.
-        inputs: Number of entries of its input.
-        outputs: Number of entries of its output.
         exported: Whether a robot is to run it, as it does an actor; refused here if it could not, before it is trained.
 
     Raises:

@@ -39,9 +39,6 @@ class Translation:
     """Nodes and constants of a function whose inputs and outputs have names.
 
     Args:
-        traced: The function.
-        inputs: Names of its inputs.
-        outputs: Names of its outputs.
         who: What it is, for errors.
 
     Attributes:
@@ -234,6 +231,5 @@ def trace(function: Callable[..., Any], shapes: Sequence[tuple[int, ...]]) -> Cl
 
     Args:
         function: Takes as many arrays as there are shapes.
-        shapes: Of its inputs.
     """
     return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes))

@@ -31,7 +31,6 @@ def update_normaliser(normaliser: Normaliser, seen: jax.Array, valid: jax.Array)
     """Return the statistics with more observations added (parallel variance, Chan et al. 1979).
 
     Args:
-        normaliser: The statistics before.
         seen: Shape ``(T, N, O)``.
         valid: Shape ``(T, N)``, bool: which of them count.
     """
@@ -49,7 +48,6 @@ def deviations(normaliser: Normaliser, privileged: int) -> jax.Array:
     """Return the standard deviations that a policy divides by, shape ``(O,)``.
 
     Args:
-        normaliser: The statistics.
         privileged: How many entries at the end are physical parameters; see ``normalise_parameters``.
     """
     if not privileged:

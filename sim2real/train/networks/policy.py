@@ -150,7 +150,6 @@ class Policy(Base):
         """Return the policy from the arrays that ``to_weights`` returns.
 
         Args:
-            weights: The arrays.
             spec: What the network is; default: a perceptron whose mean is clipped.
             factory: Makes the network of a user; default: what has the name that ``spec`` has.
 

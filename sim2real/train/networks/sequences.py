@@ -54,8 +54,6 @@ def unroll(
     """Apply a network to rows; it begins anew after an episode's end, and stays as it is in rows without a policy step.
 
     Args:
-        network: The network.
-        params: Its parameters.
         carry: What it carries into the first row; leaves of shape ``(N, ...)``.
         x: Shape ``(T, N, inputs)``.
         stepped: Shape ``(T, N)``, bool: rows with a policy step.

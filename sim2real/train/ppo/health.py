@@ -19,8 +19,6 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
 
     Args:
         values: Name -> shape ``(num_seeds,)``; those in ``FINITE`` have a second axis, of the entries.
-        env_steps: Number of rows so far.
-        config: Settings.
         names: Who is who, such as ``seed 0``.
 
     Raises:

@@ -35,11 +35,9 @@ def make_start(
     The environments' states are zeros; the first rollout resets them.
 
     Args:
-        env: The environment.
         configs: Settings; they may differ in numbers alone. The leading axis has all seeds of the first, then those of
             the next.
         key: Source of all randomness; seed i depends on it and on i alone.
-        networks: Actor and value function.
     """
     first = configs[0]
     shapes = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
@@ -72,8 +70,6 @@ def make_networks(
     """Return the networks of a training.
 
     Args:
-        env: The environment.
-        config: Names them.
         actor: Makes the actor; default: as ``config`` says.
         critic: Makes the value function; default: as ``config`` says, and that the actor.
         teacher: Whom the actor shall imitate; None: it learns from rewards.

@@ -57,7 +57,6 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
     observation is added.
 
     Args:
-        rows: T rows of N copies.
         value: Shape ``(T, N)``: value of ``rows.observation``.
         following: Shape ``(T, N)``: value of ``rows.following``.
         gamma: Discount per policy step.
@@ -95,9 +94,6 @@ def loss(
 
     Args:
         params: As in ``TrainState``.
-        batch: The rows.
-        config: Clip ranges and weights.
-        networks: Actor and value function.
 
     Returns:
         The loss, and its parts by name; each of shape ``()``.

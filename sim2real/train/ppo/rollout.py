@@ -83,7 +83,6 @@ def pick(condition: jax.Array, new: T, old: T) -> T:
 
     Args:
         condition: Shape ``()``, bool: whether it is ``new``.
-        new: Any arrays.
         old: Like ``new``.
     """
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
@@ -128,7 +127,6 @@ def collect(
 
     Args:
         env: The environment; vmapped here.
-        config: Numbers of copies and rows.
         policy: The policy; it does not change during the rollout.
         copies: The copies after the last rollout; ignored if ``update`` is 0.
         update: Shape ``()``, int32: number of updates so far, in a test of rollouts.
@@ -185,13 +183,7 @@ def untested(env: TrainingEnvironment, config: PPOConfig) -> Tested:
 
 
 def watch(tested: Tested, rows: Rows, config: PPOConfig) -> Tested:
-    """Return what is known after more rows of a test.
-
-    Args:
-        tested: What was known before.
-        rows: T rows of the N copies.
-        config: How the rewards were scaled.
-    """
+    """Return what is known after more rows of a test."""
     end = rows.terminated | rows.truncated
     runs = tested.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
     last = runs & end
@@ -221,9 +213,6 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
 
     Args:
         env: The environment; vmapped here.
-        config: Numbers of copies and rows.
-        policy: The policy.
-        key: Source of resets and the environment's own randomness.
 
     Returns:
         ``return`` (sum of the unscaled rewards, unless the environment's metrics have one), the environment's metrics,

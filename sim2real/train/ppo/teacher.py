@@ -20,9 +20,6 @@ from sim2real.train.networks.policy import Policy
 class TeacherEnvironment:
     """An environment whose policy sees, after its observation, what is true in simulation.
 
-    Args:
-        env: The environment.
-
     Raises:
         UsageError: It does not say what is true.
     """
@@ -64,7 +61,6 @@ class TeacherEnvironment:
         Args:
             state: What ``reset`` or ``step`` returned.
             action: Shape ``(A,)``, within the bounds [the action's units].
-            key: JAX key of the row's randomness.
         """
         made = self._env.step(state, action, key)
         return made._replace(observation=self._seen(made.state, made.observation))
@@ -99,9 +95,6 @@ def advice(env: TrainingEnvironment, teacher: Policy, state: Any, observation: j
     """Return what a teacher would do, shape ``(A,)``, within [-1, 1] of the action's range.
 
     Args:
-        env: The student's environment.
-        teacher: The teacher.
-        state: The environment's state.
         observation: Shape ``(O,)``: what the student sees.
     """
     if teacher.spec.privileged:
@@ -111,11 +104,6 @@ def advice(env: TrainingEnvironment, teacher: Policy, state: Any, observation: j
 
 def check_teacher(env: TrainingEnvironment, config: PPOConfig, teacher: Policy) -> None:
     """Compare a teacher with what it shall teach in.
-
-    Args:
-        env: The student's environment.
-        config: The student's settings.
-        teacher: The teacher.
 
     Raises:
         UsageError: It is none for this student; the message says in what.

@@ -55,8 +55,6 @@ def train(
     """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
     Args:
-        env: One copy of the environment.
-        config: Settings.
         key: Source of all randomness, from ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
         on_progress: Called after every evaluation, those before a resumption too; an exception that it raises ends the
             training.
@@ -67,7 +65,6 @@ def train(
         sweep: Settings to try side by side; None: those of ``config``.
         actor: Makes the actor, a module of flax.linen or a ``Network``, with this number of outputs; None: ``config``
             names it.
-        critic: The same for the value function.
         teacher: A policy to imitate, in place of learning from rewards; it may see what only simulation knows.
 
     Raises:
@@ -156,10 +153,7 @@ def _advance(
     Args:
         program: What ``_epoch`` was compiled to.
         arguments: Its settings that are swept, and the environment's data.
-        config: All settings.
-        names: Who is who on the leading axis.
         offset_s: Turns the clock into the time that training took so far.
-        now: The training before.
     """
     state, policies, values = program(now.state, *arguments)
     policies, values = jax.device_get((policies, values))
@@ -183,8 +177,6 @@ def _result(
     """Return the result.
 
     Args:
-        members: The settings of each place on the leading axis.
-        now: The training at its end.
         first: Number of evaluations that were made before this process.
         seen: Shape ``(M, N, O)``: observations of all copies of all members.
         compile_s: Time to trace and compile [s].

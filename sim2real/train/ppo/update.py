@@ -55,11 +55,7 @@ def make_policy(
     """Return the policy with the given parameters and normaliser.
 
     Args:
-        env: Gives the action bounds.
-        config: Says whether actions are squashed.
-        networks: Its actor is the policy's.
         params: As in ``TrainState``.
-        normaliser: Statistics of the observations.
     """
     known = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
     return Policy(
@@ -82,9 +78,6 @@ def prepare(
     Args:
         state: The state before the rollout; its value network and normalisers are used.
         policy: The policy that played the rows.
-        rows: T rows of N copies.
-        config: Discount and lambda.
-        networks: Actor and value function.
 
     Returns:
         The batch, and what the value function carries on after the last row.
@@ -149,11 +142,6 @@ def update(
     densities are those of the policy that played the rows.
 
     Args:
-        env: The environment.
-        config: Settings.
-        networks: Actor and value function.
-        state: The state before the rollout.
-        copies: The copies after it.
         rows: What they played, by the policy of that state.
 
     Returns:

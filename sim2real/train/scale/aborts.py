@@ -26,13 +26,7 @@ def aborted() -> str:
 
 
 def catch_aborts(words: str, hint: str, code: int) -> None:
-    """Catch SIGABRT: `aborted` returns the words from then on; a process that does not end soon is ended with them.
-
-    Args:
-        words: What happened.
-        hint: What to do next.
-        code: Exit code.
-    """
+    """Catch SIGABRT: `aborted` returns the words from then on; a process that does not end soon is ended with them."""
 
     def handler(_: int) -> None:
         _said.append(words)

@@ -69,8 +69,6 @@ class TrainingIdentity:
         """Describe a training.
 
         Args:
-            config: Its settings.
-            key: Its source of randomness.
             lowered: Its program, traced.
             sweep: The settings that are swept.
             data: The environment's data, arrays.
@@ -114,8 +112,6 @@ def save_checkpoint(path: Path, identity: TrainingIdentity, training: Checkpoint
 
     Args:
         path: The file; it is replaced as a whole.
-        identity: Which training it is.
-        training: The training.
     """
     log = training.log
     arrays = {name: np.asarray(_data(leaf)) for name, leaf in _named(tuple(training[:3]))}
@@ -133,10 +129,8 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
     """Return the training in a file.
 
     Args:
-        path: The file.
         identity: Which training it must be.
         state: A state of the same training, for the structure and the kinds of its keys.
-        policies: Shapes and dtypes of its policies.
 
     Raises:
         Sim2RealError: The file is missing or damaged.

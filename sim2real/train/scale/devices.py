@@ -83,7 +83,6 @@ def gather(state: T, layout: Shardings | None) -> T:
     """Return a state that this process can read, also where other processes have a part; all of them call this.
 
     Args:
-        state: The state.
         layout: Where its arrays are; None: here.
     """
     if layout is None or jax.process_count() == 1:

@@ -54,7 +54,6 @@ def spread(arrays: T, config: PPOConfig) -> T:
 
     Args:
         arrays: Leaves of shape ``(B, M, ...)``: B minibatches of M copies.
-        config: Numbers of devices and seeds.
     """
     mesh = mesh_of(config)
 

@@ -26,9 +26,6 @@ _WHY = "the reason is in the output of the process that ended first; `--resume n
 def join(hosts: HostsConfig) -> None:
     """Join the other processes; nothing may have been computed before.
 
-    Args:
-        hosts: Who they are.
-
     Raises:
         UsageError: No launcher is found, or JAX has computed before.
         Sim2RealError: They do not come in time.
@@ -83,11 +80,7 @@ def leads() -> bool:
 
 
 def wait_for_all(what: str) -> None:
-    """Wait until all processes have come here.
-
-    Args:
-        what: Names the place.
-    """
+    """Wait until all processes have come here."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(what)
 

@@ -147,7 +147,6 @@ def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
     """Draw a correlation matrix, with the numbers where they fit into the cells.
 
     Args:
-        names: P parameters.
         matrix: Shape ``(P, P)``.
         name: Of the figure, unique on its page.
     """

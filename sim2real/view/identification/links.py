@@ -39,12 +39,7 @@ def link_blocks(links: Sequence[Link]) -> list[Block]:
 
 
 def draw_link(ax: Any, link: Link) -> None:
-    """Draw the distribution of a link's delays with its mean and its 95th percentile.
-
-    Args:
-        ax: Matplotlib's axes.
-        link: The link.
-    """
+    """Draw the distribution of a link's delays with its mean and its 95th percentile."""
     shown = np.flatnonzero(link.share >= _SEEN * link.share.max())
     own = slice(max(shown[0] - 1, 0), shown[-1] + 2)
     ms, share = 1e3 * link.delays[own], 100.0 * link.share[own]

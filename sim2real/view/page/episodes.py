@@ -21,7 +21,6 @@ def episodes_svg(episodes: Episodes, name: str) -> str:
     """Draw parameters, computation times and noise as one ``<svg>`` element of a page.
 
     Args:
-        episodes: What is drawn.
         name: Of the figure, unique on its page.
     """
     with styled():

@@ -67,10 +67,8 @@ def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, s
     """Draw one episode on the robot against the same policy in simulation.
 
     Args:
-        log: The robot's session.
         simulation: Series of the simulation; empty where nothing was simulated.
         units: Field -> unit.
-        number: The episode's.
         name: Of the figure, unique on its page.
     """
     units = {**log.units, **units}

@@ -20,9 +20,6 @@ PAGE = "report.html"
 def report(run_dir: Path) -> Path:
     """Write the report of a run: a section for each stage that is finished.
 
-    Args:
-        run_dir: The run's folder.
-
     Returns:
         Path of the page, ``report.html`` in the run's folder.
 

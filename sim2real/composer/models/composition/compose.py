@@ -93,7 +93,6 @@ def _compose(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
     Bodies, joints, geoms, actuators and so on are in depth-first order, as PyMJCF writes them.
 
     Args:
-        model: The model.
         late: Kinds of elements that are left out.
     """
     out = _copy(model, late)
@@ -128,7 +127,6 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
     What an element names in another model has a name there that no element of this one has.
 
     Args:
-        model: The model.
         late: Kinds of elements that are left out.
     """
     spec = model._spec

@@ -236,9 +236,7 @@ def note(model: Member, path: str, name: str) -> None:
     """Note that a program wrote a setting of a model: it counts as set, and holds over what attached models had set.
 
     Args:
-        model: The model.
         path: Part of the spec, such as ``option`` or ``visual.map``; '' for sizes.
-        name: The field.
     """
     _author(model._spec, path, name)
     model.overrides.note((path, name), (m for m in model.root_model.all_models() if m is not model))
@@ -249,10 +247,7 @@ def in_world(model: Member, path: str, name: str, own: Any) -> Any:
     """Return the value of a setting in the world that a model is a part of, given the model's own.
 
     Args:
-        model: The model.
         path: Part of the spec, such as ``option`` or ``visual.map``; '' for sizes.
-        name: The field.
-        own: The value in the model itself.
     """
     if model.parent_model is None and not model.attachments:
         return own
@@ -290,7 +285,6 @@ def set_flag(spec: MjSpec, name: str, value: str) -> None:
 
     Args:
         spec: The ``MjSpec``.
-        name: The flag's name in MJCF.
         value: ``enable`` or ``disable``.
     """
     field, bit = FLAGS[name]

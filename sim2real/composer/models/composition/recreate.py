@@ -66,9 +66,7 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
     Args:
         model: The model of the element that names another.
         element: What the element is called, in an error.
-        kind: The kind of what it names.
         target: What it names: an element, or a text.
-        top: The model at the top of the world.
 
     Raises:
         UsageError: When it is not there.
@@ -98,10 +96,7 @@ def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: froze
     """Add the elements of some kinds of all models to the composed spec, which has none of them yet.
 
     Args:
-        out: The composed spec.
-        top: The model at its top.
         models: All its models, in the order in which their elements follow one another.
-        kinds: The kinds.
 
     Raises:
         UsageError: When an element names one that is not there.
@@ -121,14 +116,7 @@ def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: froze
 
 
 def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
-    """Add a copy of an element to a spec; what it names is called as in its own spec, and a tendon has no path yet.
-
-    Args:
-        out: The spec.
-        kind: What the element is.
-        native: The element of its own spec.
-        name: The name of the copy.
-    """
+    """Add a copy of an element to a spec; what it names is called as in its own spec, and a tendon has no path yet."""
     new = getattr(out, f"add_{kind}")()
     for key in translate.attributes(native):
         value = getattr(native, key)
@@ -150,9 +138,6 @@ def point_aside(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], done
     """Let what stands in bodies, and assets, name elements of other models, now that all models are in one spec.
 
     Args:
-        out: The composed spec.
-        top: The model at its top.
-        models: All its models.
         done: Kinds of elements that name the right ones already.
     """
     for model in models:

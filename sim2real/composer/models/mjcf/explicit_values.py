@@ -131,8 +131,6 @@ class Records:
             native: What holds the defaults in the spec.
             kind: Of the elements that they are for.
             tag: The tag that they were set for.
-            name: The attribute.
-            value: What it was set to.
         """
         self._has_defaults = True
         said = self.of_class(native, kind)
@@ -154,7 +152,6 @@ class Records:
 
         Args:
             native: The element of the ``MjSpec``.
-            tag: Its tag in MJCF.
             values: The attributes that were given to it.
         """
         self._of[native] = Given(tag, values)
@@ -226,7 +223,6 @@ def read(native: Native, kind: str, blank: Native) -> Given:
 
     Args:
         native: The element of the ``MjSpec``.
-        kind: What it is.
         blank: The element that holds its defaults.
     """
     tag = _tag(native, kind)

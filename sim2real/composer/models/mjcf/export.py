@@ -18,8 +18,6 @@ def export_with_assets(mjcf_model: Model, out_dir: str | os.PathLike[str], out_f
     """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
 
     Args:
-        mjcf_model: The model.
-        out_dir: The folder.
         out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
 
     Raises:
@@ -39,7 +37,6 @@ def export_with_assets_as_zip(mjcf_model: Model, out_dir: str | os.PathLike[str]
     """Write a model, composed, as MJCF with all its files into an archive; return its path.
 
     Args:
-        mjcf_model: The model.
         out_dir: The archive's folder, which is made if it is not there.
         model_name: What the archive, the folder in it and the MJCF file are called; default: as the model.
     """

@@ -26,9 +26,7 @@ class Asset:
     """The contents of a file: ``asset.add('texture', file=mjcf.Asset(png, '.png'))``.
 
     Args:
-        contents: The bytes.
         extension: How the file's name ends, such as ``.stl``.
-        prefix: How it begins.
     """
 
     contents: bytes
@@ -52,7 +50,6 @@ def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
     """Return a file that a model names.
 
     Args:
-        model: The model.
         kind: The kind of element that names the file: textures have a folder of their own.
         file: The name, or the contents.
 

@@ -29,7 +29,6 @@ def from_string(
     decides what elements without a name are called.
 
     Args:
-        text: The document.
         assets: Contents of files by name: they are looked for there first.
         folder: Where relative paths of files begin; default: the working directory.
 

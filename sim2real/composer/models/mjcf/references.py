@@ -97,7 +97,6 @@ def rename(element: Handle, name: str) -> None:
     """Call an element otherwise; what names it names it still.
 
     Args:
-        element: The element.
         name: Its new name; '' for none.
     """
     model: Tree[Handle] = element.root
@@ -133,10 +132,6 @@ def let_go(model: Tree[Handle], gone: Iterable[Handle]) -> None:
     """Prepare the deletion of elements: what names them holds them as elements, by which it is refused.
 
     What can do without them, such as a geom without its material, does not name them any more.
-
-    Args:
-        model: Their model.
-        gone: The elements.
     """
     gone = list(gone)
     natives = {element._native for element in gone}

@@ -63,7 +63,6 @@ def targets(kind: str, native: Native) -> Iterator[tuple[str, str, str]]:
     """Yield what an element names: the attribute, such as ``target`` or ``textures[1]``, kind and name of the other.
 
     Args:
-        kind: What the element is.
         native: The element of the ``MjSpec``.
     """
     for key, named in FIXED.get(kind, {}).items():
@@ -94,7 +93,6 @@ def by_text(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, 
     What a program named by element is left out, and so are the paths of tendons.
 
     Args:
-        model: The model.
         kinds: Kinds of the elements that are looked for; more may be found.
     """
     spec = model._spec

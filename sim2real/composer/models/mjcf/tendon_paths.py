@@ -58,7 +58,6 @@ def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> PathPart:
     """Return a part of a path.
 
     Args:
-        model: The model of the tendon.
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
         attrs: The attributes in MJCF: elements, or their names.
 
@@ -83,7 +82,6 @@ def wrap(tendon: Native, part: PathPart, name: Callable[[str, Handle | str], str
 
     Args:
         tendon: The tendon of the ``MjSpec``.
-        part: The part.
         name: Kind, and element or text -> the name in that ``MjSpec``.
     """
     names = {key: name(KIND[key], part.values[key]) for key in NAMING[part.tag] if key in part.values}

@@ -107,8 +107,6 @@ def read(native: Native, kind: str, key: str) -> Any:
 
     Args:
         native: The element of the ``MjSpec``.
-        kind: What it is.
-        key: The attribute in MJCF.
     """
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return np.array(getattr(native.alt, key))
@@ -126,9 +124,6 @@ def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:
 
     Args:
         native: The element of the ``MjSpec``.
-        kind: What it is.
-        key: The attribute in MJCF.
-        value: The value.
     """
     found = _PLAIN.get((kind, key))
     if found is None:
@@ -191,8 +186,6 @@ def assign(native: Native, kind: str, key: str, value: Any) -> None:
 
     Args:
         native: The element of the ``MjSpec``.
-        kind: What it is.
-        key: The attribute in MJCF.
         value: What it is set to: numbers, keywords or text, as in MJCF.
 
     Raises:
@@ -337,7 +330,6 @@ def key_of(kind: str, tag: str, name: str, references: tuple[str, ...], plain: M
 
     Args:
         kind: Namespace of the element, such as ``sensor``.
-        tag: Its tag.
         name: The attribute in MJCF that names another element.
         references: All its attributes that do so.
         plain: Attributes that decide what is named.

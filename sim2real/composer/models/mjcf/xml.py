@@ -17,10 +17,7 @@ def to_xml_string(element: Any, prefix_root: Tree[Any] | None, self_only: bool, 
     """Return an element as MJCF.
 
     Args:
-        element: The element.
         prefix_root: The model from which names are seen; default: the element's own.
-        self_only: Whether what stands in it is left out.
-        pretty_print: Whether every element has a line of its own.
     """
     node = _node(element, prefix_root or element.root, self_only)
     if pretty_print:

@@ -185,15 +185,11 @@ class MujocoCamera(Observable):
     """The image of a camera, by name; uint8 ``(height, width, 3)``, or float32 ``(height, width, 1)`` [m] for depth.
 
     Args:
-        camera_name: Name of the camera.
-        height: Pixels.
-        width: Pixels.
         update_interval: See ``Observable``.
         buffer_size: See ``Observable``.
         delay: See ``Observable``.
         aggregator: See ``Observable``.
         corruptor: See ``Observable``.
-        depth: Measure distances instead of colours.
     """
 
     def __init__(

@@ -36,7 +36,6 @@ class MJCFFeature(Observable):
         delay: See ``Observable``.
         aggregator: See ``Observable``.
         corruptor: See ``Observable``.
-        index: Applied to the attribute's array.
 
     Raises:
         UsageError: When something given is no element.
@@ -75,16 +74,11 @@ class MJCFCamera(Observable):
     """An image: uint8 ``(height, width, 3)``, depth float32 ``(.., 1)`` [m] or segmentation int32 ``(.., 2)``.
 
     Args:
-        mjcf_element: The camera.
-        height: Pixels.
-        width: Pixels.
         update_interval: See ``Observable``.
         buffer_size: See ``Observable``.
         delay: See ``Observable``.
         aggregator: See ``Observable``.
         corruptor: See ``Observable``.
-        depth: Measure distances.
-        segmentation: Number the objects.
         scene_option: What is drawn: an ``MjvOption``.
 
     Raises:

@@ -28,11 +28,6 @@ class Staleness:
 class Place:
     """Where an attribute of bound elements lies.
 
-    Args:
-        array: MuJoCo's array.
-        index: The rows in it.
-        derived: Whether it is computed from others.
-
     Attributes:
         array: MuJoCo's array.
         index: The rows in it.
@@ -99,9 +94,6 @@ class Binding:
     what has several entries per element (``qpos``, ``qvel``, ``sensordata``) is concatenated.
 
     Args:
-        physics: The physics.
-        kind: What the elements are.
-        ids: Their numbers in the compiled model.
         single: Whether one element is bound, rather than a sequence of them.
     """
 

@@ -21,11 +21,7 @@ _PLAIN = (int, float, str, bytes, mj.MjModel)
 
 
 class Compiler:
-    """Compiles a task's models, and only when something in them has changed.
-
-    Args:
-        task: The task.
-    """
+    """Compiles a task's models, and only when something in them has changed."""
 
     def __init__(self, task: Task) -> None:
         self._task = task

@@ -36,7 +36,6 @@ class NamedArray(NDArrayOperatorsMixin):
 
     Args:
         model: The compiled ``mujoco.MjModel``, which knows the names.
-        field: Which array.
         holder: What has the array as an attribute: the model or the data.
     """
 
@@ -142,7 +141,6 @@ class NamedFields:
     Args:
         model: The compiled ``mujoco.MjModel``, which knows the names.
         struct: ``model`` or ``data``.
-        holder: What has the arrays as attributes.
     """
 
     def __init__(self, model: MjModel, struct: str, holder: object) -> None:
@@ -164,7 +162,6 @@ class Named:
     Args:
         model: The compiled ``mujoco.MjModel``, which knows the names.
         model_holder: What has the model's arrays as attributes.
-        data_holder: What has the data's.
     """
 
     def __init__(self, model: MjModel, model_holder: object, data_holder: object) -> None:

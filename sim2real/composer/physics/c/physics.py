@@ -294,7 +294,6 @@ class Physics:
         Args:
             elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            value: What the part is set to.
             index: Which part of the attribute, as in ``attribute[index]``.
         """
         getattr(self.bind(elements), name)[index] = value
@@ -344,8 +343,6 @@ class Physics:
             height: Of the image [pixels].
             width: Of the image [pixels].
             camera_id: Number or name of one of the model's cameras; -1 is the free camera.
-            overlays: Texts to draw over it.
-            depth: Measure distances instead of colours.
             segmentation: Tell objects by numbers and types (``mjtObj``) instead.
             scene_option: What is drawn: an ``MjvOption``.
             render_flag_overrides: Flags of ``mjtRndFlag`` -> value, for this image.

@@ -111,7 +111,6 @@ class Graphics:
             overlays: Texts to draw over it: ``draw(context, rect)``.
             flags: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by number -> value.
             depth: Measure distances [m] instead of colours.
-            segmentation: Number the objects instead.
 
         Raises:
             UsageError: When there is no such flag.

@@ -100,7 +100,6 @@ class OpenLoop(Protocol):
         """Return the fields of the model that differ from the compiled one.
 
         Args:
-            params: The node's parameters.
             state: What ``init_state`` returned.
         """
         ...
@@ -109,7 +108,6 @@ class OpenLoop(Protocol):
         """Return where the physics starts.
 
         Args:
-            params: The node's parameters.
             state: What ``init_state`` returned.
         """
         ...
@@ -147,7 +145,6 @@ class Rollouts:
 
     Args:
         model: The ``MjModel``; it is copied.
-        substeps: Physics steps in a tick.
         names: Fields that differ from copy to copy.
         derives: Whether constants that follow from them are computed for each copy.
         law: What is set before every step; it costs a call of C for each.
@@ -186,7 +183,6 @@ class Rollouts:
 
         Args:
             fields: Name -> values, ``(..., *shape)``.
-            start: Where the copies start.
             controls: Shape ``(..., ticks, substeps, nu)``, or what the law takes.
             values: What the law takes besides, ``(..., n)`` each.
 

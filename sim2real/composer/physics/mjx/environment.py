@@ -82,12 +82,10 @@ class MjxEnvironment:
     ``after_compile`` gets the C engine's physics, and the programs start from the model that it leaves.
 
     Args:
-        task: The task.
         time_limit: Longest episode [s].
         seed: For ``initialize_episode_mjcf`` and ``after_compile``, which run on the host.
         strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
         max_reset_attempts: How often the initial state is drawn when hooks call ``physics.fail``.
-        delayed_observation_padding: What fills buffers at first.
         legacy_step: After a step, also compute positions and velocities of the new state.
         impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``sim2real[warp]``. It computes in single precision
             and has no derivatives.
@@ -213,7 +211,6 @@ class MjxEnvironment:
         """Return a copy at the start of an episode.
 
         Args:
-            key: JAX key.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
             start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
             law: What is set of the model from the state, not on Warp; ``step`` takes the same.
@@ -250,7 +247,6 @@ class MjxEnvironment:
         """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
 
         Args:
-            key: JAX key.
             model: See ``reset``.
             start: See ``reset``.
             data: What episodes start from; default: ``initial``.
@@ -291,7 +287,6 @@ class MjxEnvironment:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
 
         Args:
-            state: The copy.
             action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
             law: See ``reset``.
@@ -368,13 +363,7 @@ class MjxEnvironment:
         return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
 
     def select(self, condition: jax.Array, a: State, b: State) -> State:
-        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done.
-
-        Args:
-            condition: A boolean.
-            a: A copy.
-            b: Another copy.
-        """
+        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done."""
 
         def choose(x: jax.Array, y: jax.Array) -> jax.Array:
             if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):

@@ -28,9 +28,7 @@ def check(
     """Refuse a task whose controls, or anything else that hooks set, depend on what the physics computes.
 
     Args:
-        environment: The task.
         entered: Maps state and action to the state with which a control step begins.
-        output: Maps a state to the world's message.
         name: The world's name, for errors.
 
     Raises:

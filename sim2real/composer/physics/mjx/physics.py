@@ -135,7 +135,6 @@ class MjxPhysics:
 
         Args:
             struct: ``model`` or ``data``.
-            name: The field.
             rows: Which rows of it; default: all.
 
         Raises:
@@ -159,8 +158,6 @@ class MjxPhysics:
 
         Args:
             struct: ``model`` or ``data``.
-            name: The field.
-            value: What it is set to.
 
         Raises:
             UsageError: When the field is a constant of compiled programs.
@@ -337,7 +334,6 @@ class MjxPhysics:
         Args:
             elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            value: What the part is set to.
             index: Which part of the attribute, as in ``attribute[index]``.
         """
         whole = jnp.asarray(self.get(elements, name))

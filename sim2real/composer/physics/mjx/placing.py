@@ -36,11 +36,8 @@ def place(
 
     Args:
         physics: The physics; ``physics.fail`` is called where a prop found no place.
-        random_state: Source of randomness.
-        props: The entities to place.
         pose: Position ``(3,)`` [m] and quaternion ``(4,)``, or variations.
         attempts: Poses that are tried for each prop.
-        ignore_collisions: Take the first pose.
         ignored: Entities that may be touched.
 
     Raises:

@@ -47,9 +47,7 @@ class JaxRandomState:
     """Draws like a ``RandomState``, from a JAX key that it splits at every draw.
 
     Args:
-        key: The key.
         memory: What variations keep from draw to draw: name -> array.
-        registry: The names of what is kept.
 
     Attributes:
         key: The key that is left.
@@ -82,8 +80,6 @@ class JaxRandomState:
         """Return floats in ``[low, high)``.
 
         Args:
-            low: The lower bound.
-            high: The upper bound.
             size: Shape of what is drawn; default: that of the bounds.
         """
         low, high = jnp.asarray(low, float), jnp.asarray(high, float)
@@ -93,8 +89,6 @@ class JaxRandomState:
         """Return normally distributed floats.
 
         Args:
-            loc: The mean.
-            scale: The standard deviation.
             size: Shape of what is drawn; default: that of the parameters.
         """
         loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
@@ -104,8 +98,6 @@ class JaxRandomState:
         """Return exponentials of normally distributed floats.
 
         Args:
-            mean: Of the logarithm.
-            sigma: Standard deviation of the logarithm.
             size: Shape of what is drawn; default: that of the parameters.
         """
         return jnp.exp(self.normal(mean, sigma, size))
@@ -124,8 +116,6 @@ class JaxRandomState:
         """Return binomially distributed integers.
 
         Args:
-            n: How many trials.
-            p: Probability of success in each.
             size: Shape of what is drawn; default: that of the parameters.
         """
         return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
@@ -135,7 +125,6 @@ class JaxRandomState:
 
         Args:
             low: The lower bound; without ``high``, the upper one.
-            high: The upper bound.
             size: Shape of what is drawn; default: that of the bounds.
         """
         low, high = (0, low) if high is None else (low, high)
@@ -147,7 +136,6 @@ class JaxRandomState:
         Args:
             a: The items, or how many integers there are to choose from.
             size: Shape of what is drawn; default: a single item.
-            replace: Whether an item may be drawn again.
             p: Probability of each item; default: all the same.
         """
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
@@ -180,7 +168,6 @@ class JaxRandomState:
 
         Args:
             shape: The shape of the distribution.
-            scale: Its scale.
             size: Shape of what is drawn; default: that of the parameters.
         """
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))

@@ -36,9 +36,6 @@ class Ring:
     """One observable: when it is sampled, and the samples that may still be read.
 
     Args:
-        name: Key in the observation.
-        observable: The observable.
-        steps: Physics steps in a control step.
         strip: Leave the buffer's axis out when it holds one sample.
         pad_initial: Pad with the first sample rather than with zeros.
         call: Calls the observable, given what it is called and its arguments.
@@ -106,10 +103,6 @@ class Ring:
         """Return the ring after a physics step, with a new sample in it when one is due.
 
         Args:
-            ring: The ring before the step.
-            now: Physics steps since the start of the episode.
-            physics: The physics after the step.
-            random_state: What noise and delays are drawn from.
             counts: Whether a sample may be taken now. Not so after the last physics step of a control step: that sample
                 is taken once the task's ``after_step`` hooks have run, by another call.
         """

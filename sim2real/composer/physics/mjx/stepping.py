@@ -71,7 +71,6 @@ class Lawful:
         Args:
             model: The ``mjx.Model``.
             data: The ``mjx.Data``.
-            actuation: Whether actuators act.
         """
         return forward(self._law(model, data), data, actuation)
 
@@ -92,7 +91,6 @@ def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Dat
     Args:
         model: The ``mjx.Model``.
         data: The ``mjx.Data``.
-        actuation: Whether actuators act.
     """
     if not actuation:
         flags = model.opt.disableflags | mjx.DisableBit.ACTUATION

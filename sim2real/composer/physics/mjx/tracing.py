@@ -221,7 +221,6 @@ def check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
 
     Args:
         before: Name -> value, at the start.
-        after: After a step.
 
     Raises:
         UsageError: With the variable.

@@ -38,8 +38,6 @@ class Traced(Protocol):
 
         Args:
             struct: ``model`` or ``data``.
-            name: The field.
-            rows: Which rows of it.
         """
 
     def replace(self, struct: str, name: str, value: ArrayLike) -> None:
@@ -47,8 +45,6 @@ class Traced(Protocol):
 
         Args:
             struct: ``model`` or ``data``.
-            name: The field.
-            value: What it is set to.
         """
 
     def mark_as_dirty(self) -> None:
@@ -176,9 +172,6 @@ class MjxBinding:
     """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model.
 
     Args:
-        physics: The physics.
-        kind: What the elements are.
-        ids: Their numbers in the compiled model.
         single: Whether one element is bound, rather than a sequence of them.
     """
 

@@ -103,7 +103,6 @@ class Columns:
         """Append a message.
 
         Args:
-            message: The message.
             log_ns: When the recorder got it [ns].
         """
         flat = _flat(message)
@@ -209,7 +208,6 @@ def _set_forward(steps: np.ndarray, own: np.ndarray, offset: np.ndarray) -> int 
 
     Args:
         steps: From stamp to stamp of the sender, ``(N - 1,)`` [ns].
-        own: The recorder's.
         offset: The sender's stamps less the recorder's, ``(N,)`` [ns].
     """
     if (own < 0).any() or not (own > 0).any():

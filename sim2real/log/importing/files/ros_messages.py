@@ -31,7 +31,6 @@ def decoder(name: str, definition: str) -> Decode:
     """Return what decodes the messages of a type.
 
     Args:
-        name: The type.
         definition: Its definition, followed by those of the types that it uses (``ros2msg``).
 
     Raises:

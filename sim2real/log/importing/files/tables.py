@@ -32,7 +32,6 @@ def encoding_of(path: Path, kind: str) -> str:
     """Return the encoding of a file of text: UTF-8, UTF-16 with a mark, else latin-1.
 
     Args:
-        path: The file.
         kind: What it should be, for the error.
 
     Raises:

@@ -70,7 +70,6 @@ class WarpEngine:
         Args:
             model: The ``mjx.Model``.
             data: The ``mjx.Data``.
-            actuation: Whether actuators act.
         """
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION

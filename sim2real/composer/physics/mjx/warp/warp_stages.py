@@ -128,7 +128,6 @@ def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Da
 
     Args:
         name: ``step`` or ``forward``.
-        order: What Warp does.
     """
     room = functools.partial(_with_room, order)
     shim = getattr(generated, f"_{name}_shim").__wrapped__

@@ -1,0 +1,169 @@
+"""Size and wording of the code: ``python scripts/house.py`` prints a table, ``--words`` lists the words to replace.
+
+tests/test_house_figures.py keeps each figure at or below its limit there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import re
+import subprocess
+import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DIALECT = (
+    "told", "tell", "tells", "nobody", "anew", "may as well", "whoever", "is said", "left out", "left_out", "once more",
+    "once_more", "by itself",
+)  # fmt: skip
+"""Words of speech for data flow, and adverbs in the place of logic."""
+WORDS = re.compile(rf"\b({'|'.join(word.replace(' ', '[ ]') for word in DIALECT)})\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Module:
+    """One file of Python.
+
+    Attributes:
+        path: Where it is, below the repository.
+        text: What it holds.
+    """
+
+    path: str
+    text: str
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        """Its syntax tree."""
+        return ast.parse(self.text)
+
+    @cached_property
+    def lines(self) -> Counter[str]:
+        """Number of lines of each kind: code, docstring, comment, blank; a comment stands on a line of its own."""
+        lines = self.text.splitlines()
+        kinds = ["code" if line.strip() else "blank" for line in lines]
+        for node in ast.walk(self.tree):
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
+            ):
+                kinds[node.lineno - 1 : node.end_lineno] = ["docstring"] * len(kinds[node.lineno - 1 : node.end_lineno])
+        for token in tokenize.generate_tokens(io.StringIO(self.text).readline):
+            if token.type == tokenize.COMMENT and lines[token.start[0] - 1].strip().startswith("#"):
+                kinds[token.start[0] - 1] = "comment"
+        return Counter(kinds)
+
+    @cached_property
+    def anys(self) -> int:
+        """How often the name ``Any`` stands in it, imports apart."""
+        names = [node for node in ast.walk(self.tree) if isinstance(node, ast.Name) and node.id == "Any"]
+        return len(names)
+
+    @cached_property
+    def project_imports(self) -> int:
+        """Number of modules of this project that it imports."""
+        return len({name for name in imported(self.tree) if name.startswith("sim2real")})
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Yield the names of modules that a syntax tree imports, as they are written."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            modules = [f"{node.module}.{alias.name}" for alias in node.names]
+            files = [ROOT / (name.replace(".", "/") + ".py") for name in modules]
+            yield from (name if file.is_file() else node.module for name, file in zip(modules, files, strict=True))
+
+
+def tracked(*patterns: str) -> list[str]:
+    """Return the paths of files that git tracks or would track."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *patterns]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
+    return [path for path in listed if path and (ROOT / path).is_file()]
+
+
+def modules() -> list[Module]:
+    """Return the modules of sim2real."""
+    return [Module(path, (ROOT / path).read_text(encoding="utf-8")) for path in tracked("sim2real/*.py")]
+
+
+def words() -> list[tuple[str, int, str]]:
+    """Return path, line and word of every word of the dialect in code and documents, tests apart."""
+    found = []
+    for path in tracked("sim2real", "pipelines", "scripts", "docs", "*.md"):
+        if path.endswith((".py", ".md")) and not path.startswith("tests/") and path != "scripts/house.py":
+            # A word may be broken by the end of a line.
+            text = re.sub(r"(?<=\w)\n[ #]*(?=\w)", lambda gap: " ", (ROOT / path).read_text(encoding="utf-8"))
+            found += [(path, text.count("\n", 0, m.start()) + 1, m[1].lower()) for m in WORDS.finditer(text)]
+    return found
+
+
+def robot_classes() -> tuple[int, int]:
+    """Return the levels of classes of the SO-101's robot below ``object``, and the number of its public members."""
+    sys.path.insert(0, str(ROOT))
+    from pipelines.so101.robot import SO101Robot
+
+    ours = [base for base in SO101Robot.__mro__ if base.__module__.startswith(("sim2real", "pipelines"))]
+    return len(ours), sum(not name.startswith("_") for name in dir(SO101Robot))
+
+
+def hardware_of_training() -> int:
+    """Return the number of modules of ``sim2real.hardware`` that a training of the arm imports."""
+    code = (
+        "import sys; from sim2real.stages.pipeline import load_pipeline; import sim2real.stages.train.stage;"
+        "load_pipeline('arm').load(); print(sum(m.startswith('sim2real.hardware.') for m in sys.modules))"
+    )
+    return int(
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    )
+
+
+def figures() -> dict[str, tuple[float, float]]:
+    """Return name -> (value, goal) of every figure that is measured on the files alone."""
+    every = modules()
+    lines = sum((module.lines for module in every), Counter[str]())
+    total = sum(lines.values())
+    composer = sum(sum(m.lines.values()) for m in every if m.path.startswith("sim2real/composer/"))
+    folders = Counter(str(Path(module.path).parent) for module in every)
+    return {
+        "lines without composer": (total - composer, 40_000),
+        "lines of composer": (composer, 11_000),
+        "files in the fullest folder": (max(folders.values()), 15),
+        "docstring lines [%]": (round(100 * lines["docstring"] / total, 1), 18),
+        "comment lines [%]": (round(100 * lines["comment"] / total, 2), 3),
+        "Any in 1,000 lines": (round(1000 * sum(module.anys for module in every) / total, 1), 10),
+        "words of the dialect": (len(words()), 0),
+        "largest number of project imports": (max(module.project_imports for module in every), 18),
+    }
+
+
+def main() -> None:
+    """Print the figures, or the words."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--words", action="store_true", help="list the words to replace, with file and line")
+    if parser.parse_args().words:
+        for path, line, word in words():
+            print(f"{path}:{line}: {word}")
+        return
+    levels, members = robot_classes()
+    rows = figures() | {
+        "levels of robot classes": (levels, 2),
+        "public members of SO101Robot": (members, 25),
+        "modules of hardware that train imports": (hardware_of_training(), 0),
+    }
+    print(f"{'':40}{'value':>10}{'goal':>10}")
+    for name, (value, goal) in rows.items():
+        print(f"{name:40}{value:>10,}{goal:>10,}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""Aliases of types, for annotations. Imports JAX and MuJoCo for type checkers alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+PyTree: TypeAlias = Any
+"""A tree of arrays, as JAX maps over it: a message, a state, parameters."""
+Json: TypeAlias = Any
+"""A value as ``json`` reads it: a number, a text, a list or a dict of such values, or None."""
+
+if TYPE_CHECKING:
+    import jax
+    import numpy as np
+    from mujoco._specs import MjSpec as MjSpec
+    from mujoco._structs import MjData as MjData
+    from mujoco._structs import MjModel as MjModel
+
+    Array: TypeAlias = jax.Array | np.ndarray
+    """Numbers of NumPy, or of JAX inside and outside of a traced function."""
+    Key: TypeAlias = jax.Array
+    """A key of JAX's random numbers."""
+else:
+    Array = Key = MjSpec = MjData = MjModel = Any

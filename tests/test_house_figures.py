@@ -1,0 +1,52 @@
+"""Size and wording of the code stay at or below the limits here; ``python scripts/house.py`` prints them and the goals."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
+LIMITS = {
+    "lines without composer": 57_900,
+    "lines of composer": 13_300,
+    "files in the fullest folder": 15,
+    "docstring lines [%]": 22.7,
+    "Any in 1,000 lines": 26.7,
+    "words of the dialect": 950,
+    "largest number of project imports": 37,
+    "levels of robot classes": 5,
+    "public members of SO101Robot": 70,
+    "modules of hardware that train imports": 39,
+}
+AT_LEAST = {"comment lines [%]": 0.45}
+
+
+@pytest.fixture(scope="module")
+def house():
+    spec = importlib.util.spec_from_file_location("house", HOUSE)
+    module = sys.modules["house"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_figures_keep_their_limits(house):
+    levels, members = house.robot_classes()
+    found = {name: value for name, (value, _) in house.figures().items()} | {
+        "levels of robot classes": levels,
+        "public members of SO101Robot": members,
+        "modules of hardware that train imports": house.hardware_of_training(),
+    }
+    assert found.keys() == LIMITS.keys() | AT_LEAST.keys()
+    assert {name: value for name, value in found.items() if value > LIMITS.get(name, value)} == {}
+    assert {name: value for name, value in found.items() if value < AT_LEAST.get(name, value)} == {}
+
+
+def test_kinds_of_lines_words_and_imports_are_seen(house):
+    text = '"""Doc.\n\nMore.\n"""\n\nfrom typing import Any\n\n# Why.\nx: Any = 1  # not alone\n'
+    module = house.Module("m.py", text)
+    assert dict(module.lines) == {"docstring": 4, "blank": 2, "code": 2, "comment": 1}
+    assert module.anys == 1
+    assert [m[1] for m in house.WORDS.finditer("It is Told once more; retold")] == ["Told", "once more"]
+    source = "from sim2real.graph import node, Base\nimport sim2real.errors\nimport numpy"
+    assert house.Module("m.py", source).project_imports == 3
