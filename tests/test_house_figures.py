@@ -1,4 +1,4 @@
-"""Size and wording of the code stay at or below the limits here; ``python scripts/house.py`` prints them and the goals."""
+"""Size and wording of the code stay at or below the limits here; ``python scripts/house.py`` prints both."""
 
 import importlib.util
 import sys
