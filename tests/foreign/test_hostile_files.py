@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.log import recovery
+from sim2real.log import recover
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.log.importing.proposal import propose
@@ -150,7 +150,7 @@ def test_tiny_records_cost_time_in_proportion(tmp_path, what, repetitions):
     begin = b"\x89MCAP0\r\n" + record(1, named(b"ros2") + named(b"x"))
     (tmp_path / "x.mcap").write_bytes(begin + TINY[what] * count)
     clock = time.process_time()
-    found = recovery(tmp_path / "x.mcap", tmp_path / "y.mcap")
+    found = recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
     assert time.process_time() - clock < 100e-6 * count + 1  # some 3 to 30 us each
     assert len(found.skipped) <= 101
     if len(found.skipped) == 101:

@@ -20,8 +20,7 @@ from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import StepRecord
-from sim2real.log import McapRecorder, TruncatedLogWarning, read_log, read_session, summary
-from sim2real.log import recovery as recover
+from sim2real.log import McapRecorder, TruncatedLogWarning, read_log, read_session, recover, summary
 from sim2real.log.session_file import SessionFile
 
 

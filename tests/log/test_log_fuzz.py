@@ -17,7 +17,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from sim2real.errors import Sim2RealError
-from sim2real.log import TruncatedLogWarning, read_log, recovery, summary
+from sim2real.log import TruncatedLogWarning, read_log, recover, summary
 from sim2real.log.session_file import SessionFile
 
 FEW_S, EVERY_S = 0.4, 20.0
@@ -75,7 +75,7 @@ def survive(tmp_path):
         yield lambda: read_log(path)
         yield lambda: read_log(path, 0.05, 0.1)
         yield lambda: summary(path)
-        yield lambda: recovery(path, clean)
+        yield lambda: recover(path, clean)
         yield lambda: read_log(clean) if clean.exists() else None
 
     def call(content):
