@@ -147,7 +147,8 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
     monkeypatch.setattr(identify_stage, "fitted_to", fit)
-    monkeypatch.setattr(identify_stage.held_out_parts, "chosen", lambda *_: SimpleNamespace(names=lambda _: ("cogging",)))
+    selection = SimpleNamespace(names=lambda _: ("cogging",))
+    monkeypatch.setattr(identify_stage.held_out_parts, "chosen", lambda *_: selection)
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
     identify_stage._with_terms(None, [], [], config, table, ["log"], Best())
     fewer = tables[1][1]
