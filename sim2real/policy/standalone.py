@@ -1,5 +1,6 @@
 """Run this policy where only numpy is: `python run_policy.py`. What it sees and sends, and how often: policy.json."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -11,6 +12,12 @@ class BarePolicy:
 
     def __init__(self, folder: Path) -> None:
         about, raw = json.loads((folder / "policy.json").read_text()), (folder / "policy.safetensors").read_bytes()
+        entries = {name: value for name, value in about.items() if name != "sha256"}
+        seal = hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+        if about.get("sha256", seal) != seal:  # bundles of older versions have no such hash
+            raise ValueError("policy.json was changed: its hash differs from its sha256")
+        if hashlib.sha256(raw).hexdigest() != about["files"]["policy.safetensors"]:
+            raise ValueError("policy.safetensors was changed: its hash differs from the one in policy.json")
         begin, self.clip = 8 + int.from_bytes(raw[:8], "little"), about["normaliser"]["clip"]
         tensors = {n: (t["shape"], t["data_offsets"]) for n, t in json.loads(raw[8:begin]).items() if n[0] != "_"}
         self.w = {n: np.frombuffer(raw[begin + a : begin + b], "<f4").reshape(s) for n, (s, (a, b)) in tensors.items()}

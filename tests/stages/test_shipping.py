@@ -1,5 +1,6 @@
 """``sim2real export policy``: a bundle that runs where nothing but numpy is."""
 
+import hashlib
 import itertools
 import json
 import subprocess
@@ -13,6 +14,7 @@ from sim2real.commands import export_policy
 from sim2real.commands.config import ShipConfig
 from sim2real.errors import UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
+from sim2real.policy.bundle import sealed
 from sim2real.policy.network import NetworkSpec
 
 SAME = """
@@ -72,9 +74,22 @@ def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
     expected = [load_bundle(bundle).act(o).tolist() for o in observations]
     np.testing.assert_allclose(json.loads(actions), expected, atol=1e-6)
     assert imported == "[]"
-    assert len((out / "run_policy.py").read_text().splitlines()) <= 30
+    assert len((out / "run_policy.py").read_text().splitlines()) <= 37
     said = subprocess.run([bare, "-I", out / "run_policy.py"], capture_output=True, text=True, check=True).stdout
     assert -2.0 <= json.loads(said)[0] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("file", "named"), [("policy.json", "policy.json was changed"), ("policy.safetensors", "safetensors was changed")]
+)
+def test_the_example_refuses_a_changed_bundle(trained, tmp_path, file, named):
+    out = export_policy.run(ShipConfig(str(trained[0]), tmp_path / "out"))
+    path = out / file
+    content = path.read_bytes()
+    # A digit of the rate, or the last byte of the weights.
+    path.write_bytes(content.replace(b"50.0", b"90.0", 1) if file == "policy.json" else content[:-1] + b"\x7f")
+    with pytest.raises(ValueError, match=named):
+        standalone.BarePolicy(out)
 
 
 def test_what_is_written_is_a_bundle(trained, tmp_path):
@@ -100,7 +115,11 @@ def test_a_policy_with_other_layers_is_not_run_as_if_it_had_none(trained, bare, 
     out = export_policy.run(ShipConfig(str(trained[0]), tmp_path / "out"))
     weights = safetensors.numpy.load((out / "policy.safetensors").read_bytes())
     more = {**weights, "memory.kernel": np.zeros((2, 2), np.float32), "memory.bias": np.zeros(2, np.float32)}
-    (out / "policy.safetensors").write_bytes(safetensors.numpy.save(more))
+    content = safetensors.numpy.save(more)
+    (out / "policy.safetensors").write_bytes(content)
+    about = json.loads((out / "policy.json").read_text())
+    about["files"]["policy.safetensors"] = hashlib.sha256(content).hexdigest()
+    (out / "policy.json").write_text(json.dumps(sealed(about)))
     code = f"import sys; sys.path.insert(0, {str(out)!r})\nimport run_policy as r; r.BarePolicy(r.Path('.'))"
     done = subprocess.run([bare, "-I", "-c", code], cwd=out, capture_output=True, text=True, check=False)
     assert done.returncode != 0
