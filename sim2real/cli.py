@@ -29,6 +29,7 @@ usage: sim2real COMMAND [PIPELINE] [FLAGS]
   info      about the installation, a pipeline, a log or a run
   check     judge what a recording, or a planned one, can tell about the parameters
   validate  score what was identified on a later log
+  compare   parameters with intervals, errors and success of several runs side by side
   latency   where the milliseconds go between motion and motion: host, bus and device
   import    turn files of other recorders into logs, and say what is what in them
   new       write the files of a pipeline for a robot of which there is a model

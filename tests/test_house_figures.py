@@ -8,7 +8,7 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 57_900,
+    "lines without composer": 58_400,
     "lines of composer": 13_300,
     "files in the fullest folder": 15,
     "docstring lines [%]": 22.7,

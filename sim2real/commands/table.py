@@ -161,12 +161,14 @@ def _files(command: str, arguments: list[str]) -> None:
     """``sim2real import FILE...``, ``validate PARAMETERS --log NEW`` and ``new NAME ROBOT.xml``."""
     from sim2real.commands import flags
     from sim2real.commands.config import NewConfig
+    from sim2real.stages.compare.config import CompareConfig
     from sim2real.stages.import_logs.config import ImportConfig
     from sim2real.stages.validate.config import ValidateConfig
 
     kind, stage, text, *examples = {
         "import": (ImportConfig, "stages.import_logs.stage", "", "import data.npz --mjcf robot.xml", "info LOG"),
         "validate": (ValidateConfig, "stages.validate.stage", _WORSE, "validate runs/NAME/TIME/identify --log b.mcap"),
+        "compare": (CompareConfig, "stages.compare.stage", "", "compare runs/NAME/MONDAY runs/NAME/FRIDAY"),
         "new": (NewConfig, "commands.new", "", "new go2 go2.xml --log run.csv", "identify go2"),
     }[command]
     own, epilog = kind(), _epilog(*(f"sim2real {example}" for example in examples))
@@ -246,7 +248,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
     "info": _info,
     "latency": _stage,
     "check": _check,
-    **dict.fromkeys(("import", "validate", "new"), _files),
+    **dict.fromkeys(("import", "validate", "compare", "new"), _files),
     **dict.fromkeys(("log", "export"), _act),
 }
 

@@ -60,7 +60,37 @@ def _stage_page(folder: Path, stage: str) -> Path:
 def _write(
     path: Path, artifacts: Sequence[StageFolder], sections: Sequence[PageSection], run: str, notes: list[NoteBlock]
 ) -> Path:
-    """Render a page and write it; a browser that has the old one open never sees half of the new one."""
+    """Write the page of stages of one run."""
+    pipeline = next((str(a.manifest["pipeline"]) for a in artifacts if "pipeline" in a.manifest), "")
+    started = min((str(a.manifest["started"]) for a in artifacts if "started" in a.manifest), default="")
+    return write_page(
+        path,
+        pipeline or "run",
+        sections,
+        run=run,
+        started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
+        version=next((a.manifest["versions"].get("sim2real") for a in artifacts if "versions" in a.manifest), ""),
+        stages=[(stage, stage in {s.id for s in sections}) for stage in STAGES],
+        notes=notes,
+    )
+
+
+def write_page(
+    path: Path,
+    pipeline: str,
+    sections: Sequence[PageSection],
+    *,
+    run: str = "",
+    started: str = "",
+    version: str = "",
+    stages: Sequence[tuple[str, bool]] = (),
+    notes: Sequence[NoteBlock] = (),
+) -> Path:
+    """Render sections as a page and write it; a browser that has the old one open never reads half of the new one.
+
+    Args:
+        stages: Stages in the head of the page, and whether each has a section.
+    """
     environment = Environment(
         loader=PackageLoader("sim2real.view"),
         autoescape=True,
@@ -68,16 +98,14 @@ def _write(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pipeline = next((str(a.manifest["pipeline"]) for a in artifacts if "pipeline" in a.manifest), "")
-    started = min((str(a.manifest["started"]) for a in artifacts if "started" in a.manifest), default="")
     text = environment.get_template("page.html").render(
-        pipeline=pipeline or "run",
+        pipeline=pipeline,
         run=run,
-        started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
-        version=next((a.manifest["versions"].get("sim2real") for a in artifacts if "versions" in a.manifest), ""),
+        started=started,
+        version=version,
         sections=sections,
         tiles=headline(sections) if len(sections) > 1 else [],
-        stages=[(stage, stage in {s.id for s in sections}) for stage in STAGES],
+        stages=stages,
         notes=notes,
     )
     draft = path.with_name(f".{path.name}.tmp")
