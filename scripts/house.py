@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,32 @@ DIALECT = (
     "once_more", "by itself",
 )  # fmt: skip
 """Words of speech for data flow, and adverbs in the place of logic."""
-WORDS = re.compile(rf"\b({'|'.join(word.replace(' ', '[ ]') for word in DIALECT)})\b", re.IGNORECASE)
+OTHER_DIALECT = (
+    # Verbs of speech and knowledge for data flow.
+    "said", "says", "(?:is|are|was|were) (?:not )?(?:asked|known|seen)",
+    # Pronouns and relative clauses in the place of a noun.
+    "whatever", "everybody", "nothing (?:is|was|has|can|may|else)", "all that", "that is none", "what (?:it|they)",
+    "what (?:is|was|are|were)(?! the)", "where (?:it|they) stands?", "so many", "so much", "the surest", "one's own",
+    # Adverbs and connectives in the place of logic.
+    "(?:than|of) which", "but for", "for ever", "as it were", "of itself", "of themselves", "by themselves",
+    "thereof", "thereby", "comes? out at", "not so", "in words",
+)  # fmt: skip
+"""Patterns of the same kind, which have a figure of their own."""
+_SPACE = r"(?:[ ]|\n[ #]*)"
+
+
+def pattern(words: Iterable[str], more: str = "") -> re.Pattern[str]:
+    """Return a pattern that finds words and phrases, also where a line ends inside a phrase."""
+    choices = "|".join(word.replace(" ", _SPACE) for word in words)
+    return re.compile(rf"\b({choices})\b{more}", re.IGNORECASE | re.MULTILINE)
+
+
+WORDS = pattern(DIALECT)
+OTHER_WORDS = pattern(OTHER_DIALECT, more=r"|(?:(?<=[.:] )|^)Of (?:what|those|all)\b")
+NAMES = {"found", "own", "kept", "made", "given", "asked", "prepared", "odd", "seen", "known"}
+"""Participles and adjectives that name no thing where they are the whole name in code."""
+PARTS_OF_NAMES = {"told", "said", "asked", "anew", "again", "prepared", "odd", "nobody", "whoever", "left out"}
+"""The same as one part of a longer name in code."""
 
 
 @dataclass(frozen=True)
@@ -96,15 +121,35 @@ def modules() -> list[Module]:
     return [Module(path, (ROOT / path).read_text(encoding="utf-8")) for path in tracked("sim2real/*.py")]
 
 
-def words() -> list[tuple[str, int, str]]:
-    """Return path, line and word of every word of the dialect in code and documents, tests apart."""
-    found = []
+def texts() -> Iterator[tuple[str, str]]:
+    """Yield path and text of the code and the documents, without tests and this file."""
     for path in tracked("sim2real", "pipelines", "scripts", "docs", "*.md"):
         if path.endswith((".py", ".md")) and not path.startswith("tests/") and path != "scripts/house.py":
-            # A word may be broken by the end of a line.
-            text = re.sub(r"(?<=\w)\n[ #]*(?=\w)", lambda gap: " ", (ROOT / path).read_text(encoding="utf-8"))
-            found += [(path, text.count("\n", 0, m.start()) + 1, m[1].lower()) for m in WORDS.finditer(text)]
-    return found
+            yield path, (ROOT / path).read_text(encoding="utf-8")
+
+
+def words(wanted: re.Pattern[str] = WORDS) -> list[tuple[str, int, str]]:
+    """Return path, line and word of every match of a pattern in code and documents."""
+    return [
+        (path, text.count("\n", 0, match.start()) + 1, re.sub(r"\n[ #]*", " ", match[0].lower()))
+        for path, text in texts()
+        for match in wanted.finditer(text)
+    ]
+
+
+def named_badly(text: str) -> Iterator[tuple[int, str]]:
+    """Yield line and name of every name in code that is a participle, or has a word of speech as one of its parts."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        name = token.string.lower().strip("_")
+        parts = set(name.replace("left_out", "left out").split("_"))
+        if token.type == tokenize.NAME and (name in NAMES or (len(parts) > 1 and parts & PARTS_OF_NAMES)):
+            yield token.start[0], token.string
+
+
+def other_words() -> list[tuple[str, int, str]]:
+    """Return path, line and word of the other words of the dialect, and of names in code that are such words."""
+    names = [(path, line, name) for path, text in texts() if path.endswith(".py") for line, name in named_badly(text)]
+    return sorted(words(OTHER_WORDS) + names)
 
 
 def robot_classes() -> tuple[int, int]:
@@ -142,6 +187,7 @@ def figures() -> dict[str, tuple[float, float]]:
         "comment lines [%]": (round(100 * lines["comment"] / total, 2), 3),
         "Any in 1,000 lines": (round(1000 * sum(module.anys for module in every) / total, 1), 10),
         "words of the dialect": (len(words()), 0),
+        "other words of the dialect": (len(other_words()), 0),
         "largest number of project imports": (max(module.project_imports for module in every), 18),
     }
 
@@ -150,8 +196,10 @@ def main() -> None:
     """Print the figures, or the words."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--words", action="store_true", help="list the words to replace, with file and line")
-    if parser.parse_args().words:
-        for path, line, word in words():
+    parser.add_argument("--other-words", action="store_true", help="list the other words of the dialect likewise")
+    flags = parser.parse_args()
+    if flags.words or flags.other_words:
+        for path, line, word in words() if flags.words else other_words():
             print(f"{path}:{line}: {word}")
         return
     levels, members = robot_classes()
