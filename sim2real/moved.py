@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 MOVED = {
+    "composer.mjx": "composer.physics.mjx",
     "composer.engine": "composer.physics.engine",
     "hardware.config": "hardware.safety.config",
     "hardware.gate": "hardware.safety.gate",

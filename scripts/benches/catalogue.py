@@ -102,7 +102,7 @@ BENCHES = {
         "links",
         "delays, losses and drift of emulated links, found from the motion",
         (
-            *(f"sim2real/identify/{part}.py" for part in ("hidden", "likelihood", "links", "losses")),
+            "sim2real/identify/delays",
             *("sim2real/artifacts/estimation/links.py", "scripts/benches/emulated_links.py"),
         ),
     ),

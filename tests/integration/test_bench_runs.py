@@ -13,6 +13,7 @@ from benches import arm, stages
 from shared_run import copied
 
 from sim2real import cli
+from sim2real.commands import table as command_table
 
 pytestmark = pytest.mark.realtime
 
@@ -29,7 +30,7 @@ def commands(monkeypatch, finished_run_dir):
         assert cli.main([command, pipeline, *flags]) == 0, "flags that the command does not have"
 
     for runs_stages in ("_run_all", "_call_stage"):
-        monkeypatch.setattr(cli, runs_stages, lambda *_: None)
+        monkeypatch.setattr(command_table, runs_stages, lambda *_: None)
     monkeypatch.setattr(stages, "sim2real", sim2real)
     return called
 

@@ -20,14 +20,14 @@ import jax
 import numpy as np
 from environments import Bandit
 from sim2real.train.config import PPOConfig
-from sim2real.train import ppo
+from sim2real.train.ppo import trainer
 from sim2real.train.sweep import Sweep
 
-divided, shardings_of = [], ppo.shardings_of
+divided, shardings_of = [], trainer.shardings_of
 def seen(state, config):
     divided.append(shardings_of(state, config))
     return divided[-1]
-ppo.shardings_of = seen
+trainer.shardings_of = seen
 
 config = PPOConfig(
     num_seeds=2, num_envs=32, minibatches=4, rollout_steps=4, total_steps=512, hidden=(8,), evaluations=2, eval_steps=2,
@@ -35,7 +35,7 @@ config = PPOConfig(
 found = {}
 for devices in (1, 8):
     sweep = Sweep({"learning_rate": (1e-3, 3e-3)})
-    result = ppo.train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3), sweep=sweep)
+    result = trainer.train(Bandit(), dataclasses.replace(config, devices=devices), jax.random.key(3), sweep=sweep)
     leaves = jax.tree.leaves(jax.device_get(result.policies))
     found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
 
