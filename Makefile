@@ -7,7 +7,7 @@ DOCS_READY := .venv/.ready-docs
 WARP_READY := .venv/.ready-warp
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
-.PHONY: demo test test-all bench docs format
+.PHONY: demo test test-all bench docs format wheel
 
 demo: $(READY)
 	$(BIN)/sim2real demo
@@ -28,6 +28,12 @@ bench: $(READY)
 docs: $(DOCS_READY)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html docs docs/_build/html
 	@echo "wrote docs/_build/html/index.html"
+
+wheel: $(READY)
+	@rm -rf dist
+	@$(BIN)/python -m build --outdir dist . > dist.log 2>&1 || { cat dist.log >&2; exit 1; }
+	@rm dist.log
+	@for file in dist/*; do echo "wrote $$file"; done
 
 format: $(READY)
 	$(BIN)/ruff check --fix

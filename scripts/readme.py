@@ -1,4 +1,4 @@
-"""Write the tables of README.md from reports/: ``python scripts/readme.py``.
+"""Write the tables and the figure of README.md and docs/results.md from reports/: ``python scripts/readme.py``.
 
 A report that is of another state of the code than this one is refused, unless it is named after --stale-ok.
 """
@@ -19,6 +19,7 @@ from benches.catalogue import measures
 from benches.provenance import ROOT, why_stale
 
 TABLES = {
+    "evidence": ("randomise", "league"),
     "demo": ("demo",),
     "arm": ("arm_cpu", "arm_h200"),
     "so101": ("so101_cpu",),
@@ -26,7 +27,10 @@ TABLES = {
     "league": ("league",),
     "randomise": ("randomise", "randomise_worn"),
 }
-"""Tables of README.md, and the reports that each is made of; one whose reports are not all there is left out."""
+"""Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
+PAGES = ("README.md", "docs/results.md")
+"""Pages with tables."""
+FIGURE = "docs/images/what_training_knows.svg"
 LEAGUE_SETS = {
     "disk": "motor with eccentric mass, RMSE",
     "xl330": "DYNAMIXEL XL330, MAE",
@@ -36,7 +40,7 @@ LEAGUE_SETS = {
 }
 LEAGUE_ENTRANTS = {
     "sysid": "mujoco.sysid",
-    "sysid_delay": "the same with a delay",
+    "sysid_delay": "mujoco.sysid with a delay",
     "pace": "PACE",
     "bam_m1": "BAM M1",
     "bam_m6": "BAM M6",
@@ -44,9 +48,9 @@ LEAGUE_ENTRANTS = {
 TRAINED_ON = {
     "data_sheet": "the data sheet, without delays",
     "uniform": "the data sheet, parameters 30 % up and down",
-    "point": "what was identified",
-    "posterior": "its posterior",
-    "all": "all that the log knows: posterior, misfit, timing, noise",
+    "point": "the identified parameters and delays",
+    "posterior": "the posterior of the identification",
+    "all": "posterior, misfit, recorded timing and noise",
 }
 CLOSE_M = 0.02
 """How near the arm's tip must come to its target [m]."""
@@ -154,6 +158,67 @@ def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
+def evidence(ideal: Mapping[str, Any], judged: Mapping[str, Any]) -> str:
+    """Return README's table: what sim2real reaches beside the best of the others, then the set that it loses."""
+    share = {r["name"].removeprefix("randomise/"): 100 * r["value"] for r in ideal["rows"] if r["value"] is not None}
+    count, trials = len(ideal["robots"]), ideal["flags"]["trials"]
+    lines = [
+        ("measured on", "sim2real", "compared with"),
+        ("---", "---:", "---:"),
+        (
+            f"success of policies on {count} robots with hidden parameters and delays, {trials} deployments each",
+            f"{share['all/success']:.0f} %",
+            f"{share['data_sheet/success']:.0f} % trained on the data sheet",
+        ),
+    ]
+    sets = {name: _mean_errors(judged, name) for name in LEAGUE_SETS}
+    lost = []
+    for name, errors in sets.items():
+        best = min((e for e in errors if e != "ours"), key=lambda e: errors[e])
+        line = (
+            f"{LEAGUE_SETS[name]}, mean over held-out parts",
+            f"{errors['ours']:.1f} mrad",
+            f"{errors[best]:.1f} mrad by {LEAGUE_ENTRANTS[best]}",
+        )
+        (lines if errors["ours"] < errors[best] else lost).append(line)
+    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    return text + "".join(f"\nsim2real loses on one set, {what}: {own} against {other}.\n"
+                          for what, own, other in lost)  # fmt: skip
+
+
+def _mean_errors(judged: Mapping[str, Any], name: str) -> dict[str, float]:
+    """Return entrant -> mean error on a set of the league [mrad]."""
+    scale = {"rad": 1e3, "mrad": 1.0}
+    means = {r["name"]: scale[r["unit"]] * r["value"] for r in judged["rows"] if r["value"] is not None}
+    found = {entrant: means.get(f"league/{name}/{entrant}/mean") for entrant in ("ours", *LEAGUE_ENTRANTS)}
+    return {entrant: value for entrant, value in found.items() if value is not None}
+
+
+def what_training_knows(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
+    """Return README's figure as SVG: success on hidden robots by what the training was given."""
+    shares = [{r["name"].removeprefix("randomise/"): r["value"] for r in report["rows"]} for report in (ideal, worn)]
+    row_px, left_px, scale_px = 44, 390, 3.6
+    height_px = 60 + row_px * len(TRAINED_ON)
+    body = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 {height_px}" font-family="sans-serif">',
+        "<title>Success on hidden robots by what the training was given</title>",
+        f'<rect width="820" height="{height_px}" fill="#ffffff"/>',
+        '<rect x="390" y="14" width="14" height="12" fill="#0b62b0"/><text x="410" y="25">nearly ideal robots</text>',
+        '<rect x="570" y="14" width="14" height="12" fill="#b8540c"/><text x="590" y="25">worn robots</text>',
+    ]
+    for i, (way, label) in enumerate(TRAINED_ON.items()):
+        top_px = 44 + i * row_px
+        body.append(f'<text x="{left_px - 12}" y="{top_px + 20}" text-anchor="end">{label}</text>')
+        for j, (share, colour) in enumerate(zip(shares, ("#0b62b0", "#b8540c"), strict=True)):
+            percent = 100 * share[f"{way}/success"]
+            y_px = top_px + 16 * j
+            body.append(
+                f'<rect x="{left_px}" y="{y_px}" width="{scale_px * percent:.0f}" height="13" fill="{colour}"/>'
+                f'<text x="{left_px + scale_px * percent + 6:.0f}" y="{y_px + 11}">{percent:.0f} %</text>'
+            )
+    return "\n".join([*body, "</svg>", ""])
+
+
 def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> str:
     """Return the table of an arm: the first seed of the run on a CPU, and training on an accelerator if measured."""
     seed = cpu["seeds"][0]
@@ -189,13 +254,14 @@ def origin(reports: Mapping[str, dict[str, Any]]) -> str:
     return f"\nCommit that was measured: {listed}.\n"
 
 
-def updated(readme: str, tables: Mapping[str, str]) -> str:
-    """Return the README with each table between the two markers of its name."""
+def updated(page: str, tables: Mapping[str, str]) -> str:
+    """Return a page with each of its tables between the two markers of the table's name."""
     for name, text in tables.items():
         begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->\n"
-        head, _, rest = readme.partition(begin)
-        readme = head + begin + text + end + rest.partition(end)[2]
-    return readme
+        if begin in page:
+            head, _, rest = page.partition(begin)
+            page = head + begin + text + end + rest.partition(end)[2]
+    return page
 
 
 def read_reports() -> dict[str, dict[str, Any]]:
@@ -207,6 +273,7 @@ def read_reports() -> dict[str, dict[str, Any]]:
 def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
     """Return the tables of which there are all reports."""
     write: dict[str, Callable[[dict[str, dict[str, Any]]], str]] = {
+        "evidence": lambda own: evidence(own["randomise"], own["league"]),
         "demo": lambda own: demo(own["demo"]),
         "arm": lambda own: arm("the arm: three position-controlled servos on one bus", *own.values()),
         "so101": lambda own: arm("the SO-101: six servos with the parameters of a real one", *own.values()),
@@ -230,7 +297,7 @@ def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Update README.md in place."""
+    """Update the pages in place."""
     parser = argparse.ArgumentParser(prog="readme.py", description=__doc__)
     names = [name for table in TABLES.values() for name in table]
     parser.add_argument(
@@ -245,8 +312,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if refused:
         print(f"\nhint: measure again, or --stale-ok {' '.join(refused)}", file=sys.stderr)
         return 1
-    readme = ROOT / "README.md"
-    readme.write_text(updated(readme.read_text(), tables(reports)))
+    for page in (ROOT / name for name in PAGES):
+        page.write_text(updated(page.read_text(), tables(reports)))
+    (ROOT / FIGURE).write_text(what_training_knows(reports["randomise"], reports["randomise_worn"]))
     return 0
 
 

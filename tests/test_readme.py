@@ -1,7 +1,9 @@
 """What README.md says was measured must be what reports/ holds, and what it links to must be there."""
 
 import importlib.util
+import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -19,28 +21,56 @@ def script():
 
 
 def test_the_tables_are_those_of_the_reports(script):
+    reports = script.read_reports()
+    tables = script.tables(reports)
+    pages = {name: (ROOT / name).read_text() for name in script.PAGES}
+    assert {name: script.updated(text, tables) for name, text in pages.items()} == pages
+    assert all(any(f"<!-- {name}:begin -->" in text for text in pages.values()) for name in tables)
+    figure = script.what_training_knows(reports["randomise"], reports["randomise_worn"])
+    assert (ROOT / script.FIGURE).read_text() == figure
+
+
+def test_the_readme_is_read_in_a_minute():
     text = (ROOT / "README.md").read_text()
-    tables = script.tables(script.read_reports())
-    assert script.updated(text, tables) == text
-    assert all(f"<!-- {name}:begin -->" in text for name in tables)
+    assert len(text.splitlines()) <= 120
+    assert re.search(r"^    make demo", text, re.MULTILINE).start() < 0.25 * len(text)
+    for guide in (ROOT / "docs" / "guides").glob("*.md"):
+        assert f"docs/guides/{guide.name}" in text
+    assert (ROOT / "docs" / "images" / "swing_up.gif").stat().st_size < 2e6
+
+
+def test_the_evidence_names_the_sets_that_are_lost(script):
+    """The table holds the best of the others on each set, whoever wins; a lost set stands below it."""
+    reports = script.read_reports()
+    text = script.tables(reports)["evidence"]
+    worse = json.loads(json.dumps(reports["league"]))
+    for row in worse["rows"]:
+        if row["name"] == "league/go2/ours/mean":
+            row["value"] = 5.0
+    assert "Unitree Go2 in the air, RMSE, mean over held-out parts | 4.1 mrad | 4.3 mrad" in text
+    lost = script.evidence(reports["randomise"], worse)
+    assert "loses on one set, Unitree Go2 in the air, RMSE, mean over held-out parts: 5.0 mrad against 4.3 mrad" in lost
 
 
 def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, tmp_path, capsys):
-    readme = (ROOT / "README.md").read_text()
+    pages = {name: (ROOT / name).read_text() for name in script.PAGES}
     reports = {
         name: {k: v for k, v in r.items() if k not in ("measured", "commit")}
         for name, r in script.read_reports().items()
     }
-    (tmp_path / "README.md").write_text(readme)
+    for name, text in pages.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    (tmp_path / script.FIGURE).parent.mkdir()
     monkeypatch.setattr(script, "ROOT", tmp_path)
     monkeypatch.setattr(script, "read_reports", lambda: reports)
     assert script.main([]) == 1
     told = capsys.readouterr().err
     assert "reports/demo.json: it does not say which state of the code it is of" in told
-    assert "hint: measure again, or --stale-ok demo arm_cpu arm_h200 so101_cpu identify_disk" in told
-    assert (tmp_path / "README.md").read_text() == readme
+    assert "hint: measure again, or --stale-ok randomise league demo arm_cpu arm_h200 so101_cpu identify_disk" in told
+    assert {name: (tmp_path / name).read_text() for name in pages} == pages
     assert script.main(["--stale-ok", *reports]) == 0
-    assert "Commit that was measured: not recorded (demo)." in (tmp_path / "README.md").read_text()
+    assert "Commit that was measured: not recorded (demo)." in (tmp_path / "docs" / "results.md").read_text()
 
 
 @pytest.fixture
@@ -87,3 +117,8 @@ def test_links_lead_somewhere():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "guides").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert target.startswith("https://") or (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_the_citation_names_the_version_of_the_package():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
