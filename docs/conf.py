@@ -2,6 +2,8 @@
 
 from importlib import metadata
 
+from sphinx.application import Sphinx
+
 project = "sim2real"
 author = "The sim2real authors"
 copyright = author
@@ -38,3 +40,14 @@ suppress_warnings = ["ref.python"]
 # Warp is an extra, whose wheel has 150 MB: its modules are documented without it.
 _WARP = "mujoco.mjx.third_party.mujoco_warp"
 autodoc_mock_imports = ["warp", _WARP, f"{_WARP}._src"]
+
+
+def setup(app: Sphinx) -> None:
+    """Register the handler below with Sphinx."""
+    app.connect("source-read", document_each_name_once)
+
+
+def document_each_name_once(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Give a package's page the options of a module's page: apidoc ignores `automodule_options` for packages."""
+    if docname.startswith("reference/api/"):
+        source[0] = source[0].replace(":undoc-members:", ":ignore-module-all:")

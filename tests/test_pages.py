@@ -1,0 +1,137 @@
+"""Files, modules and links that the pages name exist; tables that people extend stay well formed."""
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+GROUPS = {"sim2real.pipelines", "sim2real.devices", "sim2real.worlds"}
+"""Groups of entry points, which are named like modules."""
+PACKAGES = (
+    "errors|graph|runtime|policy|composer|worlds|hardware|log|artifacts|identify|train|robots|view|stages|interop"
+)
+"""Packages whose constants choices.md may name."""
+
+
+def without_code(text: str) -> str:
+    """Return a page without its blocks of code."""
+    return re.sub(r"^(`{3,}).*?^\1$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def rows(text: str, header: str) -> list[list[str]]:
+    """Return the cells of the rows of the table with a header, in their order."""
+    lines = text.splitlines()
+    start = lines.index(header) + 2
+    end = next((i for i, line in enumerate(lines[start:], start) if not line.startswith("|")), len(lines))
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[start:end]]
+
+
+def resolve(name: str) -> object:
+    """Return the module, class or function of a dotted name; old names of modules do not count."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:length])
+        if path.with_suffix(".py").is_file() or (path / "__init__.py").is_file():
+            value = importlib.import_module(".".join(parts[:length]))
+            for part in parts[length:]:
+                value = getattr(value, part)
+            return value
+    raise ModuleNotFoundError(name)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as MyST and GitHub make them."""
+    headings = re.findall(r"^#+ (.+)$", without_code(page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def broken_links(page: Path, text: str) -> list[str]:
+    """Return the targets of a page's links to files or headings that do not exist."""
+    wrong = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(text)):
+        name, _, anchor = target.partition("#")
+        path = page.parent / name if name else page
+        if not target.startswith("https://") and (
+            not path.exists() or (anchor and path.suffix == ".md" and anchor not in anchors(path))
+        ):
+            wrong.append(target)
+    return wrong
+
+
+def test_links_lead_to_files_and_headings():
+    assert {p.name: wrong for p in PAGES if (wrong := broken_links(p, p.read_text()))} == {}
+
+
+def test_broken_links_are_seen():
+    page = ROOT / "docs" / "index.md"
+    text = "[a](timing.md) [b](none.md) [c](graph.md#no-such-heading) [d](https://example.com) [e](#sim2real)"
+    assert broken_links(page, text) == ["none.md", "graph.md#no-such-heading"]
+
+
+def test_modules_named_on_pages_exist():
+    names = {m[0]: p.name for p in PAGES for m in re.finditer(r"\bsim2real(?:\.[A-Za-z_]\w*)+", p.read_text())}
+    wrong = {}
+    for name in sorted(names.keys() - GROUPS):
+        try:
+            resolve(name)
+        except (ModuleNotFoundError, AttributeError):
+            wrong[name] = names[name]
+    assert len(names) > 30
+    assert wrong == {}
+
+
+@pytest.mark.parametrize("name", ["sim2real.hardware.gate", "sim2real.graph.rules.no_such_rule", "sim2real.nothing"])
+def test_old_and_wrong_names_of_modules_are_seen(name):
+    with pytest.raises((ModuleNotFoundError, AttributeError)):
+        resolve(name)
+
+
+def test_paths_of_source_files_on_pages_exist():
+    pattern = r"`((?:sim2real|pipelines|scripts|tests|datasets|reports)/[\w/.*-]+\.\w+)`"
+    paths = {(page.name, m[1]) for page in PAGES for m in re.finditer(pattern, without_code(page.read_text()))}
+    paths = {(page, path) for page, path in paths if not page.startswith("tutorial")}  # they name the reader's files
+    assert len(paths) > 40
+    assert [found for found in paths if not list(ROOT.glob(found[1]))] == []
+
+
+def test_the_map_of_behaviours_names_files_that_exist():
+    table = rows((ROOT / "CONTRIBUTING.md").read_text(), "| To change | open |")
+    assert len(table) >= 30
+    assert len({behaviour for behaviour, _ in table}) == len(table)
+    assert [file for _, file in table if not (ROOT / file.strip("`")).is_file()] == []
+
+
+def test_every_noun_stands_in_the_glossary_once():
+    text = (ROOT / "docs" / "reference" / "glossary.md").read_text()
+    nouns = re.findall(r"^\| ([a-z][\w -]+) \| \S", text, re.MULTILINE)
+    nouns = [noun for noun in nouns if noun != "noun"]
+    assert len(nouns) == len(set(nouns)) == 64
+    assert {"log", "estimate", "held-out part", "false-alarm rate", "stale command", "bundle"} <= set(nouns)
+
+
+def malformed(table: list[list[str]]) -> list[str]:
+    """Return the rows of choices.md that lack a cell, or whose constant stands without its module."""
+    module = re.compile(rf"`(?:sim2real[./])?(?:{PACKAGES}|pipelines)[./]")
+    return [" | ".join(row) for row in table if len(row) != 4 or not all(row) or not module.search(row[0])]
+
+
+def test_rows_of_choices_are_complete():
+    text = (ROOT / "docs" / "reference" / "choices.md").read_text()
+    assert malformed(rows(text, "| constant | value | what was measured | commit or report |")) == []
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("| `sim2real.graph.node.B` | 2 s | x |", 1),
+        ("| `A` | 2 s | x | y |", 1),
+        ("| `sim2real.graph.node.B` | 2 s | | y |", 1),
+        ("| `sim2real.graph.node.B` | 2 s | a \\| b | y |", 0),
+        ("| `stages/check/stage.py`: `_LIMIT` | 2 s | x | y |", 0),
+    ],
+)
+def test_wrong_rows_of_choices_are_seen(line, wrong):
+    assert len(malformed(rows(f"| a |\n|---|\n{line}", "| a |"))) == wrong
