@@ -20,7 +20,7 @@ IMPORTED_AS = {
 MAY_IMPORT = {
     "view": {"sim2real.view.rerun_recording", "pipelines.arm.scene", "pipelines.pendulum.scene"},
     "hardware": {"sim2real.policy.runner"},
-    "interop": {"sim2real.composer.interop.copies", "sim2real.composer.interop.counted"},
+    "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
     "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.importing.files.lerobot"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},

@@ -82,7 +82,7 @@ BENCHES = {
     "interop": Bench(
         "interop",
         "our PPO against brax's, in the same environment",
-        (*_GRAPH, "sim2real/train", "sim2real/interop", "sim2real/composer/interop", "scripts/benches/train.py"),
+        (*_GRAPH, "sim2real/train", "sim2real/interop", "scripts/benches/train.py"),
     ),
     "league": Bench(
         "league",

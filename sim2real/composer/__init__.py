@@ -1,14 +1,14 @@
 """Worlds from parts: entities, arenas, tasks, observables and the environment that runs them.
 
-Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``. What tasks are written with
-is here and in ``mjcf``, ``observation``, ``variation`` and ``initializers``. The rest is machinery: ``models`` edits
-and composes models, ``c`` and ``mjx`` are the two engines, ``interop`` has the interfaces of other libraries.
+Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``. A task uses the names here and
+in ``mjcf``, ``observation``, ``variation`` and ``initializers``. ``models`` edits and composes models, ``physics`` has
+the two engines. ``BraxEnv`` and ``MjxVectorEnv`` live in ``sim2real.interop``.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.arena import Arena as Arena
 from sim2real.composer.constants import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
@@ -34,20 +34,20 @@ from sim2real.composer.task import Task as Task
 from sim2real.composer.variation.base import Variation as Variation
 
 if TYPE_CHECKING:
-    from sim2real.composer.interop.brax_env import BraxEnv as BraxEnv
-    from sim2real.composer.interop.vector_env import MjxVectorEnv as MjxVectorEnv
     from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
     from sim2real.composer.world import ComposedWorld as ComposedWorld
+    from sim2real.interop.brax_adapter import BraxEnv as BraxEnv
+    from sim2real.interop.gymnasium_adapter import MjxVectorEnv as MjxVectorEnv
 
 _LAZY = {
-    "BraxEnv": "sim2real.composer.interop.brax_env",
+    "BraxEnv": "sim2real.interop.brax_adapter",
     "ComposedWorld": "sim2real.composer.world",
     "MjxEnvironment": "sim2real.composer.physics.mjx.environment",
-    "MjxVectorEnv": "sim2real.composer.interop.vector_env",
+    "MjxVectorEnv": "sim2real.interop.gymnasium_adapter",
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import what needs JAX, brax or gymnasium when it is first used."""
     if name not in _LAZY:
         raise AttributeError(f"module 'sim2real.composer' has no attribute {name!r}")

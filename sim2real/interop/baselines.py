@@ -1,4 +1,4 @@
-"""A gymnasium vector environment as a ``VecEnv`` of Stable-Baselines3, which has an interface of its own."""
+"""A gymnasium vector environment as a ``VecEnv`` of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -8,49 +8,53 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.composer.interop.copies import AutoresetMode, CopiesVectorEnv
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.interop.gymnasium_adapter import AutoresetMode, CopiesVectorEnv
+from sim2real.types import PyTree
+
+Indices = int | Iterable[int] | None
+"""Copies; None: all."""
 
 
-def to_baselines(env: CopiesVectorEnv, seed: int | None = None) -> Any:
+def to_baselines(env: CopiesVectorEnv[Any], seed: int | None = None) -> Any:
     """Return a vector environment as a ``stable_baselines3.common.vec_env.VecEnv``.
 
-    An episode that the time limit cut has ``TimeLimit.truncated`` in its info, and every one that ended
-    ``terminal_observation``, from which Stable-Baselines3 takes the value of what would have followed.
+    An episode that a time limit ended has ``TimeLimit.truncated`` in its info, and every episode that ended
+    ``terminal_observation``: Stable-Baselines3 estimates the value of the state after it from that.
 
     Args:
-        env: Copies that start anew in the step that ends an episode, ``autoreset_mode="SameStep"``.
+        env: Its ``autoreset_mode`` must be ``"SameStep"``.
         seed: Seed of the episodes; default: a random one.
 
     Raises:
         Sim2RealError: When Stable-Baselines3 is not installed.
-        UsageError: When copies start anew at another time.
+        UsageError: When copies are reset in another step.
     """
     if env.autoreset_mode is not AutoresetMode.SAME_STEP:
         raise UsageError(
-            f"Stable-Baselines3 starts copies anew in the step that ends an episode, and this environment's mode is "
+            f"Stable-Baselines3 resets copies in the step that ends an episode, and this environment's mode is "
             f"{env.autoreset_mode.value!r}",
             hint="make it with autoreset_mode='SameStep'",
         )
     try:
-        # By name: it comes with PyTorch, and is no dependency.
+        # By name: Stable-Baselines3 installs PyTorch, so it is no dependency.
         base: Any = importlib.import_module("stable_baselines3.common.vec_env").VecEnv
     except ImportError as error:
         raise Sim2RealError(
             "Stable-Baselines3 is not installed", hint="pip install stable-baselines3, which installs PyTorch"
         ) from error
 
-    kind: Any = type("BaselinesVecEnv", (_Copies, base), {})  # its base class is known only now
-    made = kind(env.num_envs, env.single_observation_space, env.single_action_space)
-    made.env = env
-    made.seed(seed)
-    return made
+    kind: Any = type("BaselinesVecEnv", (_Copies, base), {})
+    adapted = kind(env.num_envs, env.single_observation_space, env.single_action_space)
+    adapted.env = env
+    adapted.seed(seed)
+    return adapted
 
 
 class _Copies:
-    """The methods that Stable-Baselines3 asks for."""
+    """The methods that Stable-Baselines3 calls."""
 
-    env: CopiesVectorEnv
+    env: CopiesVectorEnv[Any]
     num_envs: int
     render_mode = None
 
@@ -69,40 +73,40 @@ class _Copies:
         """Keep the actions for ``step_wait``."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, PyTree]]]:
         """Step all copies."""
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
-        told: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
+        copy_infos: list[dict[str, PyTree]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
         for i in np.flatnonzero(done):
             final = infos["final_info"]
-            told[i]["terminal_observation"] = infos["final_obs"][i]
-            told[i] |= {name: value[i] for name, value in final.items() if not name.startswith("_")}
-        return observation, reward.astype(np.float32), done, told
+            copy_infos[i]["terminal_observation"] = infos["final_obs"][i]
+            copy_infos[i] |= {name: value[i] for name, value in final.items() if not name.startswith("_")}
+        return observation, reward.astype(np.float32), done, copy_infos
 
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, for each of some copies."""
-        of = self if attr_name == "render_mode" else self.env
-        return [getattr(of, attr_name) for _ in self._chosen(indices)]
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[object]:
+        """Return an attribute of the environment, once for each of some copies."""
+        owner = self if attr_name == "render_mode" else self.env
+        return [getattr(owner, attr_name) for _ in self._selected(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: copies are steps of one program, none has attributes of its own."""
+    def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
+        """Refuse: all copies run in one program, and have no attributes of their own."""
         raise UsageError(f"copies have no attributes of their own: {attr_name!r} cannot be set")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: object, indices: Indices = None, **options: object) -> list[object]:
         """Call a method of the environment once, and return its result for each of some copies."""
         result = getattr(self.env, method_name)(*args, **options)
-        return [result for _ in self._chosen(indices)]
+        return [result for _ in self._selected(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
         """Return that no copy is wrapped."""
-        return [False for _ in self._chosen(indices)]
+        return [False for _ in self._selected(indices)]
 
-    def _chosen(self, indices: Any) -> Iterable[int]:
+    def _selected(self, indices: Indices) -> Iterable[int]:
         if indices is None:
             return range(self.num_envs)
         return [indices] if isinstance(indices, int) else indices

@@ -1,40 +1,77 @@
-"""A robot with its delays, as pure functions of one copy that the adapters to other libraries take."""
+"""A robot with its delays as a pure environment."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from dm_env import specs
 
-from sim2real.composer.interop.moment import Moment
 from sim2real.errors import UsageError
-from sim2real.interop.entries import entries_of
+from sim2real.interop.pure_environment import Transition
 from sim2real.policy.contract import PolicyContract
-from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.environment.graph_environment import EnvState, GraphEnvironment
 from sim2real.train.environment.policy_steps import PolicySteps
+
+if TYPE_CHECKING:
+    from sim2real.types import Key
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of an observation or an action.
+
+    Attributes:
+        name: E.g. ``past voltage[0][2]``: the term, its age in steps, and the entry of that term.
+        unit: ``"1"`` for a number without a unit.
+        low: Lower bound [its unit]; infinite where the robot gives none.
+        high: Upper bound [its unit].
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+def entries_of(contract: PolicyContract) -> tuple[tuple[Entry, ...], tuple[Entry, ...]]:
+    """Return the entries of a policy's observation, and those of its action."""
+    bounds = [
+        (unit, low, high)
+        for term in contract.observation
+        for _ in range(term.history)
+        for unit, low, high in zip(
+            term.units, term.low or (-math.inf,) * term.size, term.high or (math.inf,) * term.size, strict=True
+        )
+    ]
+    observation = (Entry(name, *rest) for name, rest in zip(contract.observation_names, bounds, strict=True))
+    return tuple(observation), tuple(Entry(term.name, term.unit, term.low, term.high) for term in contract.action)
 
 
 class Copy(NamedTuple):
     """The state of one copy.
 
     Attributes:
-        env: The environment's.
-        key: Source of what is random in an episode.
-        cut: Whether the time limit has ended the episode.
+        env: The environment's state.
+        key: Source of the random numbers in an episode.
+        truncated: Whether the time limit has ended the episode.
     """
 
-    env: Any
+    env: EnvState
     key: jax.Array
-    cut: jax.Array
+    truncated: jax.Array
 
 
 class RobotEnvironment:
-    """One copy of a robot with its delays; see ``sim2real.composer.interop.moment.PureEnvironment``.
+    """One copy of a robot with its delays; see ``PureEnvironment``.
 
-    Every step is one of the policy's, and every episode has a random one of the graph's timelines, and its own
-    parameters. An episode is truncated where its timeline ends. Actions are clipped to their bounds, as the gate does
-    on the robot.
+    Every step is a step of the policy. Every episode has a random timeline of the graph and parameters of its own, and
+    is truncated at the end of the timeline. Actions are clipped to their bounds, as the gate does on the robot.
 
     Attributes:
         observation: The entries of an observation, in order.
@@ -50,40 +87,49 @@ class RobotEnvironment:
         self.steps = PolicySteps(env)
         self.observation, self.action = entries_of(contract)
         self.rate_hz, self.length = contract.rate_hz, self.steps.length
+        self.period_s = 1.0 / contract.rate_hz
         if len(self.observation) != env.observation_size:
             raise UsageError(
                 f"the robot's observation terms have {len(self.observation)} entries, its task shows "
                 f"{env.observation_size}",
                 hint="give each entry a name and a unit in the robot's `observation`",
             )
+        self.observation_spec, self.action_spec = _spec(self.observation), _spec(self.action)
 
-    def reset(self, key: jax.Array) -> Moment:
+    def reset(self, key: Key) -> Transition[Copy]:
         """Return a copy at the start of an episode."""
-        key, own = jax.random.split(key)
+        key, next_key = jax.random.split(key)
         state, observation = self.steps.reset(key)
-        no = jnp.bool_(False)
-        zero = jnp.float32(0)
-        idle = jnp.zeros(len(self.action), jnp.float32)
-        ending = {name: zero for name in jax.eval_shape(self.steps.step, state, idle, key).metrics}
-        return Moment(Copy(state, own, no), observation, zero, no, no, {}, ending)
+        no, zero = jnp.bool_(False), jnp.float32(0)
+        # The values of an episode have the same names as those of a step, so that both have one structure.
+        action = jnp.zeros(len(self.action), jnp.float32)
+        names = jax.eval_shape(self.steps.step, state, action, key).metrics
+        values = {name: zero for name in names}
+        return Transition(Copy(state, next_key, no), observation, zero, no, no, {}, values)
 
-    def step(self, state: Copy, action: jax.Array) -> Moment:
+    def step(self, state: Copy, action: jax.Array) -> Transition[Copy]:
         """Return the copy after the policy's next step.
 
         Args:
             action: Shape ``(A,)`` [the action's units].
         """
-        key, own = jax.random.split(state.key)
+        key, next_key = jax.random.split(state.key)
         low, high = (jnp.asarray(b, jnp.float32) for b in (self.steps.action_low, self.steps.action_high))
-        made = self.steps.step(state.env, jnp.clip(jnp.asarray(action, jnp.float32), low, high), key)
-        cut = made.truncated & ~made.terminated
-        reward = jnp.asarray(made.reward, jnp.float32)
-        return Moment(Copy(made.state, own, cut), made.observation, reward, made.terminated, cut, {}, made.metrics)
+        result = self.steps.step(state.env, jnp.clip(jnp.asarray(action, jnp.float32), low, high), key)
+        truncated = result.truncated & ~result.terminated
+        reward = jnp.asarray(result.reward, jnp.float32)
+        following = Copy(result.state, next_key, truncated)
+        return Transition(following, result.observation, reward, result.terminated, truncated, {}, result.metrics)
 
-    def cut(self, state: Copy) -> jax.Array:
+    def is_truncated(self, state: Copy) -> jax.Array:
         """Return whether the time limit has ended the episode."""
-        return state.cut
+        return state.truncated
 
-    def reseed(self, state: Copy, key: jax.Array) -> Copy:
-        """Return a state whose random numbers go on from ``key``."""
+    def reseed(self, state: Copy, key: Key) -> Copy:
+        """Return a state with random numbers from ``key``."""
         return state._replace(key=key)
+
+
+def _spec(entries: Sequence[Entry]) -> specs.BoundedArray:
+    low, high = np.array([(e.low, e.high) for e in entries], np.float32).T
+    return specs.BoundedArray((len(entries),), np.float32, low, high)

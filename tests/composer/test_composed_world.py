@@ -247,8 +247,8 @@ def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
 def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])
-    state = vector._moment.state
-    vector._moment = vector._moment._replace(state=state.replace(data=state.data.replace(qpos=places)))
+    state = vector._last.state
+    vector._last = vector._last._replace(state=state.replace(data=state.data.replace(qpos=places)))
     _, reward, terminated, truncated, infos = vector.step(np.zeros((4, 1)))
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
@@ -257,16 +257,15 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
 
 
 @pytest.mark.parametrize(
-    ("name", "modules", "needed"),
+    ("name", "module", "needed"),
     [
-        ("BraxEnv", ("brax_env", "counted"), "brax.envs.base"),
-        ("MjxVectorEnv", ("vector_env", "copies"), "gymnasium"),
+        ("BraxEnv", "brax_adapter", "brax.envs.base"),
+        ("MjxVectorEnv", "gymnasium_adapter", "gymnasium"),
     ],
 )
-def test_without_the_other_library_the_error_names_the_extra(name, modules, needed, monkeypatch):
+def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):
     monkeypatch.delitem(vars(composer), name, raising=False)
-    for module in modules:
-        monkeypatch.delitem(sys.modules, f"sim2real.composer.interop.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"sim2real.interop.{module}", raising=False)
     monkeypatch.setitem(sys.modules, needed, None)
     library = needed.partition(".")[0]
     with pytest.raises(Sim2RealError, match=f"for {library} need {library}, which is not installed") as caught:

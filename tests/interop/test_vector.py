@@ -124,7 +124,7 @@ def test_the_caller_may_reset_copies_that_are_done(env, pendulum):
     with pytest.raises(UsageError, match=r"copies \[0, 1, 2\] are done"):
         made.step(np.zeros((COPIES, 1)))
     mask = np.array([True, False, False])
-    before = np.asarray(made._moment.observation)
+    before = np.asarray(made._last.observation)
     seen, _ = made.reset(options={"reset_mask": mask})
     assert (seen[0] != before[0]).any()
     np.testing.assert_array_equal(seen[1:], before[1:])

@@ -1,1 +1,0 @@
-"""Composed tasks as the environments of other libraries."""
