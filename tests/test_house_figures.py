@@ -8,8 +8,8 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 58_400,
-    "lines of composer": 13_300,
+    "lines without composer": 58_750,
+    "lines of composer": 12_770,
     "files in the fullest folder": 15,
     "docstring lines [%]": 22.7,
     "Any in 1,000 lines": 26.7,
