@@ -1,4 +1,4 @@
-"""Modules that were called otherwise in the last release: their old names still work, with a warning."""
+"""Old names of modules that have moved since the last release: an import by the old name works, with a warning."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MOVED = {
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Import the module of the new name under the old one."""
+    """Imports the module of the new name when a program imports the old name."""
 
     def __init__(self) -> None:
         self._specs: dict[str, importlib.machinery.ModuleSpec | None] = {}
@@ -64,10 +64,10 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Give the module its own spec back, which the import has replaced; it has run under its new name."""
+        """Restore the module's spec, which this import replaced; the module ran under its new name."""
         module.__spec__ = self._specs.pop(module.__name__)
 
 
 def install() -> None:
-    """Let the old names be found, after everything that exists."""
+    """Make the old names importable; modules that exist under such a name come first."""
     sys.meta_path.append(_Finder())

@@ -1,5 +1,6 @@
 """The command line: what it says, where it says it, and the exit codes."""
 
+import ast
 import json
 import os
 import signal
@@ -400,7 +401,15 @@ def test_nothing_heavy_is_imported_for_help(code):
 def test_public_names_are_listed_where_they_come_from():
     import sim2real
 
-    assert set(sim2real.__all__) == {*sim2real._HOME_OF, *sim2real._ROOMS}
+    stub = Path(sim2real.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    typed = {
+        (node.module, name.name)
+        for node in ast.parse(stub).body
+        if isinstance(node, ast.ImportFrom) and node.module != "sim2real"
+        for name in node.names
+    }
+    assert typed == {(module, name) for name, module in sim2real._MODULE_OF_NAME.items()}
+    assert set(sim2real.__all__) == set(sim2real._MODULE_OF_NAME) >= set(sim2real._CALLABLE_PACKAGES)
     assert sim2real.Sim2RealError is errors.Sim2RealError
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = sim2real.Nothing

@@ -15,7 +15,7 @@ ROOMS = [
     "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "artifacts", "identify", "train", "robots",
     "view", "stages", "interop", "commands", "cli",
 ]  # fmt: skip
-EVERYWHERE = {"arrays", "errors", "leaps", "moved", "room", "types"}
+EVERYWHERE = {"arrays", "errors", "leaps", "moved", "callable_package", "types"}
 STAGES = {path.parent.name for path in (PACKAGE / "stages").glob("*/stage.py")}
 COMPOSED = {"latency": {"record", "identify"}}
 """Stages that call other stages: latency records steps and identifies the delay from them."""

@@ -2,14 +2,14 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sim2real import room
+from sim2real import callable_package
 
 if TYPE_CHECKING:
     from sim2real.identify.search.minimum import minimise as minimise
 
 __all__ = ["minimise"]
 
-room(__name__)
+callable_package(__name__)
 
 
 def __getattr__(name: str) -> Any:

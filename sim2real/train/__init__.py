@@ -1,5 +1,5 @@
 """Policies from graphs: the environment that PPO trains on, PPO, the policy."""
 
-from sim2real import room
+from sim2real import callable_package
 
-room(__name__)
+callable_package(__name__)
