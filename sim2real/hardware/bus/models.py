@@ -41,5 +41,5 @@ def table(models: Iterable[ServoModel]) -> str:
     rows = [
         (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source) for m in models
     ]
-    lines = [("Servo", "By itself, when the computer dies", "Known from"), ("---",) * 3, *rows]
+    lines = [("Servo", "Reaction when the computer dies", "Source"), ("---",) * 3, *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
