@@ -222,6 +222,11 @@ class RandomState(Protocol):
 Varying: TypeAlias = "ArrayLike | Callable[..., Any] | Sequence[Varying] | Mapping[str, Varying] | None"
 """A value, a variation that draws one, or lists and dicts of these: what ``variation.evaluate`` takes."""
 
+Index: TypeAlias = Any
+"""A key of an array: a number, a slice, an array, or a tuple of these; names too where rows have names."""
+ArrayModule: TypeAlias = Any
+"""The module of an engine's arrays: ``numpy`` or ``jax.numpy``."""
+
 Steps: TypeAlias = int | Callable[..., int]
 """A number of physics steps or of samples, or a variation or a function that draws one."""
 Aggregate: TypeAlias = Callable[[Any], Any]

@@ -8,16 +8,20 @@ from __future__ import annotations
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
+
+import numpy as np
 
 from sim2real.composer.physics.arrays import is_jax, namespace
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import ArrayLike, RandomState, Varying
+    from sim2real.composer.physics.mjx.random import JaxRandomState
+    from sim2real.composer.types import ArrayLike, Index, RandomState, Varying
+    from sim2real.types import PyTree
 
 
-def evaluate(structure: Varying, *args: Any, **kwargs: Any) -> Any:
-    """Return nested dicts, lists and tuples with every callable in them replaced by what it returns."""
+def evaluate(structure: Varying, *args: PyTree, **kwargs: PyTree) -> PyTree:
+    """Return nested dicts, lists and tuples with every callable in them replaced by its result."""
     if isinstance(structure, dict):
         return type(structure)((k, evaluate(v, *args, **kwargs)) for k, v in structure.items())
     if isinstance(structure, tuple) and hasattr(structure, "_fields"):
@@ -36,7 +40,7 @@ class Variation(ABC):
         initial_value: ArrayLike | None = None,
         current_value: ArrayLike | None = None,
         random_state: RandomState | None = None,
-    ) -> Any:
+    ) -> PyTree:
         """Return a value."""
 
     def __add__(self, other: Varying) -> Variation:
@@ -75,30 +79,81 @@ class Variation(ABC):
     def __rpow__(self, other: Varying) -> Variation:
         return BinaryOperation(operator.pow, other, self)
 
-    def __getitem__(self, index: Any) -> Variation:
+    def __getitem__(self, index: Index) -> Variation:
         return GetItemOperation(self, index)
 
     def __neg__(self) -> Variation:
         return UnaryOperation(operator.neg, self)
 
 
-class UnaryOperation(Variation):
-    """An operator applied to a variation."""
+def is_compiled(random_state: RandomState | None) -> TypeGuard[JaxRandomState]:
+    """Return whether random numbers are drawn inside a compiled program, which carries values from draw to draw."""
+    return hasattr(random_state, "recall")
 
-    def __init__(self, op: Callable[[Any], Any], variation: Varying) -> None:
-        self._op, self._variation = op, variation
+
+class Context(NamedTuple):
+    """Arguments of a variation.
+
+    Attributes:
+        initial_value: The value before the first variation.
+        current_value: The value now.
+        random_state: Source of random numbers; None: numpy's global one.
+    """
+
+    initial_value: PyTree
+    current_value: PyTree
+    random_state: RandomState | None
+
+    @property
+    def source(self) -> RandomState:
+        """The source of random numbers."""
+        return self.random_state or np.random
+
+    def shape(self, single_sample: bool) -> tuple[int, ...] | None:
+        """Return the shape of the initial value; None for a single sample."""
+        return None if single_sample or self.initial_value is None else np.shape(self.initial_value)
+
+    def base(self, cumulative: bool) -> PyTree:
+        """Return the value that a variation changes: the current one, or the initial one."""
+        return self.current_value if cumulative else self.initial_value
+
+
+class Drawn(Variation):
+    """A variation whose subclasses compute the value in ``_value``."""
 
     def __call__(
         self,
         initial_value: ArrayLike | None = None,
         current_value: ArrayLike | None = None,
         random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the operator's result."""
-        return self._op(evaluate(self._variation, initial_value, current_value, random_state))
+    ) -> PyTree:
+        """Return a value."""
+        return self._value(Context(initial_value, current_value, random_state))
+
+    @abstractmethod
+    def _value(self, context: Context) -> PyTree:
+        """Return a value."""
+
+
+class Parametric(Drawn):
+    """A variation that is equal to another one of its class with equal parameters."""
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, UnaryOperation) and (self._op, self._variation) == (other._op, other._variation)
+        return isinstance(other, type(self)) and [*vars(self).values()] == [*vars(other).values()]
+
+    def __repr__(self) -> str:
+        parameters = ", ".join(f"{name.removeprefix('_')}={value}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({parameters})"
+
+
+class UnaryOperation(Parametric):
+    """An operator applied to a variation."""
+
+    def __init__(self, op: Callable[[PyTree], PyTree], variation: Varying) -> None:
+        self._op, self._variation = op, variation
+
+    def _value(self, context: Context) -> PyTree:
+        return self._op(evaluate(self._variation, *context))
 
     def __str__(self) -> str:
         return f"{self._op.__name__}({self._variation})"
@@ -107,31 +162,14 @@ class UnaryOperation(Variation):
         return f"UnaryOperation({self})"
 
 
-class BinaryOperation(Variation):
-    """An operator applied to two values, at least one of which varies.
+class BinaryOperation(Parametric):
+    """An operator applied to two values, at least one of which varies."""
 
-    Args:
-        op: The operator, a function of two values.
-    """
-
-    def __init__(self, op: Callable[[Any, Any], Any], first: Varying, second: Varying) -> None:
+    def __init__(self, op: Callable[[PyTree, PyTree], PyTree], first: Varying, second: Varying) -> None:
         self._op, self._first, self._second = op, first, second
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the operator's result."""
-        first = evaluate(self._first, initial_value, current_value, random_state)
-        second = evaluate(self._second, initial_value, current_value, random_state)
-        return self._op(first, second)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BinaryOperation):
-            return False
-        return (self._op, self._first, self._second) == (other._op, other._first, other._second)
+    def _value(self, context: Context) -> PyTree:
+        return self._op(evaluate(self._first, *context), evaluate(self._second, *context))
 
     def __str__(self) -> str:
         return f"{self._op.__name__}({self._first}, {self._second})"
@@ -140,26 +178,15 @@ class BinaryOperation(Variation):
         return f"BinaryOperation({self._op.__name__}({self._first!r}, {self._second!r}))"
 
 
-class GetItemOperation(Variation):
+class GetItemOperation(Parametric):
     """A part of a variation's value."""
 
-    def __init__(self, variation: Varying, index: Any) -> None:
+    def __init__(self, variation: Varying, index: Index) -> None:
         self._variation, self._index = variation, index
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the part."""
-        value = evaluate(self._variation, initial_value, current_value, random_state)
+    def _value(self, context: Context) -> PyTree:
+        value = evaluate(self._variation, *context)
         return (value if is_jax(value) else namespace(value).asarray(value))[self._index]
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, GetItemOperation):
-            return False
-        return (self._variation, self._index) == (other._variation, other._index)
 
     def __str__(self) -> str:
         return f"{self._variation}[{self._index}]"

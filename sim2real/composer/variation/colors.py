@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import colorsys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.composer.physics.arrays import namespace
-from sim2real.composer.variation.base import Variation, evaluate
+from sim2real.composer.variation.base import Context, Parametric, evaluate
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import ArrayLike, RandomState, Varying
+    from sim2real.composer.types import Varying
+    from sim2real.types import PyTree
 
 
-class RgbVariation(Variation):
+class RgbVariation(Parametric):
     """Red, green, blue and alpha.
 
     Args:
@@ -25,27 +26,14 @@ class RgbVariation(Variation):
     """
 
     def __init__(self, r: Varying, g: Varying, b: Varying, alpha: Varying = 1.0) -> None:
-        self._channels = [r, g, b, alpha]
+        self._r, self._g, self._b, self._alpha = r, g, b, alpha
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return a colour."""
-        values = evaluate(self._channels, initial_value, current_value, random_state)
+    def _value(self, context: Context) -> PyTree:
+        values = evaluate([self._r, self._g, self._b, self._alpha], *context)
         return namespace(values).asarray(values)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RgbVariation) and self._channels == other._channels
 
-    def __repr__(self) -> str:
-        r, g, b, alpha = self._channels
-        return f"RgbVariation(r={r}, g={g}, b={b}, alpha={alpha})"
-
-
-class HsvVariation(Variation):
+class HsvVariation(Parametric):
     """Hue, saturation, value and alpha.
 
     Args:
@@ -56,29 +44,16 @@ class HsvVariation(Variation):
     """
 
     def __init__(self, h: Varying, s: Varying, v: Varying, alpha: Varying = 1.0) -> None:
-        self._channels = (h, s, v, alpha)
+        self._h, self._s, self._v, self._alpha = h, s, v, alpha
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return a colour."""
-        h, s, v, alpha = evaluate(self._channels, initial_value, current_value, random_state)
+    def _value(self, context: Context) -> PyTree:
+        h, s, v, alpha = evaluate((self._h, self._s, self._v, self._alpha), *context)
         xp = namespace(h, s, v, alpha)
         if xp is np:
             return np.asarray([*colorsys.hsv_to_rgb(h, s, v), alpha])
         # The same without branches: a channel falls from v to v (1 - s) with the hue's distance from it.
         places = (xp.asarray([5.0, 3.0, 1.0]) + 6.0 * h) % 6.0
         return xp.append(v - v * s * xp.clip(xp.minimum(places, 4.0 - places), 0.0, 1.0), alpha)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, HsvVariation) and self._channels == other._channels
-
-    def __repr__(self) -> str:
-        h, s, v, alpha = self._channels
-        return f"HsvVariation(h={h}, s={s}, v={v}, alpha={alpha})"
 
 
 class GrayVariation(HsvVariation):
@@ -88,4 +63,4 @@ class GrayVariation(HsvVariation):
         super().__init__(h=0.0, s=0.0, v=gray_level, alpha=alpha)
 
     def __repr__(self) -> str:
-        return f"GrayVariation(gray_level={self._channels[2]}, alpha={self._channels[3]})"
+        return f"GrayVariation(gray_level={self._v}, alpha={self._alpha})"

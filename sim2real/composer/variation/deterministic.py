@@ -3,67 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.physics.arrays import namespace
-from sim2real.composer.variation.base import Variation, evaluate
+from sim2real.composer.variation.base import Context, Drawn, Parametric, evaluate, is_compiled
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import ArrayLike, RandomState, Varying
+    from sim2real.composer.types import Varying
+    from sim2real.types import PyTree
 
 
-class Constant(Variation):
+class Constant(Parametric):
     """Always the same value."""
 
     def __init__(self, value: Varying) -> None:
-        self._value: Any = value
+        self._constant = value
 
     @property
-    def value(self) -> Any:
+    def value(self) -> PyTree:
         """The value."""
-        return self._value
+        return self._constant
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the value."""
-        return self._value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Constant) and self._value == other._value
+    def _value(self, context: Context) -> PyTree:
+        return self._constant
 
     def __str__(self) -> str:
-        return f"{self._value}"
+        return f"{self._constant}"
 
     def __repr__(self) -> str:
-        return f"Constant({self._value!r})"
+        return f"Constant({self._constant!r})"
 
 
-class Sequence(Variation):
-    """One value after the other, from the start again after the last one; on MJX: of numbers or arrays of one shape."""
+class Sequence(Drawn):
+    """One value after the other, and the first one after the last; on MJX: of numbers or arrays of one shape."""
 
     def __init__(self, values: Iterable[Varying]) -> None:
         self._values = values
         self._iterator = iter(values)
 
     @property
-    def values(self) -> Iterable[Any]:
+    def values(self) -> Iterable[PyTree]:
         """The values."""
         return self._values
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: Any = None,
-    ) -> Any:
-        """Return the next value."""
-        if hasattr(random_state, "recall"):
-            position = random_state.recall(self, 0)
-            random_state.keep(self, position + 1)
+    def _value(self, context: Context) -> PyTree:
+        source = context.random_state
+        if is_compiled(source):
+            position = source.recall(self, 0)
+            source.keep(self, position + 1)
             values = namespace(position).asarray(self._values)
             return values[position % len(values)]
         try:
@@ -71,20 +58,11 @@ class Sequence(Variation):
         except StopIteration:
             self._iterator = iter(self._values)
             value = next(self._iterator)
-        return evaluate(value, initial_value=initial_value, current_value=current_value, random_state=random_state)
+        return evaluate(value, **context._asdict())
 
 
-class Identity(Variation):
+class Identity(Parametric):
     """The current value."""
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the current value."""
-        return current_value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Identity)
+    def _value(self, context: Context) -> PyTree:
+        return context.current_value

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from sim2real.composer.variation.base import Variation, evaluate
+from sim2real.composer.variation.base import Context, Parametric, evaluate
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import ArrayLike, RandomState, Varying
+    from sim2real.composer.types import Varying
+    from sim2real.types import PyTree
 
 
-class Additive(Variation):
+class Additive(Parametric):
     """Adds a variation to the initial value, or to the current one.
 
     Args:
@@ -20,26 +21,11 @@ class Additive(Variation):
     def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the sum."""
-        base: Any = current_value if self._cumulative else initial_value
-        return base + evaluate(self._variation, initial_value, current_value, random_state)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Additive):
-            return False
-        return (self._variation, self._cumulative) == (other._variation, other._cumulative)
-
-    def __repr__(self) -> str:
-        return f"Additive(variation={self._variation}, cumulative={self._cumulative})"
+    def _value(self, context: Context) -> PyTree:
+        return context.base(self._cumulative) + evaluate(self._variation, *context)
 
 
-class Multiplicative(Variation):
+class Multiplicative(Parametric):
     """Multiplies the initial value, or the current one, by a variation.
 
     Args:
@@ -50,20 +36,5 @@ class Multiplicative(Variation):
     def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative
 
-    def __call__(
-        self,
-        initial_value: ArrayLike | None = None,
-        current_value: ArrayLike | None = None,
-        random_state: RandomState | None = None,
-    ) -> Any:
-        """Return the product."""
-        base: Any = current_value if self._cumulative else initial_value
-        return base * evaluate(self._variation, initial_value, current_value, random_state)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Multiplicative):
-            return False
-        return (self._variation, self._cumulative) == (other._variation, other._cumulative)
-
-    def __repr__(self) -> str:
-        return f"Multiplicative(variation={self._variation}, cumulative={self._cumulative})"
+    def _value(self, context: Context) -> PyTree:
+        return context.base(self._cumulative) * evaluate(self._variation, *context)
